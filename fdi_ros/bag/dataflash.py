@@ -98,12 +98,32 @@ _VALUES = {
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
 _OTHERS = {
     "MSG": {"Message"},
+    "ERR": {"Subsys", "ECode"},
     "FMTU": {"FmtType", "UnitIds", "MultIds"},
     "UNIT": {"Id", "Label"},
     "MULT": {"Id", "Mult"},
 }
 """Columns of further messages that are read."""
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
+_EKF_PRIMARY = 24
+_SUBSYSTEMS = {
+    2: "radio",
+    3: "compass",
+    5: "radio failsafe",
+    6: "battery failsafe",
+    8: "ground station failsafe",
+    9: "fence failsafe",
+    10: "flight mode",
+    11: "GPS",
+    12: "crash check",
+    16: "EKF check",
+    17: "EKF failsafe",
+    18: "barometer",
+    25: "thrust loss",
+    29: "vibration failsafe",
+    30: "internal error",
+}
+"""Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
 _FIRMWARE = re.compile(
     r"(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Blimp|AntennaTracker)\b.* V[0-9]", re.IGNORECASE
 )
@@ -218,6 +238,7 @@ class DataflashReader(LogReader):
         """Begin anew: what a log says of its records counts from there on."""
         self.unread.clear()
         self.counts.clear()
+        self.texts.clear()
         self.vehicle, self.start_utc = "", None
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
@@ -281,9 +302,14 @@ class DataflashReader(LogReader):
         """Take in what the log says of its vehicle, and of the units of its columns; the first counts."""
         for k, of_message in rows.items():
             name = self._messages[k].name
-            if name == "MSG" and not self.vehicle:
-                said = (text.decode("ascii", "replace") for text in of_message["Message"].tolist())
-                self.vehicle = next((match[1].title() for one in said if (match := _FIRMWARE.match(one))), "")
+            if name == "MSG":
+                said = [text.decode("ascii", "replace") for text in of_message["Message"].tolist()]
+                vehicles = (match[1].title() for one in said if (match := _FIRMWARE.match(one)))
+                self.vehicle = self.vehicle or next(vehicles, "")
+                self._add_texts(name, of_message, said)
+            elif name == "ERR":
+                errors = zip(of_message["Subsys"].tolist(), of_message["ECode"].tolist(), strict=True)
+                self._add_texts(name, of_message, [_error_text(*error) for error in errors])
             elif name == "UNIT":
                 for one in of_message:
                     self._units.setdefault(int(one["Id"]), one["Label"].decode("ascii", "replace"))
@@ -293,6 +319,12 @@ class DataflashReader(LogReader):
             elif name == "FMTU":
                 for one in of_message:
                     self._of_columns.setdefault(int(one["FmtType"]), (one["UnitIds"], one["MultIds"]))
+
+    def _add_texts(self, kind: str, rows: Rows, texts: Sequence[str]) -> None:
+        """Take in what the records (k,) of a message say, where they say when."""
+        if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
+            for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
+                self.add_text(stamp, kind, text)
 
     def _factors(self, number: int, message: _Message) -> dict[str, float]:
         """Return what values of each column are to be multiplied by, for rad, m and s."""
@@ -308,6 +340,14 @@ class DataflashReader(LogReader):
                 factor *= math.pi / 180.0
             factors[column] = factor
         return factors
+
+
+def _error_text(subsystem: float, code: float) -> str:
+    """Say what an ERR record says."""
+    if subsystem == _EKF_PRIMARY:
+        return f"EKF lane switched to {code:g}"
+    name = _SUBSYSTEMS.get(int(subsystem), f"subsystem {subsystem:g}")
+    return f"{name}: error {code:g}" if code else f"{name}: resolved"
 
 
 def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message | None, str]:

@@ -333,6 +333,8 @@ class FlightLog:
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
         self._shift = 0 if dated else self._reader.start_utc or 0
         """UTC of the start of the autopilot, us; 0: not known, and times count from there, or they are dates."""
+        self.texts = tuple(one._replace(stamp=self._log_time(one.stamp)) for one in self._reader.texts)
+        """What the autopilot said, with the times of recording, ns."""
         self.topics = tuple(Topic(_topic(source), IMU, count=survey.tracks[source].count) for source in self._sources)
         self.start_time = self._log_time(self._starts[0])
 

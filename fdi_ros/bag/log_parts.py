@@ -51,6 +51,20 @@ class ImuSamples(NamedTuple):
         )
 
 
+class LogText(NamedTuple):
+    """What the autopilot said of itself."""
+
+    stamp: int
+    """us as of samples; of a recording ns."""
+    kind: str
+    """Message it was logged in: MSG, ERR, or the severity."""
+    text: str
+
+
+MOST_TEXTS = 1000
+"""Texts of a log that are kept: the first ones."""
+
+
 class Portion(NamedTuple):
     """What one portion of a log holds."""
 
@@ -80,6 +94,13 @@ class LogReader(ABC):
         """Kind of vehicle by the name of its firmware; empty: not known."""
         self.start_utc: int | None = None
         """UTC of the start of the autopilot, us since 1970; None: not known."""
+        self.texts: list[LogText] = []
+        """What the autopilot said up to the place that was read."""
+
+    def add_text(self, stamp: int, kind: str, text: str) -> None:
+        """Take in what the autopilot said at a time, us."""
+        if len(self.texts) < MOST_TEXTS and (line := " ".join(text.split())):
+            self.texts.append(LogText(stamp, kind, line))
 
     @abstractmethod
     def portions(self, end: int) -> Iterator[Portion]:

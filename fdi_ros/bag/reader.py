@@ -22,6 +22,7 @@ from fdi_ros import __version__
 from fdi_ros.bag.csv_file import CSV
 from fdi_ros.bag.dataflash import DATAFLASH
 from fdi_ros.bag.flight_log import FlightLog
+from fdi_ros.bag.log_parts import LogText
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import LFS, OWN, Batch, Damage, Topic, find_files
 from fdi_ros.bag.ros1_file import Ros1File
@@ -99,6 +100,11 @@ class Recording:
                 count = topic.count + (before.count if before else 0)
                 merged[topic.name] = replace(before or topic, count=count)
         return tuple(merged[name] for name in sorted(merged))
+
+    @property
+    def texts(self) -> tuple[LogText, ...]:
+        """What the autopilot of a flight log said of itself, with times of recording, ns, in their order."""
+        return tuple(sorted(text for file in self._files if isinstance(file, FlightLog) for text in file.texts))
 
     def require(self, names: Sequence[str], type_name: str) -> None:
         """Check that topics are there, of the type, serialised as CDR and not empty.

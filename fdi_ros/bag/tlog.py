@@ -24,7 +24,7 @@ from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED,
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.system.limits import TLOG_BYTES
 
-_HEARTBEAT = 0
+_HEARTBEAT, _STATUSTEXT = 0, 253
 _AUTOPILOT_COMPONENT = 1
 _MARKS = (0xFE, 0xFD)
 """First bytes of messages of MAVLink 1 and 2."""
@@ -76,10 +76,16 @@ class TlogReader(LogReader):
     def portions(self, end: int) -> Iterator[Portion]:
         """Return the samples up to a place in the file, bytes."""
         if self._series is None:
+            self._texts: list[tuple[int, str]] = []
+            """What the autopilot said, with the time at which it came, us since 1970."""
             self.file.seek(0)
             self._series = self._load(self.file.read(end))
         found = [one.samples(source, end) for source, one in self._series.items()]
         self.start_utc = min(filter(None, (_start_utc(one, end) for one in self._series.values())), default=None)
+        self.texts.clear()
+        if self.start_utc is not None:
+            for came, text in self._texts:
+                self.add_text(came - self.start_utc, "STATUSTEXT", text)
         count = max((len(one.stamp) for one in found), default=0) // _TOGETHER + 1
         for k in range(count):
             yield Portion([one.at(_part(len(one.stamp), k, count)) for one in found], (k + 1) / count)
@@ -91,7 +97,12 @@ class TlogReader(LogReader):
         if (beat := next(beats, None)) is None:
             return series
         autopilot = beat.message.autopilot
-        for record in self._records(data, tuple(MESSAGES)):
+        for record in self._records(data, (*MESSAGES, _STATUSTEXT)):
+            came = int.from_bytes(data[record.at : record.at + _TIME], "big")
+            if record.number == _STATUSTEXT:
+                if record.system == beat.system:
+                    self._texts.append((came, str(record.message.text)))
+                continue
             kind = MESSAGES[record.number].kind
             if record.system != beat.system or not understood(kind, autopilot):
                 continue
@@ -101,7 +112,7 @@ class TlogReader(LogReader):
                 continue
             one = series.setdefault(Source(kind, reading.unit), _Series())
             one.stamp.append(min(reading.time, 2**63 - 1))
-            one.came.append(int.from_bytes(data[record.at : record.at + _TIME], "big"))
+            one.came.append(came)
             one.end.append(record.end)
             one.values.extend((*reading.rate, *reading.acceleration))
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))

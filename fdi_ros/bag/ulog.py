@@ -119,12 +119,9 @@ class UlogReader(LogReader):
         log = _parsed(bounded, self.file.name)
         if bounded.cut or bounded.reached < len(data):
             self.note(f"it is cut off or damaged: read up to byte {bounded.reached}")
-        if log.file_corruption:
-            self.note("it is damaged: what pyulog could not read was left out")
-        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
-            count = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
-            seconds = f"for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
-            self.note(f"the logger dropped out {count}, {seconds}")
+        self._note_gaps(log)
+        for text in log.logged_messages:
+            self.add_text(int(text.timestamp), text.log_level_str(), text.message)
         parts: list[dict[Source, Columns]] = []
         for one in log.data_list:
             source = Source(one.name, one.multi_id)
@@ -139,6 +136,15 @@ class UlogReader(LogReader):
             if log.file_corruption:
                 self.unread[name] = _LACKS
         return parts
+
+    def _note_gaps(self, log: Any) -> None:
+        """Tell what of a file, as pyulog reads it, is damaged or was never written."""
+        if log.file_corruption:
+            self.note("it is damaged: what pyulog could not read was left out")
+        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
+            count = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
+            seconds = f"for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
+            self.note(f"the logger dropped out {count}, {seconds}")
 
     def _describe(self, source: Source, columns: Columns) -> None:
         """Count the messages of a topic, take its time of day, or note why it cannot be read."""

@@ -18,7 +18,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import Outcome, StateChange, Summary
+from fdi_ros.replay.summary import AutopilotText, Outcome, StateChange, Summary
 from fdi_ros.replay.words import fault_sections, notes, sentences, verdict
 from fdi_ros.report.layout import (
     FINE,
@@ -133,13 +133,14 @@ class Report(Sink):
         }
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         states = _timeline(self.names, self._first_states, summary)
-        states["layout"] |= common
+        said = _autopilot_marks(summary)
+        # Words are read best where little else is.
+        states["layout"] |= {**common, "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)]}
+        statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
         stretches = stretch_words(story)
         spectrum = self._spectrum and self._spectrum.section(unit)
         sections = [
-            Section(
-                "The recording", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states, self._statistic(common)]
-            ),
+            Section("The recording", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states, statistic]),
             _episode_section(story, bool(scores.faults), unit, self._origin),
             *([Section("Stretches", "Each is judged for itself.", stretches)] if stretches else []),
             Section(
@@ -164,6 +165,7 @@ class Report(Sink):
             ),
             *fault_sections(scores, unit),
             _channel_section(summary, unit),
+            *_autopilot_section(summary.autopilot),
             _event_section(scores.events, unit),
             Section("Notes", "", [*summary.monitor.degraded, *notes(summary)]),
             Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
@@ -401,7 +403,26 @@ def marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[s
     return found
 
 
+def _autopilot_marks(summary: Summary) -> list[dict[str, Any]]:
+    """Mark what the autopilot said; its errors with their words."""
+    return [
+        {"x": one.at_s, "kind": "autopilot", "text": f"autopilot at {one.at_s:.3f} s: {one.text}"}
+        | ({"label": f"autopilot: {one.text}"} if one.kind == "ERR" else {})
+        for one in summary.autopilot[:MOST_MARKS]
+    ]
+
+
+def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
+    columns: Columns = {
+        "time": lambda one: f"{one.at_s:.3f} s",
+        "kind": lambda one: one.kind,
+        "words": lambda one: one.text,
+    }
+    return [Section("What the autopilot said", "", head_and_rows(columns, said[:MOST_ROWS]))] if said else []
+
+
 def _marks_hint(summary: Summary) -> str:
     """Say what the marks and shades are."""
     hint = SCORED_HINT if summary.scores.faults else MARKS_HINT
+    hint += " □ the autopilot said something." if summary.autopilot else ""
     return f"{hint} {GAPS_HINT}" if summary.story.gaps else hint

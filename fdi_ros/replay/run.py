@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,6 +36,7 @@ from fdi_ros.replay.evaluate import Evaluation
 from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
+    AutopilotText,
     BiasResult,
     DelayResult,
     Judgement,
@@ -332,7 +333,11 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
             alignment=dict(zip(samples.topics, samples.alignment.counters, strict=True)),
             damage=recording.damage.report(),
         )
-    return Summary(**vars(judge.judgement()), bag=str(request.bag), stream=stream, seconds=clock() - begun)
+        texts = [AutopilotText(judge.evaluation.time(one.stamp), one.kind, one.text) for one in recording.texts]
+    judgement = judge.judgement()
+    end = judgement.scores.start_s + judgement.scores.duration_s
+    said = tuple(replace(one, at_s=round(one.at_s, 6)) for one in texts if judgement.scores.start_s <= one.at_s <= end)
+    return Summary(**vars(judgement), bag=str(request.bag), stream=stream, seconds=clock() - begun, autopilot=said)
 
 
 def _tap_of(sinks: Sequence[Sink]) -> Tap:

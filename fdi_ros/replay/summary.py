@@ -227,6 +227,17 @@ class Judgement:
         return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
 
 
+@dataclass(frozen=True)
+class AutopilotText:
+    """What the autopilot of a flight log said of itself."""
+
+    at_s: float
+    """s from the first message."""
+    kind: str
+    """MSG, ERR (a lane switch of the EKF among them), STATUSTEXT, or the level of PX4."""
+    text: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Summary(Judgement):
     """What a monitor made of a recording."""
@@ -235,6 +246,8 @@ class Summary(Judgement):
     stream: StreamResult
     seconds: float
     """That the replay took."""
+    autopilot: tuple[AutopilotText, ...] = ()
+    """From the first sample to the last."""
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the changes of state as a table; needs pandas.
@@ -265,4 +278,11 @@ def as_json(summary: Summary) -> dict[str, Any]:
         "episodes": [{**asdict(one), "duration_s": one.duration_s} for one in summary.story.episodes],
         "more_episodes": summary.story.more,
     }
-    return {"bag": summary.bag, "detector": summary.detector, **figures, **story, "seconds": summary.seconds}
+    return {
+        "bag": summary.bag,
+        "detector": summary.detector,
+        **figures,
+        **story,
+        "autopilot": list(map(asdict, summary.autopilot)),
+        "seconds": summary.seconds,
+    }

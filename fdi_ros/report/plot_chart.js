@@ -5,7 +5,7 @@
 
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500"];
 const DASHES = { dash: "7 4", dot: "2 3", dashdot: "8 3 2 3" };
-const GLYPHS = { detected: "M-5,-9h10l-5,8z", isolated: "M0,2l5,5l-5,5l-5,-5z", declared: "M-4,-9l8,8M4,-9l-8,8" };
+const GLYPHS = { detected: "M-5,-9h10l-5,8z", isolated: "M0,2l5,5l-5,5l-5,-5z", declared: "M-4,-9l8,8M4,-9l-8,8", autopilot: "M-3,-7h6v6h-6z" };
 const LETTER = 6.6; // px, about, of the small print
 
 const esc = (text) => String(text).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
