@@ -28,7 +28,6 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
-from fdi_ros.setup.blocks import POINTS, interpolate
 from fdi_ros.system.installation import BAGS, PROGRESS, there
 
 Task = tuple[Any, ...]
@@ -95,9 +94,6 @@ def warm_verbs() -> None:
 
         walk(b"")
         list(DataflashReader(io.BytesIO(b"\0"), Damage().add).portions(1))
-    z = np.zeros((POINTS, 3))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
-    every = np.arange(POINTS)
-    interpolate(every.astype(np.float64), z, np.arange(3), every, 1.0, 0.0, 0, z.copy())
     Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))

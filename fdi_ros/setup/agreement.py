@@ -21,10 +21,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.errors import DisagreementError
+from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.setup.blocks import Data
-from fdi_ros.setup.windows import UNEQUAL
 
 LEAST_ROTATION = 0.05
 """Root mean square rotation about any axis while in motion, rad/s."""

@@ -12,14 +12,12 @@ have all of them; 25 blocks are a window.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
 from fdi_ros.config.config import Config
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.model.samples import Array, Block, Int, Mask
@@ -333,11 +331,17 @@ class Resampled:
         """Values (N, n) of some samples, rad/s, NaN: not known."""
         z = self._z[begin:end].copy()
         for channels, rows, usual in self._groups:
-            squares, count = interpolate(
-                self.seconds, self._z, channels, rows, usual, float(self._late[channels[0]]), begin, z
-            )
-            self._squares[channels] += squares
-            self._count[channels] += count
+            late = float(self._late[channels[0]])
+            first, weight = lagrange_weights(self.seconds[rows], self.seconds[begin:end] + late, usual)
+            known = np.flatnonzero(first >= 0)
+            z[:, channels] = np.nan
+            if len(known):
+                around = rows[first[known, None] + np.arange(POINTS)]
+                z[np.ix_(known, channels)] = np.einsum(
+                    "mp,mpc->mc", weight[known], self._z[around[..., None], channels]
+                )
+            self._squares[channels] += (weight[known] ** 2).sum()
+            self._count[channels] += len(known)
         return z
 
     @property
@@ -346,51 +350,28 @@ class Resampled:
         return np.where(self._count > 0, self._squares / np.maximum(self._count, 1), 1.0)
 
 
-@compiled
-def interpolate(
-    seconds: Array, z: Array, channels: Int, rows: Int, usual: float, late: float, begin: int, out: Array
-) -> tuple[float, int]:
-    """Values of some channels late s after samples from one on, into ``out``; sum of squared weights, and their number.
+def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
+    """Find the polynomials through the six knots around instants.
 
-    By the polynomial through the six samples around, of those in ``rows``.
+    Parameters
+    ----------
+    knots
+        (K,) s, increasing.
+    x
+        (N,) s.
+    usual
+        Time from one knot to the next, s.
+
+    Returns
+    -------
+    First knot (N,) of each, -1 where x is beside a hole or outside; weights (N, `POINTS`) of the knots.
     """
-    weight = np.empty(POINTS)
-    squares, found = 0.0, 0
-    low, high = 0, len(rows)
-    while low < high:
-        middle = (low + high) // 2
-        if seconds[rows[middle]] < seconds[begin] + late:
-            low = middle + 1
-        else:
-            high = middle
-    for m in range(len(out)):
-        x = seconds[begin + m] + late
-        while low < len(rows) and seconds[rows[low]] < x:
-            low += 1
-        k = max(min(low - POINTS // 2, len(rows) - POINTS), 0)
-        near = k + POINTS <= len(rows)
-        if near:
-            first, last = seconds[rows[k]], seconds[rows[k + POINTS - 1]]
-            near = last - first < (POINTS - 2 + HOLE) * usual and first <= x <= last
-        if near:
-            squares += weigh(seconds, rows[k : k + POINTS], x, weight)
-            found += 1
-        for c in channels:
-            value = 0.0
-            for p in range(POINTS if near else 0):
-                value += weight[p] * z[rows[k + p], c]
-            out[m, c] = value if near else math.nan
-    return squares, found
-
-
-@compiled
-def weigh(seconds: Array, rows: Int, x: float, weight: Array) -> float:
-    """Find the weights (`POINTS`,) of Lagrange's polynomial at an instant; return their sum of squares."""
-    squares = 0.0
-    for p in range(POINTS):
-        weight[p] = 1.0
-        for q in range(POINTS):
-            if q != p:
-                weight[p] *= (x - seconds[rows[q]]) / (seconds[rows[p]] - seconds[rows[q]])
-        squares += weight[p] * weight[p]
-    return squares
+    if len(knots) < POINTS:
+        return np.full(len(x), -1), np.zeros((len(x), POINTS))
+    first = np.clip(np.searchsorted(knots, x) - POINTS // 2, 0, len(knots) - POINTS)
+    around = knots[first[:, None] + np.arange(POINTS)]
+    there = (np.ptp(around, axis=1) < (POINTS - 2 + HOLE) * usual) & (around[:, 0] <= x) & (x <= around[:, -1])
+    # Each with itself gives the factor 1.
+    apart = around[:, :, None] - around[:, None, :] + np.eye(POINTS)
+    from_x = np.where(np.eye(POINTS, dtype=bool), 1.0, (x[:, None] - around)[:, None, :])
+    return np.where(there, first, -1), np.asarray((from_x / apart).prod(axis=2))

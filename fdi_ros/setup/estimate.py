@@ -32,10 +32,11 @@ from fdi_ros.estimator.error_states import (
     prepare_layout,
 )
 from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
 from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
-from fdi_ros.setup.windows import UNEQUAL, Floor, find_floor, gains, information, levels, of_the_moment
+from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken

@@ -34,7 +34,7 @@ from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.fitness import copy_words
 from fdi_ros.setup.inspect import topic_columns, troubles
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns, noisier
+from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns, faults_words, noisier
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
 from fdi_ros.sources import source_of
 from fdi_ros.system.limits import LINE
@@ -78,7 +78,8 @@ def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
         return Verdict(Severity.UNKNOWN, f"NO BETTER THAN BEFORE: {words}")
     if found.calibration is None:
         return Verdict(Severity.UNKNOWN, f"USABLE, NOT CALIBRATED: {found.refused}")
-    if looks := [words for words in (copy_words(found.reports), noisier(found.calibration, unit)) if words]:
+    looks = [copy_words(found.reports), noisier(found.calibration, unit), faults_words(found.calibration)]
+    if looks := [words for words in looks if words]:
         return Verdict(Severity.UNKNOWN, f"USABLE, BUT LOOK: {'; '.join(looks)}")
     words = "nothing is declared without a fault"
     if not found.mounting.whole.isolable:

@@ -263,7 +263,9 @@ def axis_errors(result: Calibration) -> Array:
 def warnings_of(result: Calibration) -> tuple[str, ...]:
     """List what to look at before the settings are trusted, grouped."""
     return tuple(
-        line for line in (_faults(result), _unusable(result), _noise(result), _axes(result), _biases(result)) if line
+        line
+        for line in (faults_words(result), _unusable(result), _noise(result), _axes(result), _biases(result))
+        if line
     )
 
 
@@ -271,7 +273,8 @@ def _who(names: Sequence[str], total: int) -> str:
     return "every channel" if len(names) == total else ", ".join(names)
 
 
-def _faults(result: Calibration) -> str:
+def faults_words(result: Calibration) -> str:
+    """Say what the monitor declares in the recording that it was set up on; empty: nothing."""
     if not result.faults:
         return ""
     shown = [

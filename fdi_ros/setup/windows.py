@@ -29,8 +29,6 @@ QUIETEST = 0.05
 AS_QUIET = 1.5
 """Windows of at most so many times the variance of the quietest are as quiet."""
 LEAST_WINDOWS = 4
-UNEQUAL = 0.15
-"""Share by which units see vibration differently, at least: logs of vehicles show 0.04 to 0.6."""
 MEMORY = 2
 """Windows on both sides that the noise of the moment is averaged over."""
 
