@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.setup.blocks import Data
+from fdi_ros.model.samples import Array, Int
+from fdi_ros.setup.blocks import WINDOW, Data
 
 LEAST_ROTATION = 0.05
 """Root mean square rotation about any axis while in motion, rad/s."""
@@ -34,9 +34,6 @@ FOLLOWS = 0.9
 """Correlation from which a channel shows the rotation, if on another scale."""
 LEAST_WINDOWS = 20
 """In motion; with fewer, units are not compared, and no mount is estimated."""
-DEGREES = float(np.degrees(1.0))
-NEAR = 0.1
-"""A factor this close, relative, to that of a unit of measurement may be it."""
 SHARED, SAME = 0.7, 0.9
 """Share of the rotation that units have in common: less contradicts, more shows by which axes it would not."""
 
@@ -84,23 +81,14 @@ def _contradiction(units: list[str], most: Int, ratio: Array) -> str:
         others = " and ".join(units[k] for k in most)
         factor = float(np.median(ratio[odd, most]))
         return (
-            f"{units[odd]} shows {_times(factor)} the rotation that {others} show:"
+            f"{units[odd]} shows {factor:.3g} times the rotation that {others} show:"
             f" mend it or name its channels in excluded_channels"
         )
     low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
     return (
         f"{' and '.join(units)} do not show one rotation, and nothing decides which is right:"
-        f" {units[high]} shows {_times(float(ratio[high, low]))} that of {units[low]}; mend the one that is wrong"
+        f" {units[high]} shows {ratio[high, low]:.3g} times that of {units[low]}; mend the one that is wrong"
     )
-
-
-def _times(factor: float) -> str:
-    """Format a factor, with the unit of measurement that may explain it."""
-    if abs(factor / DEGREES - 1) < NEAR:
-        return f"{factor:.3g} times (deg/s?)"
-    if abs(factor * DEGREES - 1) < NEAR:
-        return f"{factor:.3g} times (are the others in deg/s?)"
-    return f"{factor:.3g} times"
 
 
 def _means(data: Data) -> Array:
@@ -209,7 +197,7 @@ def check_response(data: Data, nominal: Geometry) -> None:
         if found is None:
             continue
         response, seen = found
-        shows = f"{response:.0%} of" if abs(response) < 1 else _times(response)
+        shows = f"{response:.0%} of" if abs(response) < 1 else f"{response:.3g} times"
         what = f"it shows {shows} the {seen:.2f} rad/s rms that the others see along its axis"
         alike = [nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])]
         if len(alike) > 1:
@@ -254,8 +242,6 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
 # How the units are turned against each other --------------------------------------------------------------------------
 
 
-WINDOW = 0.25
-"""Rates are averaged over so long: vibration, and delays of some ms, average out, s."""
 LEAST_RATE = 0.01
 """Rotation about some axis, root mean square, below which the recording is at rest, rad/s."""
 LARGEST_ERROR = np.radians(2.0)
@@ -297,60 +283,44 @@ class Mount:
     """One of the two is no right-handed frame."""
 
 
-def find_mounts(block: Block, max_rate: float) -> tuple[Mount, ...]:
+def find_mounts(data: Data) -> tuple[Mount, ...]:
     """Find the mounts of units of three channels each.
 
     Parameters
     ----------
-    block
+    data
         The recording, channels as measured, three by three.
-    max_rate
-        Values beyond are clipped and left out, rad/s.
     """
-    means = _window_means(block, max_rate)
-    units = block.z.shape[1] // 3
+    means = _means(data)
+    # What is taken off must turn with the unit: means do, medians do not.
+    means = means - means.mean(axis=0) if len(means) else means
     first = Mount(np.eye(3), True, True, 0.0, 0.0, 1.0, "the body frame is taken to be its own")
-    return (first, *(_against(means[:, :3], means[:, 3 * k : 3 * k + 3]) for k in range(1, units)))
+    return (first, *(_against(means[:, :3], means[:, k : k + 3]) for k in range(3, means.shape[1], 3)))
 
 
-def _window_means(block: Block, max_rate: float) -> Array:
-    """Rates (W, n) averaged over windows with all channels in range, less their means: a bias is no rotation."""
-    with np.errstate(invalid="ignore"):
-        good = np.all(block.delivered & (np.abs(block.z) < max_rate), axis=1)
-    window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
-    starts = np.flatnonzero(np.diff(window, prepend=-1))
-    whole = np.minimum.reduceat(good, starts)
-    counts = np.diff([*starts, len(window)])
-    sums = np.add.reduceat(np.where(good[:, None], block.z, 0.0), starts, axis=0)
-    # A window at the end, or beside a gap, may hold few samples.
-    whole &= counts >= 0.5 * np.median(counts)
-    means = sums[whole] / counts[whole, None]
-    return means - means.mean(axis=0) if len(means) else means
-
-
-def _against(first: Array, own: Array) -> Mount:
-    """Mount of a unit whose rates are own (W, 3) against the one that shows first (W, 3), rad/s."""
-    if len(own) < LEAST_WINDOWS:
-        return _unknown(f"only {len(own) * WINDOW:.0f} s in which every unit gives values", 0.0)
-    most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(own.T @ own / len(own)), 0.0))[:0:-1]
+def _against(first: Array, unit: Array) -> Mount:
+    """Mount of a unit whose rates are these (W, 3) against the one that shows first (W, 3), rad/s."""
+    if len(unit) < LEAST_WINDOWS:
+        return _unknown(f"only {len(unit) * WINDOW:.0f} s in which every unit gives values", 0.0)
+    most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0))[:0:-1]
     if most < LEAST_RATE:
         return _unknown(f"it does not turn ({most:.2g} rad/s rms)", 0.0)
-    scale = float(np.sqrt((own**2).sum() / max((first**2).sum(), 1e-30)))
+    scale = float(np.sqrt((unit**2).sum() / max((first**2).sum(), 1e-30)))
     if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
         # Another unit of measurement hides the share that is in common, not the turn.
-        own = own / scale
-    in_common = np.linalg.svd(first.T @ own, compute_uv=False)
+        unit = unit / scale
+    in_common = np.linalg.svd(first.T @ unit, compute_uv=False)
     if in_common[1] <= ROUNDING * in_common[0]:
         return _unknown("it and the first unit never turn about two axes together", 0.0)
-    found, _, sensitivity = Rotation.align_vectors(first, own, return_sensitivity=True)
-    left = first - found.apply(own)
-    shared = 1.0 - float((left**2).sum() / (first**2).sum())
-    error = float(np.sqrt(np.mean(left**2) * np.linalg.eigvalsh(sensitivity)[-1]))
+    found, _, sensitivity = Rotation.align_vectors(first, unit, return_sensitivity=True)
+    residual = first - found.apply(unit)
+    shared = 1.0 - float((residual**2).sum() / (first**2).sum())
+    error = float(np.sqrt(np.mean(residual**2) * np.linalg.eigvalsh(sensitivity)[-1]))
     # Vibration that units see differently looks like a turn between them, however long it lasts.
-    apart = float(np.sqrt((left**2).sum() / (first**2).sum()))
+    apart = float(np.sqrt((residual**2).sum() / (first**2).sum()))
     doubt = apart * min(1.0, apart / UNEQUAL)
-    mirrored = -Rotation.align_vectors(first, -own)[0].as_matrix()
-    if shared < MIRRORED < 1.0 - float(((first - own @ mirrored.T) ** 2).sum() / (first**2).sum()):
+    mirrored = -Rotation.align_vectors(first, -unit)[0].as_matrix()
+    if shared < MIRRORED < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum() / (first**2).sum()):
         return replace(_unknown("mirrored against the first unit", shared), contradicts=True, mirrored=True)
     if shared < LEAST_SHARED:
         words = f"it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"

@@ -31,6 +31,7 @@ from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
+from fdi_ros.setup.blocks import prepare_channels
 from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.setup.fitness import candidates, clocks_apart, copy_words, needs, refuse_degrees
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
@@ -354,7 +355,7 @@ def _mounted(block: Block, start: Settings) -> Settings:
     """Find how units are mounted against each other."""
     if not source_of(start.config).units:
         return start
-    mounts = find_mounts(block, min(start.config.health.max_rate))
+    mounts = find_mounts(prepare_channels(block, start.config, list(range(block.z.shape[1]))))
     turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
     return replace(_if_built({**start.parameters, **turned}, start), mounts=mounts)
 

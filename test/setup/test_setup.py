@@ -35,6 +35,7 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.sweep import monitor_of, watch_baseline
 from fdi_ros.setup.agreement import find_mounts
+from fdi_ros.setup.blocks import Data, prepare
 from fdi_ros.setup.run import Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -49,6 +50,11 @@ def three() -> Vehicle:
     return vehicle(11, "rest and turns")
 
 
+def ready(block: Block) -> Data:
+    """A recording made ready, gyros of a range of 35 rad/s."""
+    return prepare(block, np.full(block.z.shape[1], 35.0))
+
+
 def angle(a: np.ndarray, b: np.ndarray) -> float:
     """Degrees between two rotations."""
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
@@ -56,7 +62,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     unit = three()
-    mounts = find_mounts(unit.block, 35.0)
+    mounts = find_mounts(ready(unit.block))
     left, _, right = np.linalg.svd(unit.axes[:3].T)
     first = (left @ right).T
     for mount, axes in zip(mounts, unit.axes.reshape(-1, 3, 3), strict=True):
@@ -71,7 +77,7 @@ def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     z[:, 3:6] = z[:, :3] @ off @ square
     # Damage and a shake beyond the range leave the rest of the recording as good as it was.
     z[1000:1100, 4], z[2000:2200] = np.nan, 40.0
-    found = find_mounts(Block(unit.block.stamp, z), 35.0)
+    found = find_mounts(ready(Block(unit.block.stamp, z)))
     np.testing.assert_array_equal(found[1].rotation, square)
     assert found[1].square
     assert np.degrees(found[1].off) == pytest.approx(3.0, abs=0.2)
@@ -94,7 +100,7 @@ def test_a_mount_that_is_not_shown_is_not_known() -> None:
         (apart, "does not turn as the first unit does"),
         (silent, "in which every unit gives values"),
     ):
-        mount = find_mounts(Block(unit.block.stamp, z), 35.0)[1]
+        mount = find_mounts(ready(Block(unit.block.stamp, z)))[1]
         assert not mount.shown
         assert words in mount.words
         np.testing.assert_array_equal(mount.rotation, np.eye(3))
@@ -116,6 +122,7 @@ def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_
     np.testing.assert_allclose(found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.02)
     assert config.imus.delays[1] == pytest.approx(0.0002, abs=2e-4)
     page = (tmp_path / "cone.html").read_text()
+    assert f"<li class=good>{out.splitlines()[0]}</li>" in page
     for title in (
         "Not shown by this recording",
         "Warnings",
