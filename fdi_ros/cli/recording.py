@@ -51,21 +51,21 @@ def _inspect(arguments: Namespace) -> int:
     # All of it first: what is compiled for it is announced before the result, not within.
     topics = topics_text(reports, damage, unit)
     config, refused = _starting_config(reports, arguments.bag)
-    told = verdict(reports, refused, unit)
-    figures = {"verdict": {"severity": told.severity.value, "words": told.words}, "config": config}
+    found = verdict(reports, refused, unit)
+    figures = {"verdict": {"severity": found.severity.value, "words": found.words}, "config": config}
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), **figures})
-    outputs.say(f"{told.words}\n", told.severity)
+    outputs.say(f"{found.words}\n", found.severity)
     outputs.say(f"{recording_text(reports, arguments.bag)}{topics}")
     if config is None:
         outputs.confirm("json")
         if arguments.output is not None:
-            raise ConfigError(f"{arguments.output} is not written: {shown(arguments.bag.name)} {told.words}")
-        return told.severity.exit_code
+            raise ConfigError(f"{arguments.output} is not written: {shown(arguments.bag.name)} {found.words}")
+        return found.severity.exit_code
     outputs.say(f"\n{config}")
     if arguments.output is not None:
         write_text(arguments.output, config)
     outputs.confirm()
-    return told.severity.exit_code
+    return found.severity.exit_code
 
 
 def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
@@ -238,9 +238,9 @@ def _convert(arguments: Namespace) -> int:
         with Progress(sys.stderr, arguments.quiet) as progress, whole_folder(target) as path:
             counts = convert(recording, path, progress.show)
         damage = recording.damage.report()
-    told = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]
-    told += [f"note: {line}\n" for line in damage]
-    return outputs.finish("".join(told), {"bag": str(target), "messages": counts, "damage": list(damage)})
+    lines = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]
+    lines += [f"note: {line}\n" for line in damage]
+    return outputs.finish("".join(lines), {"bag": str(target), "messages": counts, "damage": list(damage)})
 
 
 CONVERT = Verb(

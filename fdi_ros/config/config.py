@@ -17,6 +17,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from fdi_ros.config.nodes import ALL_NODES, MONITOR
 from fdi_ros.config.settings import (
     INPUTS,
     BiasConfig,
@@ -265,14 +266,7 @@ def _check_topics(config: Config) -> None:
 
 # Parameter files ----------------------------------------------------------------------------------------------------
 
-ROS_PARAMETERS = (
-    "use_sim_time",
-    "start_type_description_service",
-    "autostart",
-    "executor",
-    "state_file",
-    "state_max_age",
-)
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", *ALL_NODES, *MONITOR)
 """Parameters of the node itself: they may stand in the file, and are no settings of the pipeline."""
 
 

@@ -93,9 +93,9 @@ def _contradiction(units: list[str], most: Int, ratio: Array) -> str:
 
 def _means(data: Data) -> Array:
     """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
-    starts = data.starts[:-1]
-    good = np.minimum.reduceat(data.complete, starts)
-    counts = np.diff(data.starts)
+    starts, counts = data.starts[:-1], np.diff(data.starts)
+    # A window at the end, or beside a gap, may hold few samples.
+    good = np.minimum.reduceat(data.complete, starts) & (counts >= 0.5 * np.median(counts))
     means = np.add.reduceat(np.where(np.isfinite(data.z), data.z, 0.0), starts, axis=0)[good] / counts[good, None]
     return means - np.median(means, axis=0) if len(means) else means
 
@@ -218,7 +218,7 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
     axes
         (n, 3).
     """
-    own, found = float(np.sqrt(square[i, i])), []
+    size, found = float(np.sqrt(square[i, i])), []
     for chosen in itertools.combinations([j for j in range(len(axes)) if j != i], 3):
         three = list(chosen)
         if not spans_space(axes[three]):
@@ -228,8 +228,8 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
         if seen < LEAST_ROTATION:
             return None
         response = float(gain @ square[three, i]) / seen**2
-        small = abs(response) < LEAST_RESPONSE and own < LEAST_RESPONSE * seen
-        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > FOLLOWS * own
+        small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
+        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > FOLLOWS * size
         if not small and not large:
             return None
         found.append((response, seen))
@@ -344,7 +344,7 @@ def _unknown(words: str, shared: float) -> Mount:
 def _square_words(rotation: Rotation, off: float, error: float) -> str:
     axes = ["xyz"[int(np.abs(row).argmax())] for row in rotation.as_matrix()]
     signs = ["-" if row.min() < -0.5 else "" for row in rotation.as_matrix()]
-    along = ", ".join(f"{body} is its {sign}{own}" for body, sign, own in zip("xyz", signs, axes, strict=True))
+    along = ", ".join(f"{body} is its {sign}{axis}" for body, sign, axis in zip("xyz", signs, axes, strict=True))
     turn = "as the first" if rotation.magnitude() < 0.1 else f"turned: body {along}"
     return f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
 

@@ -180,8 +180,8 @@ def repeated(z: Array, step: float) -> Mask:
 
 def _coarse(values: Array, long: Mask, size: int) -> bool:
     """Whether values (N,) outside the long runs (N,), too, hardly change when it is quiet, in spans of a size."""
-    left = values[np.isfinite(values) & ~long]
-    spans = left[: len(left) // size * size].reshape(-1, size)
+    others = values[np.isfinite(values) & ~long]
+    spans = others[: len(others) // size * size].reshape(-1, size)
     if not len(spans):
         return False
     different = (np.diff(np.sort(spans, axis=1), axis=1) > 0).sum(axis=1) + 1

@@ -156,9 +156,9 @@ def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterat
     """Give the usable values, part by part, as the monitor will have them once the delays (n,), s, are taken off."""
     source, shifted = Resampled(data, late), np.abs(late) >= NOT_SHIFTED
     for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
-        part, own, moved = block[first:end], data.z[first:end], source.part(first, end)
+        part, usable, moved = block[first:end], data.z[first:end], source.part(first, end)
         z, received = part.z.copy(), part.delivered.copy()
-        z[:, active] = np.where(np.isfinite(own) & ~shifted, own, moved)
+        z[:, active] = np.where(np.isfinite(usable) & ~shifted, usable, moved)
         # Where there is none for the instant, the value of another one is not it.
         received[:, active] = np.isfinite(z[:, active])
         yield Block(part.stamp, z, received)
@@ -278,8 +278,8 @@ def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> t
     seconds = (stamp - stamp[0]) * 1e-9
     spans = [
         Span((place,), float(seconds[first]), float(seconds[end - 1]))
-        for place, own in enumerate(state.T)
-        for first, end in flag_runs(own == ChannelState.FAULTY)
+        for place, states in enumerate(state.T)
+        for first, end in flag_runs(states == ChannelState.FAULTY)
     ]
     among = np.asarray(state == ChannelState.AMBIGUOUS)
     for first, end in flag_runs(np.asarray(among.any(axis=1))):
@@ -378,8 +378,8 @@ def _timing(task: _Task, found: Estimate) -> tuple[Array, float]:
 def _skew(task: _Task, late: Array) -> float:
     """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
     configured, step = task.config.imus.max_skew, task.data.step
-    left = np.abs(late - np.round(late / step) * step)
-    hidden = left[(left > 2 * LEAST_SKEW) & (left <= configured)]
+    offset = np.abs(late - np.round(late / step) * step)
+    hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= configured)]
     return float(f"{hidden.min() / 2:.2g}") if len(hidden) else configured
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_ros.compiling.compiled import allocate
+from fdi_ros.config.config import PARAMETERS
 from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     BIAS_RATE_STD,
@@ -45,8 +46,8 @@ SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
 """s, and share of the rate: what changes less has settled."""
 NEAR_DELAY = 1e-3
 """s; delays that move by less are no reason to look for the walk of the biases again."""
-LARGEST_DELAY = 0.1
-"""What imus.delays may be at most, s."""
+LARGEST_DELAY = PARAMETERS["imus.delays"].high
+"""s."""
 STEP_DELAY = 0.03
 """By how much a delay changes in one pass at most, s: a slope is that of the motion only so far."""
 MOST_STEPS = 400
@@ -240,15 +241,15 @@ def _linearise(
     covariance = _by_window(blocks, apart, apart) / np.maximum(count - 1, 1)[:, None, None]
     enough = count >= 5
     there = present & enough[:, None]
-    own = of_the_moment(covariance, there, axes)
+    moment = of_the_moment(covariance, there, axes)
     floor = find_floor(blocks.samples, blocks.count, there & _told(blocks), axes)
-    steady = np.where(there, own, ABSENT)
+    steady = np.where(there, moment, ABSENT)
     bias = _spread(biases, windows)
     gain = gains(steady, axes)
     rate = np.einsum("bai,bi->ba", gain[blocks.window], y - bias[blocks.window])
     rest = _find_rest(blocks, rate, used, gain, steady, floor, axes, known) if windows > 1 else np.zeros(1, dtype=bool)
-    variance = np.where(there, own * np.where(rest[:, None], colour[0], colour[1]), ABSENT)
-    turn, inside = _turn(blocks, rate, used)
+    variance = np.where(there, moment * np.where(rest[:, None], colour[0], colour[1]), ABSENT)
+    acceleration, inside = _turn(blocks, rate, used)
     moving = ~rest[blocks.window]
     used = used & (inside | ~moving) & enough[blocks.window]
     return _Pass(
@@ -257,10 +258,10 @@ def _linearise(
         used,
         variance,
         rate,
-        turn,
+        acceleration,
         rest,
         floor,
-        *_evidence(blocks, sensors, axes, late, y, used, variance, rate, turn, rest, scale),
+        *_evidence(blocks, sensors, axes, late, y, used, variance, rate, acceleration, rest, scale),
     )
 
 
@@ -275,11 +276,11 @@ def _spread(curve: Array, windows: int) -> Array:
     return np.repeat(curve, each, axis=0)[:windows]
 
 
-def _by_window(blocks: Blocks, left: Array, right: Array) -> Array:
+def _by_window(blocks: Blocks, first: Array, second: Array) -> Array:
     """Sum (W, l, r) products over the blocks of every window."""
-    found = np.empty((blocks.windows, left.shape[1], right.shape[1]))
+    found = np.empty((blocks.windows, first.shape[1], second.shape[1]))
     for i, j in np.ndindex(found.shape[1:]):
-        found[:, i, j] = np.add.reduceat(left[:, i] * right[:, j], blocks.start)
+        found[:, i, j] = np.add.reduceat(first[:, i] * second[:, j], blocks.start)
     return found
 
 
@@ -454,9 +455,9 @@ def _misfit(of: Evidence, found: Smoothed) -> float:
     """Scatter of what single windows say of the constants, over what the noise explains."""
     n = of.n
     x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))]) / of.prior
-    left = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
+    residual = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
     covariance = found.constant_covariance / np.outer(of.prior[n:], of.prior[n:])
-    shown = float(np.einsum("ki,ij,kj->", left, covariance, left))
+    shown = float(np.einsum("ki,ij,kj->", residual, covariance, residual))
     expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], covariance))
     return max(shown / max(expected, 1e-12), 1.0)
 

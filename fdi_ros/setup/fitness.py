@@ -148,8 +148,8 @@ def noisy_words(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> str:
     for one in chosen:
         assert one.kind is not None
         places = [f"{shown(one.topic.name)} {place}" for place in one.kind.value_names(one.channels)]
-        own = range(len(names), len(names) + len(places))
-        units += [list(own)] if len(chosen) > 1 else [[i] for i in own]
+        places_of_unit = range(len(names), len(names) + len(places))
+        units += [list(places_of_unit)] if len(chosen) > 1 else [[i] for i in places_of_unit]
         names += places
     noise = np.concatenate([one.segments.moving_noise() for one in chosen])
     return noisier_words(names, noise, units, unit.name, unit.factor)

@@ -101,10 +101,10 @@ def _eliminate(of: Evidence, walk: float) -> _Eliminated:
     n, count = of.n, len(of.normal)
     stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
     blocks = of.normal[:, :n, :n].copy()
-    own = np.einsum("kii->ki", blocks)
-    own[0] += 1.0
-    own[:-1] += stiffness
-    own[1:] += stiffness
+    diagonal = np.einsum("kii->ki", blocks)
+    diagonal[0] += 1.0
+    diagonal[:-1] += stiffness
+    diagonal[1:] += stiffness
     band = np.zeros((n + 1, count, n))
     for below in range(n):
         band[below, :, : n - below] = np.diagonal(blocks, -below, 1, 2)

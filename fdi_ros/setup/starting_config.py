@@ -30,8 +30,8 @@ _REST = 3.0
 """Time at the start over which the bias could be learned, s."""
 _MOSTLY = 0.5
 """Share of a recording in motion from which its noise is that in motion."""
-_TIMEOUT = 0.1
-"""What imus.timeout and health.stale_timeout are unless they are given, s."""
+_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
+"""s; that of health.stale_timeout is the same."""
 _BRIDGED = 4.4
 """Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
 _SLOW = 0.1
@@ -144,7 +144,7 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         "bias.startup_bias_duration": _REST if at_rest else 0.0,
         "detector.name": PARAMETERS["detector.name"].default,
         "detector.false_alarms_per_hour": 0.001,
-        "health.max_rate": [_rounded_up(max(34.9, 1.001 * largest))],
+        "health.max_rate": [_rounded_up(max(*PARAMETERS["health.max_rate"].default, 1.001 * largest))],
     }
     remarks = {
         "noise.noise_std": source,

@@ -99,12 +99,12 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
     total, weight = np.zeros_like(filled), np.zeros(len(filled))
     for shift in range(-MEMORY, MEMORY + 1):
-        own = slice(max(shift, 0), len(filled) + min(shift, 0))
-        other = slice(max(-shift, 0), len(filled) + min(-shift, 0))
+        rows_here = slice(max(shift, 0), len(filled) + min(shift, 0))
+        rows_there = slice(max(-shift, 0), len(filled) + min(-shift, 0))
         # The mean of covariances of other channels would be none.
-        same = (there[own] == there[other]).all(axis=1)
-        total[own] += np.where(same[:, None, None], filled[other], 0.0)
-        weight[own] += same
+        same = (there[rows_here] == there[rows_there]).all(axis=1)
+        total[rows_here] += np.where(same[:, None, None], filled[rows_there], 0.0)
+        weight[rows_here] += same
     averaged = total / np.maximum(weight, 1)[:, None, None]
     found = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
@@ -131,16 +131,16 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
 
     The geometric mean of the channels: one that is always noisy hides nothing.
     """
-    left = np.full(there.shape, np.nan)
+    residual = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
         projector = _projector(axes[columns])
         part = covariance[np.ix_(rows, columns, columns)]
-        left[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", projector, part, projector, optimize=True)
-    told = np.isfinite(left).any(axis=1)
+        residual[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", projector, part, projector, optimize=True)
+    known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
-    if told.any():
-        logs = np.log(np.maximum(left[told][:, np.isfinite(left).any(axis=0)], LEAST_VARIANCE))
-        found[told] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
+    if known.any():
+        logs = np.log(np.maximum(residual[known][:, np.isfinite(residual).any(axis=0)], LEAST_VARIANCE))
+        found[known] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
     return found
 
 
