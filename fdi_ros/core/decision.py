@@ -268,9 +268,12 @@ def find_returns(limits: DecisionSettings, own: Decision, n: int, stamp: int) ->
     """Bits of the declared channels that have agreed for the clean time."""
     returns = 0
     for i in range(n):
-        small = abs(own.error_sum[i]) <= limits.mean_limit[i] * own.error_count[i]
-        if own.faulty >> i & 1 and stamp - own.last_bad[i] >= limits.clean_time and small:
-            returns |= 1 << i
+        if own.faulty >> i & 1 and stamp - own.last_bad[i] >= limits.clean_time:
+            if abs(own.error_sum[i]) <= limits.mean_limit[i] * own.error_count[i]:
+                returns |= 1 << i
+            else:
+                # A small fault agrees sample by sample: after its end the mean begins anew.
+                own.last_bad[i], own.error_sum[i], own.error_count[i] = stamp, 0.0, 0
     return returns
 
 

@@ -120,6 +120,18 @@ def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_sm
         assert decider.channels("faulty") == (set() if returns else {3})
 
 
+def test_a_small_fault_that_ended_does_not_count_against_the_return():
+    """Sample by sample it agrees with the others; its mean does not, until it has ended."""
+    decider = Decider(1, 1, latch=False, clean_time=10)
+    decider.take((3,), isolated=True)
+    errors = np.zeros(12)
+    errors[3] = 3.0
+    for _ in range(200):
+        assert not decider.take((), agrees=ALL, error=errors)
+    changes = [decider.take((), agrees=ALL, error=np.zeros(12)) for _ in range(20)]
+    assert np.flatnonzero(changes).size == 1
+
+
 def test_the_clean_time_of_a_second_channel_counts_from_its_own_declaration():
     decider = Decider(1, 1, latch=False, clean_time=10)
     decider.take((3,), isolated=True)
