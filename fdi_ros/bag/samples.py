@@ -27,6 +27,10 @@ _TOGETHER = 16384
 """Messages handed on together: enough that calls do not count, little enough for the cache."""
 _HELD = 1 << 20
 """Messages that wait for earlier ones at most."""
+RATE_TOLERANCE = 0.2
+"""Share by which a recording may be faster or slower than configured: beyond, every threshold and time is wrong."""
+_RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
+"""Samples from which the rate of a recording is told, and steps between samples that this takes at least."""
 Tap = Callable[[Batch, Int], None]
 """Is shown each batch and the numbers of the messages in it that are used."""
 
@@ -115,6 +119,9 @@ class Samples:
         self._span = (start, end)
         self._tap = tap
         self.period = period
+        self._configured = config.sample_rate
+        self._first: list[Int] | None = []
+        """Stamps of the first samples; None: their rate was checked."""
         self._last = -1
         self.origin: int | None = None
         """Stamp of the first message, ns: the times of faults, start and end count from here."""
@@ -135,17 +142,29 @@ class Samples:
         Raises
         ------
         BagError
-            If it holds not a single message that can be used.
+            If it holds not a single message that can be used, or samples of another rate than configured.
         """
         for messages in self._portions():
             self.messages += len(messages)
             if self.period:
                 self._note_newest(messages)
-            yield self._block(messages)
+            block = self._block(messages)
+            self._check_rate(block.stamp)
+            yield block
         if self.messages == 0:
             raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
         if self.source.stamped and len(rest := self.alignment.flush()):
             yield as_block(rest, len(self.topics))
+        self._check_rate(None)
+
+    def _check_rate(self, stamp: Int | None) -> None:
+        """Take the stamps (k,) of a block, ns, None at the end, and check the rate once enough are there."""
+        if self._first is None:
+            return
+        self._first += [stamp] if stamp is not None else []
+        if stamp is None or sum(map(len, self._first)) >= _RATE_SAMPLES:
+            first, self._first = self._first, None
+            check_sample_rate(self.recording.path, np.concatenate(first) if first else np.zeros(0), self._configured)
 
     def _portions(self) -> Iterator[Messages]:
         """Put messages together, or apart, into what becomes a block."""
@@ -231,6 +250,36 @@ class Samples:
             self._tap(batch, rows)
         messages = Messages(batch.topic, batch.log_time, stamp, decoded.values)
         return messages if len(rows) == len(keep) else messages.at(rows)
+
+
+def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:
+    """Check that the samples of a recording come about as often as configured.
+
+    Parameters
+    ----------
+    path
+        Of the recording, for the message.
+    stamp
+        (k,) stamps of its samples, ns; of fewer than 51 nothing is known.
+    configured
+        Sample rate, Hz.
+
+    Raises
+    ------
+    BagError
+        If both what is usual and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples that
+        are lost nor samples that come in bursts are a wrong rate.
+    """
+    steps = np.sort(np.diff(stamp)) * 1e-9
+    if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
+        return
+    usual, mean = 1.0 / np.median(steps), 1.0 / steps[: -max(1, len(steps) // 100)].mean()
+    off = np.array([usual, mean]) / configured
+    if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
+        raise BagError(
+            f"{path}: sample_rate is {configured:g} Hz in the config, the recording has {usual:.4g} Hz: set"
+            f" sample_rate to {usual:.4g}"
+        )
 
 
 def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:

@@ -39,7 +39,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from fdi_ros.bag.mcap_file import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Samples
+from fdi_ros.bag.samples import Samples, check_sample_rate
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
 
@@ -326,6 +326,21 @@ def test_records_are_those_of_a_plain_reading(drawn, flips, absurd, more):
         rows = zip(found.channel.tolist(), found.log_time.tolist(), found.offset, found.length, strict=True)
         messages = [(channel, time, data[start : start + size]) for channel, time, start, size in rows]
         assert (messages, found.topics, found.end) == plainly_read(data, outside)
+
+
+def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
+    regular = START + STEP * np.arange(2000)
+    random = np.random.default_rng(0)
+    lossy = regular[random.random(2000) > 0.15]
+    # Two by two, and a pause of an hour.
+    bursts, pause = regular - STEP // 2 * (np.arange(2000) % 2), regular + 3600 * 10**9 * (np.arange(2000) > 1000)
+    for stamp in (regular, lossy, bursts, pause):
+        for configured in (100.0, 90.0, 110.0):
+            check_sample_rate("bag", stamp, configured)
+        for configured in (25.0, 400.0):
+            with pytest.raises(BagError, match=rf"bag: sample_rate is {configured:g} Hz in the config"):
+                check_sample_rate("bag", stamp, configured)
+    check_sample_rate("bag", regular[:50], 1.0)
 
 
 # Bags of ROS 1 -------------------------------------------------------------------------------------------------------

@@ -158,15 +158,24 @@ def test_rates_are_printed_in_degrees_where_asked_for(fdi, flight, config, repla
     assert "std x deg/s" in out
 
 
-def test_a_sample_rate_that_is_not_the_recordings_is_said(fdi, flight, config, tmp_path, replay):
-    (tmp_path / "c.yaml").write_text(config.read_text().replace("sample_rate: 100.0", "sample_rate: 1000.0"))
-    said = "note: sample_rate is 1000 Hz in the config, the recording has 100 Hz"
+@pytest.mark.parametrize("configured", [10.0, 78.0, 130.0, 1000.0])
+def test_a_sample_rate_that_is_far_from_the_recordings_is_refused(refused, flight, config, tmp_path, configured):
+    wrong = tmp_path / "c.yaml"
+    wrong.write_text(config.read_text().replace("sample_rate: 100.0", f"sample_rate: {configured}"))
+    said = f"sample_rate is {configured:g} Hz in the config, the recording has 100 Hz: set sample_rate to 100"
+    for words in (["replay"], ["sweep"], ["calibrate", "--output", tmp_path / "out.yaml"]):
+        assert said in refused(words[0], flight, "--config", wrong, *words[1:])
+
+
+def test_a_sample_rate_that_is_not_quite_the_recordings_is_said(fdi, flight, config, tmp_path, replay):
+    (tmp_path / "c.yaml").write_text(config.read_text().replace("sample_rate: 100.0", "sample_rate: 115.0"))
+    said = "note: sample_rate is 115 Hz in the config, the recording has 100 Hz"
     assert said in fdi("replay", flight, "--config", tmp_path / "c.yaml", "--end", 1)[1]
     assert "sample_rate" not in replay("--end", 1)[1]
     words = ("--end", 1, "--quiet", "--check", "judged>=0 unchecked<=6")
     code, out, err = fdi("replay", flight, "--config", tmp_path / "c.yaml", *words)
     assert (code, out, err.count("\n")) == (0, "", 1)
-    assert err.startswith("fdi: warning: sample_rate is 1000 Hz in the config, the recording has 100 Hz")
+    assert err.startswith("fdi: warning: sample_rate is 115 Hz in the config, the recording has 100 Hz")
     assert replay(*words) == (0, "", "")
     # A word on compiling is none for who asked for quiet.
     assert not logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
