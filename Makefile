@@ -11,7 +11,7 @@ RUN = bash tools/run.sh
 .PHONY: demo test ubuntu fuzz check docs format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
-	@$(VENV) "watch" "$(PYTHON)" compile
+	@$(VENV) "watch,logs" "$(PYTHON)" compile
 	@$(RUN) python -c 'import rclpy' || { echo "make demo needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash first"; exit 1; }
 	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
 
@@ -33,7 +33,7 @@ check: venv ## style and types
 	    echo "types not checked: the last NumPy for Python 3.10 states the shapes of arrays too narrowly; take 3.11 or newer"; fi
 
 docs: ## this project's pages and API reference as a site in build/docs; warnings and dead links are errors
-	@$(VENV) "watch,calibrate,cluster,test,docs" $(PYTHON)
+	@$(VENV) "watch,logs,calibrate,cluster,test,docs" $(PYTHON)
 	@rm -rf build/docs
 	@$(RUN) python -m sphinx -q -W --keep-going -d build/doctrees -b html docs build/docs
 	@echo "wrote build/docs/index.html"
@@ -43,7 +43,7 @@ format: venv ## mend what style can mend
 	@$(RUN) python -m ruff format .
 
 venv: ## .venv with all that tests and checks need
-	@$(VENV) "watch,calibrate,cluster,test" $(PYTHON)
+	@$(VENV) "watch,logs,calibrate,cluster,test" $(PYTHON)
 
 clean: ## remove .venv and all that was built
 	rm -rf .venv .venv-ubuntu build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
