@@ -168,6 +168,9 @@ def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     drag = ActionChains(browser).move_to_element_with_offset(area, -width // 4, 0).click_and_hold()
     drag.move_by_offset(width // 8, 0).move_by_offset(width // 8, 0).release().perform()
     wait(browser, "links.time.range[0] > 10")
+    # The link of the page shows the same to whoever it is passed on to.
+    low, high = map(float, ask(browser, "location.hash").removeprefix("#t=").split(","))
+    assert [low, high] == pytest.approx(ask(browser, "links.time.range"), abs=1e-3)
     zoomed = ask(browser, ranges)
     assert all(span == zoomed[0] for span in zoomed)
     assert zoomed[0] == pytest.approx([14, 29], abs=1.5)
@@ -176,6 +179,16 @@ def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     assert len(re.findall("[ML]", drawn)) <= 100 * (zoomed[0][1] - zoomed[0][0]) + 3
     ActionChains(browser).move_to_element(area).double_click().perform()
     wait(browser, "links.time.range[0] < 1")
+
+
+def test_a_link_to_a_time_shows_it_and_contents_lead_to_all_sections(driver, report):
+    driver.get(f"{report.as_uri()}#t=20,25")
+    wait(driver, "document.documentElement.dataset.ready === 'yes'")
+    assert ask(driver, "links.time.range") == [20, 25]
+    lost = "[...document.querySelectorAll('nav a')].filter(a => !document.querySelector(a.getAttribute('href')))"
+    assert ask(driver, f"{lost}.length") == 0
+    assert ask(driver, "document.querySelectorAll('nav a').length === document.querySelectorAll('section').length")
+    driver.get("about:blank")
 
 
 def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
