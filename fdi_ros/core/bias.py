@@ -111,12 +111,12 @@ def f_quantile(probability: float, above: int, below: int) -> float:
 
 
 @compiled
-def take_for_bias(own: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
+def take_for_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
     """Take one sample into the average.
 
     Parameters
     ----------
-    own
+    average
         The average.
     sensors
         All channels, n.
@@ -133,30 +133,30 @@ def take_for_bias(own: Bias, sensors: Sensors, stamp: int, z: Array, good: int, 
     -------
     Whether the sample was used; False if with it the bias is learned.
     """
-    if own.started and stamp >= own.start + own.duration:
-        conclude(own, sensors, lost)
-        if not own.learning:
+    if average.started and stamp >= average.start + average.duration:
+        conclude(average, sensors, lost)
+        if not average.learning:
             return False
-    if not own.started:
-        begin(own, sensors.n, stamp)
-    own.rows += 1
-    portion = own.portions[(stamp - own.start) * BIAS_PORTIONS // own.duration]
+    if not average.started:
+        begin(average, sensors.n, stamp)
+    average.rows += 1
+    portion = average.portions[(stamp - average.start) * BIAS_PORTIONS // average.duration]
     for i in range(sensors.n):
         if good >> i & 1:
-            own.count[i] += 1
-            take_value(own.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
+            average.count[i] += 1
+            take_value(average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
     return True
 
 
 @compiled
-def begin(own: Bias, n: int, stamp: int) -> None:
+def begin(average: Bias, n: int, stamp: int) -> None:
     """Begin a new average."""
-    own.started, own.start, own.rows = True, stamp, 0
+    average.started, average.start, average.rows = True, stamp, 0
     for i in range(n):
-        own.count[i] = own.groups[i].count = 0
+        average.count[i] = average.groups[i].count = 0
         for b in range(BIAS_PORTIONS):
-            own.portions[b].count[i] = 0
-            own.portions[b].total[i] = own.portions[b].squares[i] = 0.0
+            average.portions[b].count[i] = 0
+            average.portions[b].total[i] = average.portions[b].squares[i] = 0.0
 
 
 @compiled
@@ -195,115 +195,115 @@ def middle_mean(values: Array, count: int) -> float:
 
 
 @compiled
-def average_channel(own: Bias, i: int) -> bool:
+def average_channel(average: Bias, i: int) -> bool:
     """Average and scatter of one channel; False if it gave no group of values."""
     filled = 0
     for b in range(BIAS_PORTIONS):
-        portion = own.portions[b]
+        portion = average.portions[b]
         if portion.count[i] > 0:
-            own.ordered[filled] = portion.total[i] / portion.count[i]
+            average.ordered[filled] = portion.total[i] / portion.count[i]
             filled += 1
     if filled == 0:
-        own.average[i] = own.scatter[i] = 0.0
+        average.average[i] = average.scatter[i] = 0.0
         return False
-    own.average[i] = middle_mean(own.ordered, filled)
+    average.average[i] = middle_mean(average.ordered, filled)
     for b in range(filled):
-        gap = own.ordered[b] - own.average[i]
-        own.ordered[b] = gap * gap
-    between = middle_mean(own.ordered, filled)
+        gap = average.ordered[b] - average.average[i]
+        average.ordered[b] = gap * gap
+    between = middle_mean(average.ordered, filled)
     filled = 0
     for b in range(BIAS_PORTIONS):
-        portion = own.portions[b]
+        portion = average.portions[b]
         if portion.count[i] > 0:
-            own.ordered[filled] = portion.squares[i] / portion.count[i] / MIDDLE_SQUARE
+            average.ordered[filled] = portion.squares[i] / portion.count[i] / MIDDLE_SQUARE
             filled += 1
-    own.scatter[i] = math.sqrt(middle_mean(own.ordered, filled) + between)
+    average.scatter[i] = math.sqrt(middle_mean(average.ordered, filled) + between)
     return True
 
 
 @compiled
-def begin_in_motion(own: Bias, n: int) -> None:
+def begin_in_motion(average: Bias, n: int) -> None:
     """Go on without an average, as there was no rest: with the biases as given, to be followed from there."""
-    own.learning, own.outcome = False, IN_MOTION
+    average.learning, average.outcome = False, IN_MOTION
     for i in range(n):
-        own.value[i] = own.centre[i]
-    own.known = (1 << n) - 1
+        average.value[i] = average.centre[i]
+    average.known = (1 << n) - 1
 
 
 @compiled
-def conclude(own: Bias, sensors: Sensors, lost: int) -> None:
+def conclude(average: Bias, sensors: Sensors, lost: int) -> None:
     """Accept the time as rest and set the bias, or note why not."""
     heard = at_rest = resting = restless = 0
     for i in range(sensors.n):
-        enough = average_channel(own, i)
-        if enough and own.count[i] * LEAST_GIVEN > own.rows and not lost >> i & 1:
+        enough = average_channel(average, i)
+        if enough and average.count[i] * LEAST_GIVEN > average.rows and not lost >> i & 1:
             heard |= 1 << i
-            if abs(own.average[i]) <= own.max_rate and own.scatter[i] <= own.max_std[i]:
+            if abs(average.average[i]) <= average.max_rate and average.scatter[i] <= average.max_std[i]:
                 at_rest |= 1 << i
                 resting += 1
             else:
                 restless += 1
-    own.started = False
-    own.heard, own.restless = heard, heard & ~at_rest
-    moved = moves_together(own, sensors, at_rest, resting)
+    average.started = False
+    average.heard, average.restless = heard, heard & ~at_rest
+    moved = moves_together(average, sensors, at_rest, resting)
     # One channel that does not look at rest is a bad channel; if more do, the vehicle moves.
-    if restless <= 1 and resting >= 3 and own.rows >= LEAST_ROWS and not moved:
+    if restless <= 1 and resting >= 3 and average.rows >= LEAST_ROWS and not moved:
         for i in range(sensors.n):
             if at_rest >> i & 1:
-                own.value[i] = own.average[i]
-        own.known = at_rest | lost
-        own.learning, own.outcome = False, LEARNED
+                average.value[i] = average.average[i]
+        average.known = at_rest | lost
+        average.learning, average.outcome = False, LEARNED
     else:
-        own.outcome = NOT_AT_REST if own.restless or moved else TOO_FEW
+        average.outcome = NOT_AT_REST if average.restless or moved else TOO_FEW
 
 
 @compiled
-def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
+def moves_together(average: Bias, sensors: Sensors, mask: int, k: int) -> bool:
     """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
-    own.common_rate = own.sway = 0.0
-    own.max_common_rate = own.max_sway = math.inf
-    if not spans(own, sensors, mask):
+    average.common_rate = average.sway = 0.0
+    average.max_common_rate = average.max_sway = math.inf
+    if not spans(average, sensors, mask):
         return False
     noise = 0.0
     for i in range(sensors.n):
-        own.part[i] = own.average[i] - own.centre[i]
+        average.part[i] = average.average[i] - average.centre[i]
         if mask >> i & 1:
             noise += sensors.noise_std[i] * sensors.noise_std[i] / k
-    turn, explained, other = split(own, sensors, mask)
+    turn, explained, other = split(average, sensors, mask)
     size = (PRIOR * USUAL * USUAL + other) / (k - _RATE + PRIOR)
-    own.common_rate = turn
-    own.max_common_rate = turn * math.sqrt(own.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
-    explained, other, count = split_portions(own, sensors, mask)
+    average.common_rate = turn
+    average.max_common_rate = turn * math.sqrt(average.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
+    explained, other, count = split_portions(average, sensors, mask)
     if k > _RATE and count > 1:
-        own.sway = math.sqrt(explained / (_RATE * (count - 1)))
-        own.max_sway = math.sqrt(own.sway_ratio[k - 1] * other / ((k - _RATE) * (count - 1)) + noise)
-    return own.common_rate > own.max_common_rate or own.sway > own.max_sway
+        average.sway = math.sqrt(explained / (_RATE * (count - 1)))
+        average.max_sway = math.sqrt(average.sway_ratio[k - 1] * other / ((k - _RATE) * (count - 1)) + noise)
+    return average.common_rate > average.max_common_rate or average.sway > average.max_sway
 
 
 @compiled
-def spans(own: Bias, sensors: Sensors, mask: int) -> bool:
+def spans(average: Bias, sensors: Sensors, mask: int) -> bool:
     """Whether the channels in mask span space; the inverse of their H'H is noted."""
     for a in range(3):
         for b in range(3):
-            own.normal[a, b] = 0.0
+            average.normal[a, b] = 0.0
             for i in range(sensors.n):
                 if mask >> i & 1:
-                    own.normal[a, b] += sensors.axes[i, a] * sensors.axes[i, b]
-    size = (own.normal[0, 0] + own.normal[1, 1] + own.normal[2, 2]) / 3
-    determinant = math.exp(invert(own.normal, 3, own.inverse))
+                    average.normal[a, b] += sensors.axes[i, a] * sensors.axes[i, b]
+    size = (average.normal[0, 0] + average.normal[1, 1] + average.normal[2, 2]) / 3
+    determinant = math.exp(invert(average.normal, 3, average.inverse))
     return determinant > _PLANE * size * size * size
 
 
 @compiled
-def split(own: Bias, sensors: Sensors, mask: int) -> tuple[float, float, float]:
-    """Length of the rate that explains ``own.part``, sum of squares of what it explains, and of what it does not."""
+def split(average: Bias, sensors: Sensors, mask: int) -> tuple[float, float, float]:
+    """Length of the rate that explains ``average.part``; sums of squares of what it explains, and of the rest."""
     x = y = z = 0.0
     for i in range(sensors.n):
         if mask >> i & 1:
-            x += sensors.axes[i, 0] * own.part[i]
-            y += sensors.axes[i, 1] * own.part[i]
-            z += sensors.axes[i, 2] * own.part[i]
-    m = own.inverse
+            x += sensors.axes[i, 0] * average.part[i]
+            y += sensors.axes[i, 1] * average.part[i]
+            z += sensors.axes[i, 2] * average.part[i]
+    m = average.inverse
     rate_x = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
     rate_y = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
     rate_z = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
@@ -312,29 +312,31 @@ def split(own: Bias, sensors: Sensors, mask: int) -> tuple[float, float, float]:
         if mask >> i & 1:
             along = sensors.axes[i, 0] * rate_x + sensors.axes[i, 1] * rate_y + sensors.axes[i, 2] * rate_z
             explained += along * along
-            other += (own.part[i] - along) * (own.part[i] - along)
+            other += (average.part[i] - along) * (average.part[i] - along)
     return math.sqrt(rate_x * rate_x + rate_y * rate_y + rate_z * rate_z), explained, other
 
 
 @compiled
-def split_portions(own: Bias, sensors: Sensors, mask: int) -> tuple[float, float, int]:
+def split_portions(average: Bias, sensors: Sensors, mask: int) -> tuple[float, float, int]:
     """Deviations of the portions from their mean: sums of squares of both parts, and the number of portions."""
     count = 0
     for i in range(sensors.n):
-        own.middle[i] = 0.0
+        average.middle[i] = 0.0
     for b in range(BIAS_PORTIONS):
-        if is_filled(own.portions[b], sensors.n, mask):
+        if is_filled(average.portions[b], sensors.n, mask):
             count += 1
             for i in range(sensors.n):
                 if mask >> i & 1:
-                    own.middle[i] += own.portions[b].total[i] / own.portions[b].count[i]
+                    average.middle[i] += average.portions[b].total[i] / average.portions[b].count[i]
     explained = other = 0.0
     for b in range(BIAS_PORTIONS):
-        if is_filled(own.portions[b], sensors.n, mask):
+        if is_filled(average.portions[b], sensors.n, mask):
             for i in range(sensors.n):
                 if mask >> i & 1:
-                    own.part[i] = own.portions[b].total[i] / own.portions[b].count[i] - own.middle[i] / count
-            _, one, two = split(own, sensors, mask)
+                    average.part[i] = (
+                        average.portions[b].total[i] / average.portions[b].count[i] - average.middle[i] / count
+                    )
+            _, one, two = split(average, sensors, mask)
             explained += one
             other += two
     return explained, other, count

@@ -139,48 +139,48 @@ WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
 
 
 @compiled
-def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> bool:
+def decide(limits: DecisionSettings, decision: Decision, n: int, evidence: Evidence) -> bool:
     """Take the verdict on one sample; return whether it changed what is declared."""
-    suspected = evidence.suspected & ~own.faulty
+    suspected = evidence.suspected & ~decision.faulty
     counted = 0 if evidence.held else suspected
-    doubtful = suspected | evidence.outliers & ~own.faulty
-    push(own, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
-    own.suspicion = at_least(own, SUSPECTED, n, 1)
+    doubtful = suspected | evidence.outliers & ~decision.faulty
+    push(decision, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
+    decision.suspicion = at_least(decision, SUSPECTED, n, 1)
     # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
-        own.last_doubt = evidence.stamp
-    faulty, undecided = confirm(own, limits, n)
-    broken = (evidence.broken | evidence.intermittent) & ~own.faulty
-    faulty |= evidence.certain & ~own.faulty
+        decision.last_doubt = evidence.stamp
+    faulty, undecided = confirm(decision, limits, n)
+    broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
+    faulty |= evidence.certain & ~decision.faulty
     if limits.evidence:
         # A set follows the evidence, and ends with it; one by votes stays.
-        own.voted |= undecided
-        if evidence.stamp - own.last_doubt >= limits.clean_time:
-            own.voted = 0
-        wanted = (own.voted | evidence.undecided) if evidence.judged else own.ambiguous
+        decision.voted |= undecided
+        if evidence.stamp - decision.last_doubt >= limits.clean_time:
+            decision.voted = 0
+        wanted = (decision.voted | evidence.undecided) if evidence.judged else decision.ambiguous
     else:
-        wanted = own.ambiguous | undecided
-    follow_declared(limits, own, n, evidence)
+        wanted = decision.ambiguous | undecided
+    follow_declared(limits, decision, n, evidence)
     returns, clears = 0, False
     if not limits.latch:
-        returns = find_returns(limits, own, n, evidence.stamp)
-        clears = own.ambiguous != 0 and evidence.stamp - own.last_doubt >= limits.clean_time
+        returns = find_returns(limits, decision, n, evidence.stamp)
+        clears = decision.ambiguous != 0 and evidence.stamp - decision.last_doubt >= limits.clean_time
     # A set of which a member is now known to be faulty is explained by it.
-    if clears or own.ambiguous & (faulty | broken):
-        own.voted = wanted = 0
-    after = (own.faulty | faulty | broken) & ~returns
-    own.voted &= ~after
+    if clears or decision.ambiguous & (faulty | broken):
+        decision.voted = wanted = 0
+    after = (decision.faulty | faulty | broken) & ~returns
+    decision.voted &= ~after
     wanted &= ~after
-    if after == own.faulty and wanted == own.ambiguous:
+    if after == decision.faulty and wanted == decision.ambiguous:
         return False
-    own.ambiguous = wanted
+    decision.ambiguous = wanted
     for i in range(n):
-        if after >> i & 1 and not own.faulty >> i & 1:
-            own.why[i] = reason_for(evidence, i)
+        if after >> i & 1 and not decision.faulty >> i & 1:
+            decision.why[i] = reason_for(evidence, i)
         elif not after >> i & 1:
-            own.why[i] = UNDECLARED
-    own.faulty = after
-    forget_alarms(own, limits, n)
+            decision.why[i] = UNDECLARED
+    decision.faulty = after
+    forget_alarms(decision, limits, n)
     return True
 
 
@@ -198,37 +198,37 @@ def reason_for(evidence: Evidence, i: int) -> int:
 
 @compiled
 def push(
-    own: Decision, limits: DecisionSettings, n: int, suspected: int, counted: int, isolated: int, checked: int
+    decision: Decision, limits: DecisionSettings, n: int, suspected: int, counted: int, isolated: int, checked: int
 ) -> None:
     """Move the window on by one sample."""
-    own.at = (own.at + 1) % limits.window
+    decision.at = (decision.at + 1) % limits.window
     if counted:
-        own.alarms += 1
-    if own.sets[COUNTED, own.at]:
-        own.alarms -= 1
+        decision.alarms += 1
+    if decision.sets[COUNTED, decision.at]:
+        decision.alarms -= 1
     for kind in range(4):
         new = checked if kind == CHECKED else isolated if kind == ISOLATED else counted
         if kind == SUSPECTED:
             new = suspected
-        old = own.sets[kind, own.at]
-        own.sets[kind, own.at] = new
+        old = decision.sets[kind, decision.at]
+        decision.sets[kind, decision.at] = new
         if new != old:
             for i in range(n):
-                own.count[kind, i] += (new >> i & 1) - (old >> i & 1)
+                decision.count[kind, i] += (new >> i & 1) - (old >> i & 1)
 
 
 @compiled
-def at_least(own: Decision, kind: int, n: int, least: int) -> int:
+def at_least(decision: Decision, kind: int, n: int, least: int) -> int:
     """Bits of the channels that are in the sets of a kind of so many samples of the window at least."""
     mask = 0
     for i in range(n):
-        if own.count[kind, i] >= least:
+        if decision.count[kind, i] >= least:
             mask |= 1 << i
     return mask
 
 
 @compiled
-def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
+def confirm(decision: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
     """Channels that the alarms of the window declare faulty, and a set one of which is.
 
     A channel is faulty when at least `alarms` of the last `window` samples suspected it and at least half that many
@@ -236,13 +236,13 @@ def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
     that at least half of them suspected are undecided together, and so they are when all the window disagrees about it.
     """
     half = (limits.alarms + 1) // 2
-    enough = at_least(own, COUNTED, n, limits.alarms)
-    faulty = enough & at_least(own, ISOLATED, n, half)
+    enough = at_least(decision, COUNTED, n, limits.alarms)
+    faulty = enough & at_least(decision, ISOLATED, n, half)
     undecided = 0
-    if enough or own.alarms == limits.window:
-        undecided = at_least(own, COUNTED, n, half)
+    if enough or decision.alarms == limits.window:
+        undecided = at_least(decision, COUNTED, n, half)
         if not undecided:
-            undecided = at_least(own, COUNTED, n, 1)
+            undecided = at_least(decision, COUNTED, n, 1)
     if undecided & (undecided - 1) == 0:
         # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
         faulty |= undecided & enough
@@ -250,57 +250,57 @@ def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
 
 
 @compiled
-def follow_declared(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> None:
+def follow_declared(limits: DecisionSettings, decision: Decision, n: int, evidence: Evidence) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
     for i in range(n):
         # That of one that is not declared counts from its declaration, not from that of another.
-        is_declared = own.faulty >> i & 1 and not limits.latch
+        is_declared = decision.faulty >> i & 1 and not limits.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
-            own.last_bad[i] = evidence.stamp
-            own.error_sum[i], own.error_count[i] = 0.0, 0
+            decision.last_bad[i] = evidence.stamp
+            decision.error_sum[i], decision.error_count[i] = 0.0, 0
         else:
-            own.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
-            own.error_count[i] += 1
+            decision.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
+            decision.error_count[i] += 1
 
 
 @compiled
-def find_returns(limits: DecisionSettings, own: Decision, n: int, stamp: int) -> int:
+def find_returns(limits: DecisionSettings, decision: Decision, n: int, stamp: int) -> int:
     """Bits of the declared channels that have agreed for the clean time."""
     returns = 0
     for i in range(n):
-        if own.faulty >> i & 1 and stamp - own.last_bad[i] >= limits.clean_time:
-            if abs(own.error_sum[i]) <= limits.mean_limit[i] * own.error_count[i]:
+        if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= limits.clean_time:
+            if abs(decision.error_sum[i]) <= limits.mean_limit[i] * decision.error_count[i]:
                 returns |= 1 << i
             else:
                 # A small fault agrees sample by sample: after its end the mean begins anew.
-                own.last_bad[i], own.error_sum[i], own.error_count[i] = stamp, 0.0, 0
+                decision.last_bad[i], decision.error_sum[i], decision.error_count[i] = stamp, 0.0, 0
     return returns
 
 
 @compiled
-def forget_kind(own: Decision, limits: DecisionSettings, n: int, kind: int) -> None:
+def forget_kind(decision: Decision, limits: DecisionSettings, n: int, kind: int) -> None:
     """Forget which channels were in the sets of a kind."""
     for k in range(limits.window):
-        own.sets[kind, k] = 0
+        decision.sets[kind, k] = 0
     for i in range(n):
-        own.count[kind, i] = 0
+        decision.count[kind, i] = 0
 
 
 @compiled
-def forget_alarms(own: Decision, limits: DecisionSettings, n: int) -> None:
+def forget_alarms(decision: Decision, limits: DecisionSettings, n: int) -> None:
     """Forget the alarms of the window. What was checked stays known; it is the last kind."""
-    own.alarms = 0
+    decision.alarms = 0
     for kind in range(CHECKED):
-        forget_kind(own, limits, n, kind)
+        forget_kind(decision, limits, n, kind)
 
 
 @compiled
-def clear(own: Decision, limits: DecisionSettings, n: int) -> None:
+def clear(decision: Decision, limits: DecisionSettings, n: int) -> None:
     """Clear all that is declared or suspected."""
-    own.faulty = own.ambiguous = own.voted = own.suspicion = 0
+    decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0
     for i in range(n):
-        own.why[i] = UNDECLARED
-    forget_alarms(own, limits, n)
+        decision.why[i] = UNDECLARED
+    forget_alarms(decision, limits, n)
 
 
 @compiled

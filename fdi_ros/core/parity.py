@@ -76,79 +76,79 @@ def invert(a: Array, size: int, out: Array) -> float:
 
 
 @compiled
-def list_channels(own: Parity, n: int, mask: int) -> int:
-    """List the channels of a set in ``own.place``; return how many."""
+def list_channels(parity: Parity, n: int, mask: int) -> int:
+    """List the channels of a set in ``parity.place``; return how many."""
     count = 0
     for i in range(n):
         if mask >> i & 1:
-            own.place[count] = i
+            parity.place[count] = i
             count += 1
     return count
 
 
 @compiled
-def weigh_each(own: Parity, n: int, mask: int, variance: Array) -> None:
+def weigh_each(parity: Parity, n: int, mask: int, variance: Array) -> None:
     """W of independent errors of the given variances (n,), (rad/s)^2."""
     for i in range(n):
         for j in range(n):
-            own.weight[i, j] = 0.0
+            parity.weight[i, j] = 0.0
         if mask >> i & 1:
-            own.weight[i, i] = 1.0 / variance[i]
+            parity.weight[i, i] = 1.0 / variance[i]
 
 
 @compiled
-def weigh_together(own: Parity, n: int, mask: int, covariance: Array) -> None:
+def weigh_together(parity: Parity, n: int, mask: int, covariance: Array) -> None:
     """W of errors of the given covariance (n, n), (rad/s)^2."""
-    count = list_channels(own, n, mask)
+    count = list_channels(parity, n, mask)
     for p in range(count):
         for q in range(p + 1):
-            own.information[p, q] = covariance[own.place[p], own.place[q]]
-    invert(own.information, count, own.weight)
+            parity.information[p, q] = covariance[parity.place[p], parity.place[q]]
+    invert(parity.information, count, parity.weight)
     for p in range(count):
         for q in range(count):
-            own.information[p, q] = own.weight[p, q]
+            parity.information[p, q] = parity.weight[p, q]
     for i in range(n):
         for j in range(n):
-            own.weight[i, j] = 0.0
+            parity.weight[i, j] = 0.0
     for p in range(count):
         for q in range(count):
-            own.weight[own.place[p], own.place[q]] = own.information[p, q]
+            parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
 
 
 @compiled
-def find_normal(own: Parity, n: int, axes: Array, known: float) -> None:
+def find_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out W H, and of ``H' W H + K`` the lower triangle."""
     for i in range(n):
         for a in range(3):
             total = 0.0
             for j in range(n):
-                total += own.weight[i, j] * axes[j, a]
-            own.weighted[i, a] = total
+                total += parity.weight[i, j] * axes[j, a]
+            parity.weighted[i, a] = total
     for a in range(3):
         for b in range(a + 1):
             total = known if a == b else 0.0
             for i in range(n):
-                total += axes[i, a] * own.weighted[i, b]
-            own.normal[a, b] = total
+                total += axes[i, a] * parity.weighted[i, b]
+            parity.normal[a, b] = total
 
 
 @compiled
-def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
+def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
-    find_normal(own, n, axes, known)
-    invert(own.normal, 3, own.inverse)
+    find_normal(parity, n, axes, known)
+    invert(parity.normal, 3, parity.inverse)
     for a in range(3):
         for i in range(n):
             total = 0.0
             for b in range(3):
-                total += own.inverse[a, b] * own.weighted[i, b]
-            own.gain[a, i] = total
+                total += parity.inverse[a, b] * parity.weighted[i, b]
+            parity.gain[a, i] = total
     for i in range(n):
         for j in range(i + 1):
-            total = own.weight[i, j]
+            total = parity.weight[i, j]
             for a in range(3):
-                total -= own.weighted[i, a] * own.gain[a, j]
-            own.information[i, j] = own.information[j, i] = total
+                total -= parity.weighted[i, a] * parity.gain[a, j]
+            parity.information[i, j] = parity.information[j, i] = total
 
 
 @compiled

@@ -83,16 +83,16 @@ def run(
     is the detector, for ``now.fed_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
     lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
-    own, count = core[0], 0
+    monitor, count = core[0], 0
     for k in range(start, len(samples)):
-        if len(events) - count < own.settings.n:
+        if len(events) - count < monitor.settings.n:
             return k, count, False
         before = count
-        count = step(own, bank[0], memory, subsets, samples[k], k, events, before)
+        count = step(monitor, bank[0], memory, subsets, samples[k], k, events, before)
         if count < 0:
             return k, before, True
-        out[k] = own.last
-        wants = own.wanted != 0 or own.copies.found
+        out[k] = monitor.last
+        wants = monitor.wanted != 0 or monitor.copies.found
         if wants or (stop_at_event and count > before):
             return k + 1, count, wants
     return len(samples), count, False
@@ -454,23 +454,23 @@ def work(
     -------
     Bits of `WORKED` and so on; 0: there is none before the next message.
     """
-    own, main = live[0], core[0]
-    if not own.ready:
+    monitor, main = live[0], core[0]
+    if not monitor.ready:
         return 0
-    sample = own.sample
+    sample = monitor.sample
     count = step(main, bank[0], memory, subsets, sample, 0, events, 0)
     if count < 0:
         return SUPPLY | MORE
-    own.events = count
+    monitor.events = count
     told = WORKED | HAS_EVENTS if count > 0 else WORKED
     if main.last.valid:
-        fill_imu(fused, own.fused_at, main.last.instant - sample.shift, main.last.rate, main.last.covariance)
+        fill_imu(fused, monitor.fused_at, main.last.instant - sample.shift, main.last.rate, main.last.covariance)
         told |= HAS_RATE
     else:
-        own.without_rate += 1
+        monitor.without_rate += 1
     if main.wanted or main.copies.found:
         told |= SUPPLY
-    fill_integrity(integrity, own.integrity_at, main.last, main.settings.n)
-    own.shift = sample.shift
-    own.ready = next_sample(aligner[0], sample)
-    return told | MORE if own.ready else told
+    fill_integrity(integrity, monitor.integrity_at, main.last, main.settings.n)
+    monitor.shift = sample.shift
+    monitor.ready = next_sample(aligner[0], sample)
+    return told | MORE if monitor.ready else told

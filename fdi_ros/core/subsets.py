@@ -194,35 +194,35 @@ def passes_test(
 
 
 @compiled
-def differentiate_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
-    """Take the rate (3,) of one sample; the acceleration is then in ``own.value``."""
-    here = own.count
-    own.count += 1
-    newest = own.history[here % ACCELERATION_SAMPLES]
+def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
+    """Take the rate (3,) of one sample; the acceleration is then in ``acceleration.value``."""
+    here = acceleration.count
+    acceleration.count += 1
+    newest = acceleration.history[here % ACCELERATION_SAMPLES]
     newest.stamp = stamp
     for a in range(3):
         newest.rate[a] = rate[a]
-        own.value[a] = 0.0
+        acceleration.value[a] = 0.0
     if here == 0:
-        note_known(own, newest)
+        note_known(acceleration, newest)
         return
-    while own.oldest + 1 < here and (
-        here - own.oldest >= ACCELERATION_SAMPLES
-        or own.history[(own.oldest + 1) % ACCELERATION_SAMPLES].stamp <= stamp - own.window
+    while acceleration.oldest + 1 < here and (
+        here - acceleration.oldest >= ACCELERATION_SAMPLES
+        or acceleration.history[(acceleration.oldest + 1) % ACCELERATION_SAMPLES].stamp <= stamp - acceleration.window
     ):
-        own.oldest += 1
-        note_known(own, own.history[own.oldest % ACCELERATION_SAMPLES])
-    if own.has_known and math.isfinite(rate[0]):
-        seconds = (stamp - own.known.stamp) * 1e-9
+        acceleration.oldest += 1
+        note_known(acceleration, acceleration.history[acceleration.oldest % ACCELERATION_SAMPLES])
+    if acceleration.has_known and math.isfinite(rate[0]):
+        seconds = (stamp - acceleration.known.stamp) * 1e-9
         for a in range(3):
-            own.value[a] = (rate[a] - own.known.rate[a]) / seconds
+            acceleration.value[a] = (rate[a] - acceleration.known.rate[a]) / seconds
 
 
 @compiled
-def note_known(own: Acceleration, one: TimedRate) -> None:
+def note_known(acceleration: Acceleration, one: TimedRate) -> None:
     """Remember the rate of the oldest sample if it had one."""
     if math.isfinite(one.rate[0]):
-        own.has_known = 1
-        own.known.stamp = one.stamp
+        acceleration.has_known = 1
+        acceleration.known.stamp = one.stamp
         for a in range(3):
-            own.known.rate[a] = one.rate[a]
+            acceleration.known.rate[a] = one.rate[a]

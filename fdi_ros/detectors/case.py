@@ -82,13 +82,13 @@ class Scale:
 
 
 @compiled
-def add_evidence(own: Constants, est: Estimator, scale: Scale, at: int, first_sample: int) -> None:
+def add_evidence(params: Constants, est: Estimator, scale: Scale, at: int, first_sample: int) -> None:
     """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
-    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * own.limit
+    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
     scale.first[scale.newest] = first_sample
     scale.kept = min(scale.kept + 1, KEPT)
     scale.total = 0.0
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         if not est.judged >> i & 1:
             continue
         y, cap = scale.series[scale.newest, i], est.noise.cap[at, i]
@@ -127,7 +127,7 @@ def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> fl
 
 
 @compiled
-def look_back(own: Constants, est: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
+def look_back(params: Constants, est: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
     """Find since when channel i is off, and the evidence for it against the noise of that same time.
 
     Returns
@@ -145,7 +145,7 @@ def look_back(own: Constants, est: Estimator, scale: Scale, i: int, sign: float)
         return since, 0.0
     mean, trust = best / math.sqrt(since), est.noise.degrees[i]
     squares, count = 0.0, 0
-    for j in range(own.sensors.n):
+    for j in range(params.sensors.n):
         if est.judged >> j & 1:
             count += 1
             for k in range(since - 1):
@@ -227,26 +227,26 @@ class State:
 
 
 @compiled
-def take_values(own: Constants, state: State, learns: bool) -> None:
+def take_values(params: Constants, state: State, learns: bool) -> None:
     """Take the statistics of a sample into the noise and the sums."""
     est, scale = state.estimator, state.scales[SAMPLE]
     noise = est.noise
     noise.seen[SAMPLE] += 1.0
     scale.newest = (scale.newest + 1) % KEPT
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         scale.series[scale.newest, i] = 0.0
         if est.judged >> i & 1:
             slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
             scale.series[scale.newest, i] = est.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
-    update_shared(own, est)
-    take_sample_steps(noise, own.sensors.n, est.judged, est.statistic, est.inflation, learns, est.samples % 2)
-    add_evidence(own, est, scale, SAMPLE, est.samples)
+    update_shared(params, est)
+    take_sample_steps(noise, params.sensors.n, est.judged, est.statistic, est.inflation, learns, est.samples % 2)
+    add_evidence(params, est, scale, SAMPLE, est.samples)
 
 
 @compiled
-def take_block_values(own: Constants, state: State, learns: bool) -> None:
+def take_block_values(params: Constants, state: State, learns: bool) -> None:
     """Take the innovations of a block into the noise and the sums of the longer time scales."""
-    est, noise, n = state.estimator, state.estimator.noise, own.sensors.n
+    est, noise, n = state.estimator, state.estimator.noise, params.sensors.n
     mask, information = est.masks[1] & est.judged, est.block_parity.information
     for k in range(1, SCALES):
         scale = state.scales[k]
@@ -265,31 +265,31 @@ def take_block_values(own: Constants, state: State, learns: bool) -> None:
                 known |= 1 << i
                 scale.values[i] /= math.sqrt(scale.information[i])
         if k == BLOCK:
-            take_block_steps(noise, n, known, scale.values, own.expected, learns)
+            take_block_steps(noise, n, known, scale.values, params.expected, learns)
         else:
             take_long_steps(noise, k, n, known, scale.values, learns)
         for i in range(n):
             scale.series[scale.newest, i] = scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
             scale.values[i] = scale.information[i] = 0.0
         scale.filled = 0
-        add_evidence(own, est, scale, k, est.samples - (PER_BLOCK[k] + 1) * own.length + 1)
+        add_evidence(params, est, scale, k, est.samples - (PER_BLOCK[k] + 1) * params.length + 1)
 
 
 @compiled
-def mean_of(own: Constants, state: State) -> float:
+def mean_of(params: Constants, state: State) -> float:
     """Mean of all sums."""
     total, channels = 0.0, 0
     for k in range(SCALES):
         total += state.scales[k].total
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         channels += state.estimator.judged >> i & 1
     return total / max(2 * (SCALES * SIZES - FIRST_LONG) * channels, 1)
 
 
 @compiled
-def find_scores(own: Constants, state: State, scores: Array) -> None:
+def find_scores(params: Constants, state: State, scores: Array) -> None:
     """Logarithm of one plus the largest sum of each channel that is judged, NaN of others; scores (n,) takes them."""
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         largest = 0.0
         for k in range(SCALES):
             sums = state.scales[k].sums
@@ -300,7 +300,7 @@ def find_scores(own: Constants, state: State, scores: Array) -> None:
 
 
 @compiled
-def forget_evidence(own: Constants, state: State) -> None:
+def forget_evidence(params: Constants, state: State) -> None:
     """Begin all sums anew, and end the case; the states and the noise stay."""
     state.case.open = False
     state.case.isolated = state.case.suspects = state.estimator.aside = state.estimator.doubted = 0
@@ -308,42 +308,42 @@ def forget_evidence(own: Constants, state: State) -> None:
         scale = state.scales[k]
         scale.kept = scale.filled = 0
         scale.total = 0.0
-        for i in range(own.sensors.n):
+        for i in range(params.sensors.n):
             scale.values[i] = scale.information[i] = 0.0
             for s in range(SIZES):
                 scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
 
 
 @compiled
-def find_case(own: Constants, state: State) -> None:
+def find_case(params: Constants, state: State) -> None:
     """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
-    est, case, best, found = state.estimator, state.case, math.log(own.limit), False
+    est, case, best, found = state.estimator, state.case, math.log(params.limit), False
     for at in range(SCALES):
         scale, largest, channel, sign = state.scales[at], 0.0, -1, 1.0
-        for i in range(own.sensors.n):
+        for i in range(params.sensors.n):
             for side in range(2):
                 for s in range(SIZES):
                     if scale.sums[side, i, s] > largest:
                         largest, channel, sign = scale.sums[side, i, s], i, 1.0 - 2.0 * side
-        if channel < 0 or largest < own.limit:
+        if channel < 0 or largest < params.limit:
             continue
-        since, evidence = look_back(own, est, scale, channel, sign)
+        since, evidence = look_back(params, est, scale, channel, sign)
         evidence = min(evidence, since * math.log(est.noise.cap[at, channel]))
-        samples = max(PER_BLOCK[at] * own.length, 1)
-        if since >= 2 and since * samples >= own.least and evidence >= best:
+        samples = max(PER_BLOCK[at] * params.length, 1)
+        if since >= 2 and since * samples >= params.least and evidence >= best:
             best, found = evidence, True
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
     if found:
-        open_case(own, state)
+        open_case(params, state)
 
 
 @compiled
-def find_drift(own: Constants, state: State) -> None:
+def find_drift(params: Constants, state: State) -> None:
     """Open a case where the rate of change of a bias is none of those that biases have.
 
     What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the square of a normal value.
     """
-    est, case, layout, worst = state.estimator, state.case, own.layout, 0.0
+    est, case, layout, worst = state.estimator, state.case, params.layout, 0.0
     if case.moved > 0.0 and est.seconds - case.moved_at < LONGEST_DRIFT:
         return
     for r in range(layout.n, layout.count):
@@ -351,27 +351,27 @@ def find_drift(own: Constants, state: State) -> None:
             prior = layout.prior[r] * layout.prior[r]
             learned = max(prior - est.states.p[r, r], LEAST_SHARE * prior)
             worst = max(worst, est.states.x[r] * est.states.x[r] / learned)
-    if worst < 2.0 * math.log(own.limit):
+    if worst < 2.0 * math.log(params.limit):
         return
     for k in range(DRIFT_TIMES):
         seconds = LONGEST_DRIFT / (1 << k)
         if not case.open and est.seconds > seconds:
-            case.onset = est.samples - int(seconds / own.period)
-            open_case(own, state)
+            case.onset = est.samples - int(seconds / params.period)
+            open_case(params, state)
 
 
 @compiled
-def find_change_in_hole(own: Constants, state: State) -> None:
+def find_change_in_hole(params: Constants, state: State) -> None:
     """Open a case where a bias is another than before a hole in the stream, by more than it may have moved meanwhile.
 
     At first after a hole slow noise is unknown, and the states follow what the sums do not see. What they have learned
     of the biases since has the covariance that is lost, D = P0 - P: ``(A (x - x0))_i^2 / (A D A)_ii`` is the square of
     a normal value. A leaves out what a rate explains: that part of the biases is not learned in motion.
     """
-    est, case, n, worst = state.estimator, state.case, own.sensors.n, 0.0
+    est, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
     information = est.parity.information
     before = case.before
-    if case.open or not is_after_hole(own, est) or not predict_from(own, est, est.hole_at, before):
+    if case.open or not is_after_hole(params, est) or not predict_from(params, est, est.hole_at, before):
         return
     for i in range(n):
         change = prior = posterior = 0.0
@@ -383,36 +383,36 @@ def find_change_in_hole(own: Constants, state: State) -> None:
                 posterior += share * est.states.p[j, k]
         if est.judged >> i & 1:
             worst = max(worst, change * change / max(prior - posterior, LEAST_SHARE * prior))
-    if worst >= 2.0 * math.log(own.limit):
+    if worst >= 2.0 * math.log(params.limit):
         case.onset = est.hole_sample + 1
-        open_case(own, state)
+        open_case(params, state)
 
 
 @compiled
-def open_case(own: Constants, state: State) -> None:
+def open_case(params: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
     est, case = state.estimator, state.case
     case.onset = max(case.onset, 1)
     case.open, case.candidate, case.isolated = True, 0, 0
-    copy_states(own.layout, est.states, case.before)
-    since = (est.samples - case.onset) * own.period
+    copy_states(params.layout, est.states, case.before)
+    since = (est.samples - case.onset) * params.period
     before = est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
     if case.onset == est.hole_sample + 1:
         before = est.hole_at
-    predict_from(own, est, before, est.states)
-    name_channels(own, state)
-    if case.open and case.inference.log_odds < STANDS * math.log(own.limit):
-        copy_states(own.layout, case.before, est.states)
+    predict_from(params, est, before, est.states)
+    name_channels(params, state)
+    if case.open and case.inference.log_odds < STANDS * math.log(params.limit):
+        copy_states(params.layout, case.before, est.states)
         case.open = False
         est.aside = 0
-        weigh(own, est)
+        weigh(params, est)
         case.retry = est.samples + 1 + (est.samples - case.onset) // 4
 
 
 @compiled
-def set_mean(own: Constants, state: State, size: int) -> None:
+def set_mean(params: Constants, state: State, size: int) -> None:
     """Set the mean of the last so many samples to be explained, and its covariance."""
-    est, case, n, layout = state.estimator, state.case, own.sensors.n, own.layout
+    est, case, n, layout = state.estimator, state.case, params.sensors.n, params.layout
     total, inference, noise = case.total, case.inference, est.noise
     total_before(est, est.samples - size + 1, total, n)
     size = est.samples - total.sample
@@ -430,12 +430,12 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         inference.rate[a] = moves * (est.total.rate[a] - total.rate[a]) / size
         speed += inference.rate[a] * inference.rate[a]
     # A turn that ends as it began leaves no trace of a delay in the mean.
-    part = min(1.0, 3.0 * own.length / size)
+    part = min(1.0, 3.0 * params.length / size)
     for i in range(n):
         turn = 0.0
         for a in range(3):
-            turn += own.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
-        inference.turn[i] = moves * turn / (size * own.period)
+            turn += params.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
+        inference.turn[i] = moves * turn / (size * params.period)
     signals = est.block_at.signals
     find_signals(layout, inference.rate, inference.turn, signals)
     subtract_errors(layout, est.states, signals, inference.y, inference.y)
@@ -444,16 +444,16 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         for j in range(n):
             inference.covariance[i, j] = est.block_at.covariance[i, j]
         v, over = noise.now.sample[i], noise.longest[i]
-        if size >= own.length:
+        if size >= params.length:
             v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
         else:
-            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / own.length)
-        inference.covariance[i, i] += v / size + est.peak_extra[i] * part + own.bent * own.bent * speed
-        place = layout.delays[own.unit[i]]
+            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / params.length)
+        inference.covariance[i, i] += v / size + est.peak_extra[i] * part + params.bent * params.bent * speed
+        place = layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * est.peak_turn[i] * part
             inference.covariance[i, i] += est.states.p[place, place] * swing * swing
-    add_line(est, inference, n, size, size >= own.length)
+    add_line(est, inference, n, size, size >= params.length)
 
 
 @compiled
@@ -466,23 +466,23 @@ def add_line(est: Estimator, inference: Inference, n: int, size: int, lasts: boo
 
 
 @compiled
-def infer(own: Constants, inference: Inference) -> None:
+def infer(params: Constants, inference: Inference) -> None:
     """Explain the mean."""
-    n = own.sensors.n
+    n = params.sensors.n
     weigh_together(inference.parity, n, inference.mask, inference.covariance)
-    eliminate_rate(inference.parity, n, own.sensors.axes, UNKNOWN_RATE)
-    explain(inference, n, own.sensors.axes, own.members, own.units, own.confidence)
+    eliminate_rate(inference.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    explain(inference, n, params.sensors.axes, params.members, params.units, params.confidence)
 
 
 @compiled
-def shows_others(own: Constants, state: State, named: int) -> bool:
+def shows_others(params: Constants, state: State, named: int) -> bool:
     """Whether single blocks since the onset show errors of other channels than those named.
 
     The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
     its own way in every block, however large it is in each.
     """
     est, case, scale = state.estimator, state.case, state.scales[BLOCK]
-    information, n = est.block_information, own.sensors.n
+    information, n = est.block_information, params.sensors.n
     first = second = -1
     for i in range(n):
         if named >> i & 1:
@@ -500,7 +500,7 @@ def shows_others(own: Constants, state: State, named: int) -> bool:
         a, b = (on_first - both * on_second) / free, (on_second - both * on_first) / free
         variance = 1.0 - a * on_first - b * on_second
         for back in range(scale.kept):
-            if scale.first[(scale.newest - back + KEPT) % KEPT] < case.onset - own.length:
+            if scale.first[(scale.newest - back + KEPT) % KEPT] < case.onset - params.length:
                 break
             x = value_at(scale, back, first)
             y = value_at(scale, back, second) if second >= 0 else 0.0
@@ -517,26 +517,26 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
 
 
 @compiled
-def name_channels(own: Constants, state: State) -> None:
+def name_channels(params: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
-    est, case, n = state.estimator, state.case, own.sensors.n
+    est, case, n = state.estimator, state.case, params.sensors.n
     inference = case.inference
     size = est.samples - case.onset + 1
-    if size * own.period > LONG_TIME:
+    if size * params.period > LONG_TIME:
         # A drift is largest at last.
         size = size // 2 + 1
-    set_mean(own, state, size)
-    infer(own, inference)
+    set_mean(params, state, size)
+    infer(params, inference)
     # By so much of the error found the model may be wrong.
     for i in range(n):
         misfit = MISFIT * inference.largest
         inference.covariance[i, i] += misfit * misfit
-    infer(own, inference)
+    infer(params, inference)
     std = 0.0 if case.isolated else moved_by(inference, n)
-    if std > 0.0 and let_biases_move(own, state, std):
+    if std > 0.0 and let_biases_move(params, state, std):
         return
     case.next = est.samples + max(size // RENAME, 1)
-    if inference.common and shows_others(own, state, inference.common):
+    if inference.common and shows_others(params, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
     case.suspects = inference.union
     if inference.common != case.candidate:
@@ -547,11 +547,11 @@ def name_channels(own: Constants, state: State) -> None:
     settled = (SETTLED if free > FEW_CHECKS else SETTLED_AMONG_FEW) if single else SETTLED_TOGETHER
     if single and inference.log_odds >= CLEAR:
         settled = 0.0
-    if inference.common and (est.samples - case.since) * own.period >= settled:
+    if inference.common and (est.samples - case.since) * params.period >= settled:
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0
-    leave_aside(own, state)
+    leave_aside(params, state)
 
 
 @compiled
@@ -573,19 +573,19 @@ def moved_by(inference: Inference, n: int) -> float:
 
 
 @compiled
-def let_biases_move(own: Constants, state: State, std: float) -> bool:
+def let_biases_move(params: Constants, state: State, std: float) -> bool:
     """Go on with biases that have all moved by so much, rad/s, if that is not too far; return whether it is done."""
-    est, case, n = state.estimator, state.case, own.sensors.n
+    est, case, n = state.estimator, state.case, params.sensors.n
     lately = case.moved * math.exp(-(est.seconds - case.moved_at) / WARMS) + std
     if lately > LARGEST_MOVE:
         return False
     case.moved, case.moved_at, case.moved_since = lately, est.seconds, case.onset
     copy_biases(est.states, n, case.reference)
-    move_biases(own, est, std, 0.5 * LARGEST_MOVE / WARMS)
+    move_biases(params, est, std, 0.5 * LARGEST_MOVE / WARMS)
     est.noise.lived[est.noise.regime] = 0.0
     find_unknown(est.noise, n, 0.0)
-    forget_evidence(own, state)
-    weigh(own, est)
+    forget_evidence(params, state)
+    weigh(params, est)
     return True
 
 
@@ -597,44 +597,44 @@ def copy_biases(states: ErrorStates, n: int, out: Array) -> None:
 
 
 @compiled
-def goes_too_far(own: Constants, state: State) -> bool:
+def goes_too_far(params: Constants, state: State) -> bool:
     """Whether a bias goes farther or faster since all have moved than they may: what passed for a move is a fault."""
-    est, case, feeds = state.estimator, state.case, own.layout.feeds
+    est, case, feeds = state.estimator, state.case, params.layout.feeds
     if case.moved == 0.0 or est.seconds - case.moved_at > WARMS:
         return False
-    for r in range(own.layout.count):
-        far = r < own.sensors.n and abs(est.states.x[r] - case.reference[r]) > LARGEST_MOVE
-        if far or (0 <= feeds[r] < own.sensors.n and abs(est.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
+    for r in range(params.layout.count):
+        far = r < params.sensors.n and abs(est.states.x[r] - case.reference[r]) > LARGEST_MOVE
+        if far or (0 <= feeds[r] < params.sensors.n and abs(est.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
             return True
     return False
 
 
 @compiled
-def take_move_back(own: Constants, state: State) -> None:
+def take_move_back(params: Constants, state: State) -> None:
     """Open a case where all biases seemed to move; for a while no move is believed."""
     state.case.onset, state.case.moved, state.case.moved_at = state.case.moved_since, RUINED, state.estimator.seconds
-    open_case(own, state)
+    open_case(params, state)
 
 
 @compiled
-def leave_aside(own: Constants, state: State) -> None:
+def leave_aside(params: Constants, state: State) -> None:
     """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
     est, case = state.estimator, state.case
     est.doubted = case.suspects | case.isolated
     est.aside = 0
     for wanted in (est.doubted, case.isolated, case.inference.likeliest):
-        if est.aside == 0 and own.spans[est.mask & ~wanted]:
+        if est.aside == 0 and params.spans[est.mask & ~wanted]:
             est.aside = wanted
-    weigh(own, est)
+    weigh(params, est)
 
 
 @compiled
-def follow_case(own: Constants, state: State) -> None:
+def follow_case(params: Constants, state: State) -> None:
     """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
     est, case = state.estimator, state.case
     if est.samples < case.next:
         return
-    name_channels(own, state)
-    if case.open and case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
-        forget_evidence(own, state)
-        weigh(own, est)
+    name_channels(params, state)
+    if case.open and case.inference.log_odds < ENDS and (est.samples - case.onset) * params.period > 1.0:
+        forget_evidence(params, state)
+        weigh(params, est)

@@ -102,216 +102,226 @@ class Inference:
 
 
 @compiled
-def reduce(own: Inference, n: int, k: int) -> None:
+def reduce(inference: Inference, n: int, k: int) -> None:
     """Work out D' u and D' A D for the first k directions."""
     for p in range(k):
-        own.along[p] = 0.0
+        inference.along[p] = 0.0
         for i in range(n):
-            own.along[p] += own.direction[p, i] * own.u[i]
+            inference.along[p] += inference.direction[p, i] * inference.u[i]
         for q in range(p + 1):
             total = 0.0
             for i in range(n):
-                if own.direction[p, i] != 0.0:
+                if inference.direction[p, i] != 0.0:
                     for j in range(n):
-                        total += own.direction[p, i] * own.parity.information[i, j] * own.direction[q, j]
-            own.matrix[p, q] = own.matrix[q, p] = total
+                        total += (
+                            inference.direction[p, i] * inference.parity.information[i, j] * inference.direction[q, j]
+                        )
+            inference.matrix[p, q] = inference.matrix[q, p] = total
 
 
 @compiled
-def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
-    """Log likelihood ratio of errors along the first k of ``own.direction`` against none.
+def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
+    """Log likelihood ratio of errors along the first k of ``inference.direction`` against none.
 
     ``given``: variance of the amplitudes, or 0: as large as they are estimated.
     """
-    reduce(own, n, k)
+    reduce(inference, n, k)
     for p in range(k):
         # Channels that look alike have no matrix that can be inverted.
-        own.matrix[p, p] += ROUNDING * own.matrix[p, p]
-        if not own.matrix[p, p] > 0.0:
+        inference.matrix[p, p] += ROUNDING * inference.matrix[p, p]
+        if not inference.matrix[p, p] > 0.0:
             return NO_LOG
-    invert(own.matrix, k, own.inverse)
-    own.fit, t = 0.0, given
+    invert(inference.matrix, k, inference.inverse)
+    inference.fit, t = 0.0, given
     for p in range(k):
-        own.amplitude[p] = 0.0
+        inference.amplitude[p] = 0.0
         for q in range(k):
-            own.amplitude[p] += own.inverse[p, q] * own.along[q]
-        own.fit += 0.5 * own.amplitude[p] * own.along[p]
+            inference.amplitude[p] += inference.inverse[p, q] * inference.along[q]
+        inference.fit += 0.5 * inference.amplitude[p] * inference.along[p]
         if given == 0.0:
-            t += (own.amplitude[p] * own.amplitude[p] + own.inverse[p, p]) / k
+            t += (inference.amplitude[p] * inference.amplitude[p] + inference.inverse[p, p]) / k
     for p in range(k):
-        own.matrix[p, p] += 1.0 / t
-    log_det = invert(own.matrix, k, own.inverse) + k * math.log(t)
+        inference.matrix[p, p] += 1.0 / t
+    log_det = invert(inference.matrix, k, inference.inverse) + k * math.log(t)
     gain = 0.0
     for p in range(k):
         for q in range(k):
-            gain += 0.5 * own.along[p] * own.inverse[p, q] * own.along[q]
+            gain += 0.5 * inference.along[p] * inference.inverse[p, q] * inference.along[q]
     return gain - 0.5 * log_det
 
 
 @compiled
-def add(own: Inference, n: int, k: int, log_odds: float, members: int, whole: bool) -> None:
+def add(inference: Inference, n: int, k: int, log_odds: float, members: int, whole: bool) -> None:
     """Add a hypothesis, that of k directions whose ratio was worked out last."""
     for i in range(n):
-        own.errors[own.count, i] = 0.0
+        inference.errors[inference.count, i] = 0.0
         for p in range(k):
-            own.errors[own.count, i] += own.direction[p, i] * own.amplitude[p]
-    own.odds[own.count], own.fits[own.count] = log_odds, own.fit
-    own.members[own.count], own.whole[own.count] = members, whole
-    own.count += 1
+            inference.errors[inference.count, i] += inference.direction[p, i] * inference.amplitude[p]
+    inference.odds[inference.count], inference.fits[inference.count] = log_odds, inference.fit
+    inference.members[inference.count], inference.whole[inference.count] = members, whole
+    inference.count += 1
 
 
 @compiled
-def set_direction(own: Inference, n: int, k: int, channel: int) -> None:
+def set_direction(inference: Inference, n: int, k: int, channel: int) -> None:
     """Make direction k the unit vector of a channel."""
     for i in range(n):
-        own.direction[k, i] = 1.0 if i == channel else 0.0
+        inference.direction[k, i] = 1.0 if i == channel else 0.0
 
 
 @compiled
-def add_channels(own: Inference, n: int) -> None:
+def add_channels(inference: Inference, n: int) -> None:
     """Add each channel, and each pair of them where there are checks for it."""
     free = -3
     for i in range(n):
-        free += own.mask >> i & 1
+        free += inference.mask >> i & 1
     for i in range(n):
-        own.error[i] = 0.0
-        if own.judged >> i & 1:
-            set_direction(own, n, 0, i)
-            odds = log_ratio(own, n, 1, 0.0)
-            own.error[i] = own.amplitude[0]
-            add(own, n, 1, odds - SPREAD, 1 << i, False)
+        inference.error[i] = 0.0
+        if inference.judged >> i & 1:
+            set_direction(inference, n, 0, i)
+            odds = log_ratio(inference, n, 1, 0.0)
+            inference.error[i] = inference.amplitude[0]
+            add(inference, n, 1, odds - SPREAD, 1 << i, False)
     if free < 2:
         return
     prior = math.log((COINCIDENCE if free > 2 else TWO_CHECKS * COINCIDENCE) / n) - 2.0 * SPREAD
     for i in range(n):
         for j in range(i):
-            if own.judged >> i & 1 and own.judged >> j & 1:
+            if inference.judged >> i & 1 and inference.judged >> j & 1:
                 aii, ajj, aij = (
-                    own.parity.information[i, i],
-                    own.parity.information[j, j],
-                    own.parity.information[i, j],
+                    inference.parity.information[i, i],
+                    inference.parity.information[j, j],
+                    inference.parity.information[i, j],
                 )
                 # Of two that cannot be told apart one is enough.
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
-                    set_direction(own, n, 0, i)
-                    set_direction(own, n, 1, j)
-                    add(own, n, 2, prior + log_ratio(own, n, 2, 0.0), 1 << i | 1 << j, False)
+                    set_direction(inference, n, 0, i)
+                    set_direction(inference, n, 1, j)
+                    add(inference, n, 2, prior + log_ratio(inference, n, 2, 0.0), 1 << i | 1 << j, False)
 
 
 @compiled
-def add_units(own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int) -> None:
+def add_units(inference: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int) -> None:
     """Add each unit as a whole: any errors of its channels, its gain, its delay."""
     prior = math.log(COINCIDENCE / max(units, 1))
     for unit in range(units):
-        inside = members[unit] & own.mask
+        inside = members[unit] & inference.mask
         count = 0
         for i in range(n):
             if inside >> i & 1 and count < 3:
-                set_direction(own, n, count, i)
+                set_direction(inference, n, count, i)
                 count += 1
-        if count < 2 or inside == own.mask:
+        if count < 2 or inside == inference.mask:
             continue
         # Of a unit the others cannot check in all its axes, the rest is as good a hypothesis.
-        add(own, n, count, prior - count * SPREAD + log_ratio(own, n, count, 0.0), inside, False)
+        add(inference, n, count, prior - count * SPREAD + log_ratio(inference, n, count, 0.0), inside, False)
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
-                along = own.turn[i]
+                along = inference.turn[i]
                 if way == 0:
-                    along = axes[i, 0] * own.rate[0] + axes[i, 1] * own.rate[1] + axes[i, 2] * own.rate[2]
-                own.direction[0, i] = along if inside >> i & 1 else 0.0
-            odds = log_ratio(own, n, 1, std * std)
+                    along = (
+                        axes[i, 0] * inference.rate[0] + axes[i, 1] * inference.rate[1] + axes[i, 2] * inference.rate[2]
+                    )
+                inference.direction[0, i] = along if inside >> i & 1 else 0.0
+            odds = log_ratio(inference, n, 1, std * std)
             if odds > NO_LOG:
-                add(own, n, 1, prior + odds, inside, True)
+                add(inference, n, 1, prior + odds, inside, True)
 
 
 @compiled
-def find_spread(own: Inference, n: int, total: float) -> None:
-    """Mean square of the errors over all hypotheses, whose shares of ``total`` are in ``own.odds``."""
+def find_spread(inference: Inference, n: int, total: float) -> None:
+    """Mean square of the errors over all hypotheses, whose shares of ``total`` are in ``inference.odds``."""
     for i in range(n):
         for j in range(n):
-            own.spread[i, j] = 0.0
-    for k in range(own.count):
-        share = own.odds[k] / total
+            inference.spread[i, j] = 0.0
+    for k in range(inference.count):
+        share = inference.odds[k] / total
         if share > 1e-4:
             for i in range(n):
                 for j in range(n):
-                    own.spread[i, j] += share * own.errors[k, i] * own.errors[k, j]
+                    inference.spread[i, j] += share * inference.errors[k, i] * inference.errors[k, j]
 
 
 @compiled
-def largest_of(own: Inference) -> int:
+def largest_of(inference: Inference) -> int:
     """Return the number of the likeliest hypothesis of those not taken."""
     best = 0
-    for k in range(own.count):
-        if own.odds[k] > own.odds[best]:
+    for k in range(inference.count):
+        if inference.odds[k] > inference.odds[best]:
             best = k
     return best
 
 
 @compiled
-def find_best(own: Inference, n: int) -> None:
+def find_best(inference: Inference, n: int) -> None:
     """Note the likeliest hypothesis, and whether what it leaves is noise."""
-    best, free = largest_of(own), -3
+    best, free = largest_of(inference), -3
     for i in range(n):
-        free += own.mask >> i & 1
-        free -= own.members[best] >> i & 1
-    own.log_odds, own.likeliest, own.fit_of_best = own.odds[best], own.members[best], own.fits[best]
-    own.fitted = 2.0 * (own.total - own.fits[best]) <= FIT + FIT_PER_CHECK * max(free, 0)
-    own.largest = 0.0
+        free += inference.mask >> i & 1
+        free -= inference.members[best] >> i & 1
+    inference.log_odds, inference.likeliest, inference.fit_of_best = (
+        inference.odds[best],
+        inference.members[best],
+        inference.fits[best],
+    )
+    inference.fitted = 2.0 * (inference.total - inference.fits[best]) <= FIT + FIT_PER_CHECK * max(free, 0)
+    inference.largest = 0.0
     for i in range(n):
-        if own.likeliest >> i & 1:
-            own.largest = max(own.largest, abs(own.error[i]))
+        if inference.likeliest >> i & 1:
+            inference.largest = max(inference.largest, abs(inference.error[i]))
 
 
 @compiled
-def choose(own: Inference, n: int, confidence: float) -> None:
+def choose(inference: Inference, n: int, confidence: float) -> None:
     """Take the most likely hypotheses until their odds make up the confidence.
 
     Where all of them contain a channel, it is faulty; but where some of them say that a unit measures motion wrongly,
     its gyros may all be healthy.
     """
-    find_best(own, n)
-    top, total = own.log_odds, 0.0
-    for k in range(own.count):
-        own.odds[k] = math.exp(max(own.odds[k] - top, -700.0))
-        total += own.odds[k]
-    find_spread(own, n, total)
+    find_best(inference, n)
+    top, total = inference.log_odds, 0.0
+    for k in range(inference.count):
+        inference.odds[k] = math.exp(max(inference.odds[k] - top, -700.0))
+        total += inference.odds[k]
+    find_spread(inference, n, total)
     mass, union, common, enough = 0.0, 0, -1, 1.0 - SET_MARGIN * (1.0 - confidence)
     some_whole = False
-    for _ in range(own.count):
+    for _ in range(inference.count):
         if mass >= confidence * total:
             break
-        best = largest_of(own)
+        best = largest_of(inference)
         # A set of one channel would look like a name: it goes on to the next.
         if mass < enough * total or union & (union - 1) == 0:
-            union |= own.members[best]
-        mass += own.odds[best]
-        own.odds[best] = 0.0
-        common &= own.members[best]
-        some_whole = some_whole or own.whole[best] != 0
+            union |= inference.members[best]
+        mass += inference.odds[best]
+        inference.odds[best] = 0.0
+        common &= inference.members[best]
+        some_whole = some_whole or inference.whole[best] != 0
     # Of a unit that is off in all its channels each is suspect, and none is sure: some may be off by very little.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
-    named = own.fitted and common > 0 and few and not some_whole
-    own.common = common if named else 0
-    own.union = union if own.fitted else own.judged
+    named = inference.fitted and common > 0 and few and not some_whole
+    inference.common = common if named else 0
+    inference.union = union if inference.fitted else inference.judged
 
 
 @compiled
-def explain(own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float) -> None:
+def explain(
+    inference: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float
+) -> None:
     """Find the smallest set of hypotheses that holds the truth with the confidence.
 
-    ``own.parity`` is that of the mean.
+    ``inference.parity`` is that of the mean.
     """
-    own.total = 0.0
+    inference.total = 0.0
     for i in range(n):
-        own.u[i] = 0.0
+        inference.u[i] = 0.0
         for j in range(n):
-            if own.mask >> j & 1:
-                own.u[i] += own.parity.information[i, j] * own.y[j]
-        if own.mask >> i & 1:
-            own.total += 0.5 * own.u[i] * own.y[i]
-    own.count = 0
-    add_channels(own, n)
-    add_units(own, n, axes, members, units)
-    choose(own, n, confidence)
+            if inference.mask >> j & 1:
+                inference.u[i] += inference.parity.information[i, j] * inference.y[j]
+        if inference.mask >> i & 1:
+            inference.total += 0.5 * inference.u[i] * inference.y[i]
+    inference.count = 0
+    add_channels(inference, n)
+    add_units(inference, n, axes, members, units)
+    choose(inference, n, confidence)

@@ -102,105 +102,105 @@ SHORT = 1.0 - 1e-9
 
 
 @compiled
-def begin(own: Constants, state: State, sample: SampleInput) -> None:
+def begin(params: Constants, state: State, sample: SampleInput) -> None:
     """Begin with what is known beforehand."""
-    est, n = state.estimator, own.sensors.n
+    est, n = state.estimator, params.sensors.n
     state.begun = True
     if not state.restored:
-        begin_states(own.layout, est.states, sample.bias_std)
-    begin_noise(est.noise, n, own.expected)
-    begin_shared(est.shared, n, own.expected)
-    find_signals(own.layout, est.zero, est.turn, est.at.signals)
-    project(own.layout, est.states, est.at)
+        begin_states(params.layout, est.states, sample.bias_std)
+    begin_noise(est.noise, n, params.expected)
+    begin_shared(est.shared, n, params.expected)
+    find_signals(params.layout, est.zero, est.turn, est.at.signals)
+    project(params.layout, est.states, est.at)
 
 
 @compiled
-def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
+def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
     """Let the time since the last sample pass, s; after a hole all evidence begins anew."""
     est = state.estimator
     if not state.begun:
-        begin(own, state, sample)
+        begin(params, state, sample)
         state.stamp = sample.stamp
     seconds = 1e-9 * (sample.stamp - state.stamp)
     state.stamp = sample.stamp
     est.seconds += seconds
     if sample.interrupted and est.samples > 0:
-        forget_motion(est, own.sensors.n)
-        forget_evidence(own, state)
-        pass_hole(own, est, seconds)
+        forget_motion(est, params.sensors.n)
+        forget_evidence(params, state)
+        pass_hole(params, est, seconds)
         if seconds > PAUSE:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
-            find_unknown(est.noise, own.sensors.n, 0.0)
+            find_unknown(est.noise, params.sensors.n, 0.0)
         est.mask = 0
     return seconds
 
 
 @compiled
-def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
+def take_mask(params: Constants, state: State, sample: SampleInput) -> None:
     """Take over which channels are present. Once those named are out of use, a new search begins without them."""
     est, case = state.estimator, state.case
     blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
-        forget_evidence(own, state)
+        forget_evidence(params, state)
         est.mask = 0
     if sample.mask != est.mask or sample.beyond != est.beyond:
         est.mask, est.beyond = sample.mask, sample.beyond
-        weigh(own, est)
+        weigh(params, est)
 
 
 @compiled
-def take_block(own: Constants, state: State) -> None:
+def take_block(params: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
-    est, case, n = state.estimator, state.case, own.sensors.n
+    est, case, n = state.estimator, state.case, params.sensors.n
     noise, learns = est.noise, not case.open
     meet_rate(noise, est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2)
     find_unknown(noise, n, est.span)
-    take_block_of_samples(noise, n, est.masks[0], own.length, est.all_blocks, own.pace, own.expected, learns)
-    find_level(own, est)
-    predict(own.layout, est.states, est.seconds - est.learned_at)
+    take_block_of_samples(noise, n, est.masks[0], params.length, est.all_blocks, params.pace, params.expected, learns)
+    find_level(params, est)
+    predict(params.layout, est.states, est.seconds - est.learned_at)
     est.learned_at = est.seconds
     if est.blocks < 3:
         return
     est.unseen = False
-    find_turning(own, est)
-    weight = judge_block(own, est)
-    take_block_values(own, state, learns)
-    find_rest(own, est)
+    find_turning(params, est)
+    weight = judge_block(params, est)
+    take_block_values(params, state, learns)
+    find_rest(params, est)
     if est.rest and noise.regime == MOTION and learns:
         change_regime(noise, n, REST, False)
-    suspicious = mean_of(own, state) > math.sqrt(own.limit)
+    suspicious = mean_of(params, state) > math.sqrt(params.limit)
     est.held = est.held + est.span if suspicious else 0.0
     if learns and not suspicious:
         # Of a case that was refused.
         est.doubted = 0
-        keep_line(own, est)
+        keep_line(params, est)
     if case.open or est.held == 0.0 or est.held > LONG_TIME:
-        learn(own, est, weight)
+        learn(params, est, weight)
     if learns and not suspicious and est.seconds - est.snapshot_at >= SNAPSHOT_TIME:
         est.snapshot_at = est.seconds
-        keep_snapshot(own, est)
-    if own.units > 1 and learns and est.seconds - est.taken_off_at > 1.0:
+        keep_snapshot(params, est)
+    if params.units > 1 and learns and est.seconds - est.taken_off_at > 1.0:
         est.taken_off_at = est.seconds
-        if transfer_delays(own, est):
+        if transfer_delays(params, est):
             # What was measured before is of other instants.
-            forget_evidence(own, state)
-    foresee(own, est)
+            forget_evidence(params, state)
+    foresee(params, est)
     if not case.open and est.all_blocks % STRIDE == 0 and est.samples >= case.retry:
-        find_drift(own, state)
-        find_change_in_hole(own, state)
+        find_drift(params, state)
+        find_change_in_hole(params, state)
 
 
 @compiled
-def forget_suspicion(own: Constants, state: State) -> None:
+def forget_suspicion(params: Constants, state: State) -> None:
     """Begin the search anew.
 
     Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
     """
     est, case = state.estimator, state.case
-    inflate_delays(own, est, state.declared | (case.isolated | case.suspects if case.open else 0))
+    inflate_delays(params, est, state.declared | (case.isolated | case.suspects if case.open else 0))
     state.cleared, state.declared = False, 0
-    forget_evidence(own, state)
-    forget_motion(est, own.sensors.n)
+    forget_evidence(params, state)
+    forget_motion(est, params.sensors.n)
     est.mask = 0
 
 
@@ -211,32 +211,32 @@ def is_blind(est: Estimator) -> bool:
 
 
 @compiled
-def weigh_sample(own: Constants, state: State, sample: SampleInput) -> None:
+def weigh_sample(params: Constants, state: State, sample: SampleInput) -> None:
     """Take a sample into estimator and evidence."""
     est = state.estimator
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
-    if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
-        drop_block(est, own.sensors.n)
+    if est.seconds - est.used_at > max(HOLE, SLOW * params.period):
+        drop_block(est, params.sensors.n)
     est.used_at = est.seconds
     est.samples += 1
-    find_behind(own, est)
-    correct_sample(own, est, sample.z)
-    watch_for_motion(own, est)
-    find_statistics(own, est)
+    find_behind(params, est)
+    correct_sample(params, est, sample.z)
+    watch_for_motion(params, est)
+    find_statistics(params, est)
     if not is_blind(est):
-        take_values(own, state, not state.case.open)
+        take_values(params, state, not state.case.open)
 
 
 @compiled
-def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
+def find_outliers(params: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
     est, largest, far = state.estimator, 0.0, 0.0
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         burst = max(1.0, BURST * est.noise.quick[i], est.shared.level[i] / est.noise.now.sample[i])
         largest = max(largest, abs(est.statistic[i]) / math.sqrt(burst))
         far = max(far, est.distance[i])
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         if largest > OUTLIER:
             # Of all statistics with equal weights that of the culprit is the largest (Cauchy and Schwarz).
             verdict.outliers[i] = est.distance[i] > ALIKE * far
@@ -245,16 +245,16 @@ def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
 
 
 @compiled
-def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
-    est, case, n = state.estimator, state.case, own.sensors.n
+    est, case, n = state.estimator, state.case, params.sensors.n
     unsure = case.open and case.isolated == 0
     # What the channels disagree by now beyond all that is known, as in a shock that they measure at other instants.
     odd = 1.0 if case.open else est.odd
-    find_scores(own, state, verdict.scores)
+    find_scores(params, state, verdict.scores)
     for i in range(n):
         variance = est.shared.level[i] * odd
-        verdict.noise[i] = math.sqrt(variance / own.expected[i])
+        verdict.noise[i] = math.sqrt(variance / params.expected[i])
         sample.estimate.corrected[i], sample.estimate.variance[i] = est.corrected[i], variance
         sample.estimate.bias[i] = est.states.x[i]
         sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
@@ -269,7 +269,7 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
                 sample.estimate.covariance[i, i] += left * left
     sample.estimate.behind, sample.estimate.spread = est.behind, est.spread
     sample.estimate.checked = 0 if is_blind(est) else est.checked
-    for u in range(own.units):
+    for u in range(params.units):
         sample.estimate.late[u] = est.late[u]
     suspects = (case.isolated if case.isolated else case.suspects) & est.mask
     if case.open and suspects:
@@ -284,44 +284,44 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
 
 
 @callback(Constants, State, SampleInput, SampleVerdict)
-def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
     est, case = state.estimator, state.case
-    verdict.threshold = math.log(1.0 + own.limit)
-    seconds = pass_time(own, state, sample)
+    verdict.threshold = math.log(1.0 + params.limit)
+    seconds = pass_time(params, state, sample)
     if state.cleared:
-        forget_suspicion(own, state)
-    take_mask(own, state, sample)
-    if not own.spans[est.mask] or est.judged == 0:
+        forget_suspicion(params, state)
+    take_mask(params, state, sample)
+    if not params.spans[est.mask] or est.judged == 0:
         verdict.statistic = verdict.threshold = math.nan
         return
     if sample.held:
         if est.aside:
             est.mask = 0
-        forget_evidence(own, state)
-        forget_motion(est, own.sensors.n)
+        forget_evidence(params, state)
+        forget_motion(est, params.sensors.n)
         verdict.statistic = 0.0
         return
     if sample.repeated:
-        verdict.statistic = min(math.log(1.0 + mean_of(own, state)), SHORT * verdict.threshold)
+        verdict.statistic = min(math.log(1.0 + mean_of(params, state)), SHORT * verdict.threshold)
         return
-    find_shape(own, est)
-    weigh_sample(own, state, sample)
-    if add_sample(own, est, sample.z, seconds):
-        take_block(own, state)
+    find_shape(params, est)
+    weigh_sample(params, state, sample)
+    if add_sample(params, est, sample.z, seconds):
+        take_block(params, state)
         # Its covariance is that of now.
-        correct_sample(own, est, sample.z)
-    mean = mean_of(own, state)
+        correct_sample(params, est, sample.z)
+    mean = mean_of(params, state)
     verdict.statistic = math.log(1.0 + mean)
-    find_outliers(own, state, verdict)
+    find_outliers(params, state, verdict)
     if case.open:
-        follow_case(own, state)
-    elif est.filled == 0 and goes_too_far(own, state):
-        take_move_back(own, state)
-    elif mean >= own.limit and est.samples >= case.retry:
-        find_case(own, state)
+        follow_case(params, state)
+    elif est.filled == 0 and goes_too_far(params, state):
+        take_move_back(params, state)
+    elif mean >= params.limit and est.samples >= case.retry:
+        find_case(params, state)
     sample.estimate.known = True
-    fill_verdict(own, state, sample, verdict)
+    fill_verdict(params, state, sample, verdict)
 
 
 class Sequential(Detector):
@@ -410,14 +410,14 @@ class Sequential(Detector):
                 "delay_std": delay_std,
             },
         )
-        own, n, noise = self.constants[0], geometry.n, self.noise
+        params, n, noise = self.constants[0], geometry.n, self.noise
         unit = np.zeros(n, dtype=np.int64)
         for u, channels in enumerate(geometry.units):
             unit[list(channels)] = u
-        own["units"], own["unit"][:n] = len(geometry.units), unit
-        own["members"][: len(geometry.units)] = [mask_of(channels) for channels in geometry.units]
+        params["units"], params["unit"][:n] = len(geometry.units), unit
+        params["members"][: len(geometry.units)] = [mask_of(channels) for channels in geometry.units]
         prepare_layout(
-            own["layout"],
+            params["layout"],
             unit,
             len(geometry.units),
             {
@@ -431,19 +431,19 @@ class Sequential(Detector):
                 "clock_rate_std": np.array(CLOCK_RATE_STD),
             },
         )
-        own["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
-        own["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
-        own["period"] = 1.0 / self.sample_rate
-        own["pace"] = 1.0 / max(0.5 * self.sample_rate / own["length"], 8.0)
-        own["expected"][:n] = noise.noise_std**2
-        own["timing"][:n], own["bent"] = np.maximum(noise.timing_std, LEAST_TIMING), BENT
-        own["rest_std"] = REST_STD
+        params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
+        params["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
+        params["period"] = 1.0 / self.sample_rate
+        params["pace"] = 1.0 / max(0.5 * self.sample_rate / params["length"], 8.0)
+        params["expected"][:n] = noise.noise_std**2
+        params["timing"][:n], params["bent"] = np.maximum(noise.timing_std, LEAST_TIMING), BENT
+        params["rest_std"] = REST_STD
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
         enough = used.sum(axis=1) >= MIN_CHANNELS
-        own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
-        own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
-        own["limit"], own["confidence"] = self.run_length, confidence
+        params["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
+        params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
+        params["limit"], params["confidence"] = self.run_length, confidence
 
     def clear(self, declared: int = 0) -> None:
         """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""

@@ -92,14 +92,14 @@ know what they can learn of the biases."""
 
 
 @compiled
-def keep_snapshot(own: Constants, est: Estimator) -> None:
+def keep_snapshot(params: Constants, est: Estimator) -> None:
     """Keep the states, so that they can be had again from before a fault."""
     tier = 0
     while tier < TIERS:
         snapshot = est.snapshots[tier * SNAPSHOTS + est.taken[tier] % SNAPSHOTS]
         snapshot.seconds = est.seconds
-        copy_states(own.layout, est.states, snapshot.states)
-        for u in range(own.units):
+        copy_states(params.layout, est.states, snapshot.states)
+        for u in range(params.units):
             snapshot.late[u] = est.late[u]
         est.taken[tier] += 1
         if est.taken[tier] % SNAPSHOTS != 1:
@@ -108,47 +108,47 @@ def keep_snapshot(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def pass_hole(own: Constants, est: Estimator, seconds: float) -> None:
+def pass_hole(params: Constants, est: Estimator, seconds: float) -> None:
     """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off.
 
     The states kept from before it stay, as little sure of the biases: what changed in the hole is compared with them.
     """
-    if not is_after_hole(own, est):
+    if not is_after_hole(params, est):
         est.hole_at, est.hole_sample = est.seconds - seconds, est.samples
-    move_biases(own, est, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
+    move_biases(params, est, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
 
 
 @compiled
-def is_after_hole(own: Constants, est: Estimator) -> bool:
+def is_after_hole(params: Constants, est: Estimator) -> bool:
     """Whether there was a hole in the stream lately."""
-    return est.hole_sample > 0 and (est.samples - est.hole_sample) * own.period < AFTER_HOLE
+    return est.hole_sample > 0 and (est.samples - est.hole_sample) * params.period < AFTER_HOLE
 
 
 @compiled
-def move_biases(own: Constants, est: Estimator, std: float, rate_std: float) -> None:
+def move_biases(params: Constants, est: Estimator, std: float, rate_std: float) -> None:
     """Let all biases be others by so much, rad/s, and their rates of change, rad/s^2; now and in all states kept."""
-    add_to_biases(own, est.states, std, rate_std)
+    add_to_biases(params, est.states, std, rate_std)
     for k in range(TIERS * SNAPSHOTS):
-        add_to_biases(own, est.snapshots[k].states, std, rate_std)
+        add_to_biases(params, est.snapshots[k].states, std, rate_std)
 
 
 @compiled
-def add_to_biases(own: Constants, states: ErrorStates, std: float, rate_std: float) -> None:
+def add_to_biases(params: Constants, states: ErrorStates, std: float, rate_std: float) -> None:
     """Add to the variances of the biases and of their rates of change."""
-    for r in range(own.layout.count):
-        if r < own.sensors.n:
+    for r in range(params.layout.count):
+        if r < params.sensors.n:
             states.p[r, r] += std * std
-        elif 0 <= own.layout.feeds[r] < own.sensors.n:
+        elif 0 <= params.layout.feeds[r] < params.sensors.n:
             states.p[r, r] += rate_std * rate_std
 
 
 @compiled
-def inflate_delays(own: Constants, est: Estimator, units: int) -> None:
+def inflate_delays(params: Constants, est: Estimator, units: int) -> None:
     """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
-    for u in range(1, own.units):
-        if own.members[u] & ~units == 0 or own.members[0] & ~units == 0:
-            place = own.layout.delays[u]
-            est.states.p[place, place] += own.layout.prior[place] * own.layout.prior[place]
+    for u in range(1, params.units):
+        if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
+            place = params.layout.delays[u]
+            est.states.p[place, place] += params.layout.prior[place] * params.layout.prior[place]
             forget_snapshots(est)
 
 
@@ -160,7 +160,7 @@ def forget_snapshots(est: Estimator) -> None:
 
 
 @compiled
-def predict_from(own: Constants, est: Estimator, seconds: float, states: ErrorStates) -> bool:
+def predict_from(params: Constants, est: Estimator, seconds: float, states: ErrorStates) -> bool:
     """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
     best, latest = -1, 0.0
     for tier in range(TIERS):
@@ -171,10 +171,10 @@ def predict_from(own: Constants, est: Estimator, seconds: float, states: ErrorSt
     if best < 0:
         return False
     snapshot = est.snapshots[best]
-    copy_states(own.layout, snapshot.states, states)
-    for u in range(1, own.units):
-        states.x[own.layout.delays[u]] += snapshot.late[u] - est.late[u]
-    predict(own.layout, states, est.seconds - latest)
+    copy_states(params.layout, snapshot.states, states)
+    for u in range(1, params.units):
+        states.x[params.layout.delays[u]] += snapshot.late[u] - est.late[u]
+    predict(params.layout, states, est.seconds - latest)
     return True
 
 
@@ -190,7 +190,7 @@ LONGEST_DELAY = 0.06
 
 
 @compiled
-def find_acceleration(own: Constants, est: Estimator) -> float:
+def find_acceleration(params: Constants, est: Estimator) -> float:
     """Angular acceleration in the middle of the block before, into ``est.acceleration``; return its variance by noise.
 
     It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
@@ -203,7 +203,7 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
     worst = single = apart = 0.0
     for a in range(3):
         total = alone = 0.0
-        for i in range(own.sensors.n):
+        for i in range(params.sensors.n):
             square = est.fused.gain[a, i] * est.fused.gain[a, i]
             total += square * est.noise.now.block[i]
             alone += square * est.noise.now.sample[i]
@@ -213,8 +213,8 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
         apart += (between - est.acceleration[a]) * (between - est.acceleration[a])
     single *= 2.0 / (span * span)
     est.shaken = 0.0
-    noise = (first * first + last * last + (last - first) * (last - first)) * worst / own.length
-    if apart <= TURNING * single or span > 2.0 * own.length * own.period:
+    noise = (first * first + last * last + (last - first) * (last - first)) * worst / params.length
+    if apart <= TURNING * single or span > 2.0 * params.length * params.period:
         return noise
     # Of vibration that blocks are too slow for nobody knows what it is: what channels see of it is no delay.
     est.shaken = apart
@@ -222,15 +222,15 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
 
 
 @compiled
-def find_turning(own: Constants, est: Estimator) -> None:
+def find_turning(params: Constants, est: Estimator) -> None:
     """Angular acceleration along each channel in the block before, and what of it is not linear.
 
     The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
     not linear in the rate.
     """
-    n, states = own.sensors.n, est.states
+    n, states = params.sensors.n, est.states
     ahead, behind = est.times[0] - est.times[1], est.times[1] - est.times[2]
-    noise, square = find_acceleration(own, est), 0.0
+    noise, square = find_acceleration(params, est), 0.0
     for a in range(3):
         square += est.acceleration[a] * est.acceleration[a]
     # At rest a rate that none of the channels agree on is a fault, and no motion.
@@ -244,27 +244,27 @@ def find_turning(own: Constants, est: Estimator) -> None:
     for i in range(n):
         along = jerk = lately = 0.0
         for a in range(3):
-            h = own.sensors.axes[i, a]
+            h = params.sensors.axes[i, a]
             along += h * est.acceleration[a]
             after, before = (est.rates[0, a] - est.rates[1, a]) / ahead, (est.rates[1, a] - est.rates[2, a]) / behind
             lately += h * after
             jerk += h * 2.0 * (after - before) / (ahead + behind)
         est.turn[i] = along if turning else 0.0
-        swift = own.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
-        est.extra[i] = swift * swift + own.bent * own.bent * speed
-        place = own.layout.delays[own.unit[i]]
+        swift = params.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
+        est.extra[i] = swift * swift + params.bent * params.bent * speed
+        place = params.layout.delays[params.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
             est.extra[i] += second * (noise + est.shaken) + ((0.5 * second * jerk) ** 2 if turning else 0.0)
 
 
 @compiled
-def judge_block(own: Constants, est: Estimator) -> float:
+def judge_block(params: Constants, est: Estimator) -> float:
     """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable.
 
     Its means are put to its middle, and the share of noise in the statistics of blocks is noted.
     """
-    n, noise, layout = own.sensors.n, est.noise, own.layout
+    n, noise, layout = params.sensors.n, est.noise, params.layout
     for a in range(3):
         est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
     find_signals(layout, est.signal_rate, est.turn, est.block_at.signals)
@@ -275,9 +275,9 @@ def judge_block(own: Constants, est: Estimator) -> float:
         est.means[1, i] -= est.turn[i] * est.middles[1, i]
         for j in range(n):
             est.matrix[i, j] = est.block_at.covariance[i, j]
-        est.matrix[i, i] += noise.now.block[i] * noise.longest[i] / own.length + est.extra[i]
+        est.matrix[i, i] += noise.now.block[i] * noise.longest[i] / params.length + est.extra[i]
     weigh_together(est.block_parity, n, mask, est.matrix)
-    eliminate_rate(est.block_parity, n, own.sensors.axes, UNKNOWN_RATE)
+    eliminate_rate(est.block_parity, n, params.sensors.axes, UNKNOWN_RATE)
     subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
     chi, free = 0.0, -3.0
     for i in range(n):
@@ -287,7 +287,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
             for j in range(n):
                 if mask >> j & 1:
                     total += information[i, j] * est.block_innovation[j]
-                    variance = noise.now.block[j] * noise.longest[j] / own.length
+                    variance = noise.now.block[j] * noise.longest[j] / params.length
                     share += information[i, j] * information[i, j] * variance
             chi += total * est.block_innovation[i]
             free += 1.0
@@ -299,7 +299,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
 
 
 @compiled
-def find_rest(own: Constants, est: Estimator) -> None:
+def find_rest(params: Constants, est: Estimator) -> None:
     """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
     for a in range(3):
         est.rest_rates[est.rest_count % REST_BLOCKS, a] = est.rates[1, a]
@@ -308,20 +308,20 @@ def find_rest(own: Constants, est: Estimator) -> None:
     est.rest = False
     if est.rest_count < REST_BLOCKS:
         return
-    n = own.sensors.n
+    n = params.sensors.n
     for a in range(3):
         variance = known = 0.0
         for i in range(n):
             gain, part = est.fused.gain[a, i], 0.0
             if gain != 0.0:
-                variance += gain * gain * est.noise.now.block[i] / own.length
+                variance += gain * gain * est.noise.now.block[i] / params.length
                 for j in range(n):
                     part += est.fused.gain[a, j] * est.at.covariance[i, j]
                 known += gain * part
         est.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
         est.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
-    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_bias_variance, own.rest_std * own.rest_std)
+    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_bias_variance, params.rest_std * params.rest_std)
     if est.noise.lived[REST] > LIVED:
         # A hover in vibration may turn as little: it is known by its noise.
         for i in range(n):
@@ -349,9 +349,9 @@ def unlearnable(error: float, inside: float, square: float) -> float:
 
 
 @compiled
-def find_unlearnable(own: Constants, est: Estimator) -> None:
+def find_unlearnable(params: Constants, est: Estimator) -> None:
     """Variance that each state of the motion keeps at least, into ``est.taught``; biases have no motion in them."""
-    layout, noise, at, n = own.layout, est.noise, est.block_at, own.sensors.n
+    layout, noise, at, n = params.layout, est.noise, est.block_at, params.sensors.n
     for r in range(layout.count):
         est.taught[r] = 0.0
     if est.rest:
@@ -361,33 +361,33 @@ def find_unlearnable(own: Constants, est: Estimator) -> None:
         inside = est.shared.vibration[a]
         quick = max(quick, inside)
         for i in range(n):
-            along = own.sensors.axes[i, a] * own.sensors.axes[i, a] / (UNEQUAL * UNEQUAL * own.length)
+            along = params.sensors.axes[i, a] * params.sensors.axes[i, a] / (UNEQUAL * UNEQUAL * params.length)
             inside = max(inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i])
             quick = max(quick, along * noise.now.block[i] * noise.longest[i])
         # A peak of vibration is no motion.
         est.usual_rate[a] += (est.signal_rate[a] * est.signal_rate[a] - est.usual_rate[a]) / REST_BLOCKS
         for i in range(n):
-            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
+            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
             est.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, est.usual_rate[a])
     for i in range(n):
         place, turn = layout.place[i, TURN], at.signals[i, TURN]
         if place >= 0:
             # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be
             # learned in the first seconds of motion.
-            error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / own.length
+            error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / params.length
             least = unlearnable(error, 0.5 * quick / (est.span * est.span), turn * turn)
             # A unit learns from that of its axes which turns most.
             est.taught[place] = least if est.taught[place] == 0.0 else min(est.taught[place], least)
 
 
 @compiled
-def learn(own: Constants, est: Estimator, weight: float) -> None:
+def learn(params: Constants, est: Estimator, weight: float) -> None:
     """Correct the states by the block before.
 
     At rest the rate is known to be zero. The estimated one would be the noise of the values themselves, and is no
     signal there.
     """
-    n, layout = own.sensors.n, own.layout
+    n, layout = params.sensors.n, params.layout
     kept = est.masks[1] & ~est.doubted
     if est.rest:
         for i in range(n):
@@ -402,16 +402,16 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
         subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
     if est.rest or kept != est.masks[1]:
         weigh_together(est.block_parity, n, kept, est.matrix)
-        known = 1.0 / (own.rest_std * own.rest_std) if est.rest else UNKNOWN_RATE
-        eliminate_rate(est.block_parity, n, own.sensors.axes, known)
-    find_unlearnable(own, est)
+        known = 1.0 / (params.rest_std * params.rest_std) if est.rest else UNKNOWN_RATE
+        eliminate_rate(est.block_parity, n, params.sensors.axes, known)
+    find_unlearnable(params, est)
     update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight, est.taught)
 
 
 @compiled
-def foresee(own: Constants, est: Estimator) -> None:
+def foresee(params: Constants, est: Estimator) -> None:
     """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
-    n, layout, square, ahead = own.sensors.n, own.layout, 0.0, est.times[0] - est.times[1]
+    n, layout, square, ahead = params.sensors.n, params.layout, 0.0, est.times[0] - est.times[1]
     for a in range(3):
         change = (est.rates[0, a] - est.rates[1, a]) / ahead
         square += change * change
@@ -420,7 +420,7 @@ def foresee(own: Constants, est: Estimator) -> None:
     for i in range(n):
         quick = 0.0
         for a in range(3):
-            quick += own.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / ahead
+            quick += params.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / ahead
         if not begins:
             quick = 0.0
         if abs(est.turn[i]) > abs(quick):
@@ -434,30 +434,30 @@ def foresee(own: Constants, est: Estimator) -> None:
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]
     est.speed_squared = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
-    weigh(own, est)
+    weigh(params, est)
 
 
 @compiled
-def find_behind(own: Constants, est: Estimator) -> None:
+def find_behind(params: Constants, est: Estimator) -> None:
     """Find by how much values lie before the stamp, if the earliest unit is in time, and how far units are apart.
 
     `restamp` brings all units to the instant of the latest, the states what is left to that of the first unit.
     """
     latest = earliest = least = most = 0.0
-    for u in range(1, own.units):
+    for u in range(1, params.units):
         late = est.late[u]
-        left = late + est.states.x[own.layout.delays[u]]
+        left = late + est.states.x[params.layout.delays[u]]
         latest, earliest = max(latest, late), min(earliest, late)
         most, least = max(most, left), min(least, left)
     est.behind, est.spread = latest - earliest, most - least
 
 
 @compiled
-def transfer_delays(own: Constants, est: Estimator) -> bool:
+def transfer_delays(params: Constants, est: Estimator) -> bool:
     """Move delays that are sure from their states to ``late``, which `restamp` makes up for; return whether any was."""
     changed = False
-    for u in range(1, own.units):
-        place = own.layout.delays[u]
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
         delay, variance = est.states.x[place], est.states.p[place, place]
         if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
             step = min(max(delay, -LONGEST_DELAY - est.late[u]), LONGEST_DELAY - est.late[u])

@@ -148,20 +148,20 @@ def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int
 
 
 @compiled
-def begin_states(layout: Layout, own: ErrorStates, bias_std: Array) -> None:
+def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
     """Begin with nothing known but the priors, and of the biases their standard deviations (n,), rad/s."""
     for r in range(layout.count):
-        own.x[r] = 0.0
+        states.x[r] = 0.0
         for c in range(layout.count):
-            own.p[r, c] = 0.0
+            states.p[r, c] = 0.0
         std = bias_std[r] if r < layout.n else layout.prior[r]
-        own.p[r, r] = std * std
+        states.p[r, r] = std * std
 
 
 @compiled
-def predict(layout: Layout, own: ErrorStates, seconds: float) -> None:
+def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
     """Let the states wander for a time: what has a rate of change runs with it, and all have their random walks."""
-    x, p, count = own.x, own.p, layout.count
+    x, p, count = states.x, states.p, layout.count
     for r in range(count):
         to = layout.feeds[r]
         if to >= 0:
@@ -189,7 +189,7 @@ def find_signals(layout: Layout, rate: Array, turn: Array, signals: Array) -> No
 
 
 @compiled
-def project(layout: Layout, own: ErrorStates, at: Projection) -> None:
+def project(layout: Layout, states: ErrorStates, at: Projection) -> None:
     """Work out P C' and C P C' for ``at.signals``."""
     n, count = layout.n, layout.count
     for i in range(n):
@@ -201,7 +201,7 @@ def project(layout: Layout, own: ErrorStates, at: Projection) -> None:
             if place >= 0 and share != 0.0:
                 # P is symmetric: a row is read in place of a column.
                 for r in range(count):
-                    row[r] += share * own.p[place, r]
+                    row[r] += share * states.p[place, r]
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -213,21 +213,21 @@ def project(layout: Layout, own: ErrorStates, at: Projection) -> None:
 
 
 @compiled
-def subtract_errors(layout: Layout, own: ErrorStates, signals: Array, values: Array, out: Array) -> None:
+def subtract_errors(layout: Layout, states: ErrorStates, signals: Array, values: Array, out: Array) -> None:
     """Values (n,) less what the states say of their errors, rad/s."""
     for i in range(layout.n):
         total = values[i]
         for k in range(SIGNALS):
             place = layout.place[i, k]
             if place >= 0:
-                total -= own.x[place] * signals[i, k]
+                total -= states.x[place] * signals[i, k]
         out[i] = total
 
 
 @compiled
 def update(
     layout: Layout,
-    own: ErrorStates,
+    states: ErrorStates,
     at: Projection,
     information: Array,
     innovation: Array,
@@ -257,21 +257,21 @@ def update(
     for j in range(layout.n):
         if information[j, j] != 0.0:
             find_gain(layout, at, information, j, weight)
-    find_shares(layout, own, at, information, taught)
+    find_shares(layout, states, at, information, taught)
     for j in range(layout.n):
         if information[j, j] != 0.0:
             for r in range(count):
-                own.x[r] += taught[r] * at.weighted[j, r] * innovation[j]
+                states.x[r] += taught[r] * at.weighted[j, r] * innovation[j]
                 share = at.weighted[j, r]
                 for c in range(r + 1):
-                    own.p[r, c] -= (1.0 - (1.0 - taught[r]) * (1.0 - taught[c])) * share * at.columns[j, c]
+                    states.p[r, c] -= (1.0 - (1.0 - taught[r]) * (1.0 - taught[c])) * share * at.columns[j, c]
     for r in range(count):
         for c in range(r):
-            own.p[c, r] = own.p[r, c]
+            states.p[c, r] = states.p[r, c]
 
 
 @compiled
-def find_shares(layout: Layout, own: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
+def find_shares(layout: Layout, states: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
     """Put into ``taught`` (states,), which holds the least variances, the share of its gain that each state takes."""
     for r in range(layout.count):
         least, taught[r], gained = taught[r], 1.0, 0.0
@@ -279,8 +279,8 @@ def find_shares(layout: Layout, own: ErrorStates, at: Projection, information: A
             for j in range(layout.n):
                 if information[j, j] != 0.0:
                     gained += at.weighted[j, r] * at.columns[j, r]
-            if gained > 0.0 and own.p[r, r] - gained < least:
-                taught[r] = 1.0 - math.sqrt(1.0 - min(max(own.p[r, r] - least, 0.0) / gained, 1.0))
+            if gained > 0.0 and states.p[r, r] - gained < least:
+                taught[r] = 1.0 - math.sqrt(1.0 - min(max(states.p[r, r] - least, 0.0) / gained, 1.0))
         elif layout.feeds[r] >= layout.n:
             # The rate of change of a state is learned with it.
             taught[r] = taught[layout.feeds[r]]

@@ -208,16 +208,16 @@ class Estimator:
 
 
 @compiled
-def weigh(own: Constants, est: Estimator) -> None:
+def weigh(params: Constants, est: Estimator) -> None:
     """Work out what samples of the channels present are judged and fused with.
 
     What is not known of the states lasts until the next block: it counts twice the samples of a block, or it would be
     summed up as if it were white.
     """
-    n, noise = own.sensors.n, est.noise
-    lasting = 2.0 * own.length
+    n, noise = params.sensors.n, est.noise
+    lasting = 2.0 * params.length
     weigh_each(est.parity, n, est.mask, noise.now.sample)
-    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    eliminate_rate(est.parity, n, params.sensors.axes, UNKNOWN_RATE)
     for i in range(n):
         est.known[i] = est.parity.information[i, i]
     for i in range(n):
@@ -225,7 +225,7 @@ def weigh(own: Constants, est: Estimator) -> None:
             est.matrix[i, j] = lasting * est.at.covariance[i, j]
         est.matrix[i, i] += noise.now.sample[i]
     weigh_together(est.parity, n, est.mask, est.matrix)
-    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    eliminate_rate(est.parity, n, params.sensors.axes, UNKNOWN_RATE)
     est.judged = est.checked = 0
     for i in range(n):
         information, share = est.parity.information[i, i], 0.0
@@ -240,16 +240,16 @@ def weigh(own: Constants, est: Estimator) -> None:
                 est.checked |= 1 << i
         est.growth[i] = est.shared.level[i] + est.at.covariance[i, i]
     kept = est.mask & ~est.aside & ~est.beyond
-    if not own.spans[kept]:
+    if not params.spans[kept]:
         kept = est.mask
     weigh_each(est.fused, n, kept, est.growth)
-    eliminate_rate(est.fused, n, own.sensors.axes, UNKNOWN_RATE)
+    eliminate_rate(est.fused, n, params.sensors.axes, UNKNOWN_RATE)
 
 
 @compiled
-def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
+def correct_sample(params: Constants, est: Estimator, values: Array) -> None:
     """Correct a sample by what is known now: its rate, and what is left over of every channel."""
-    n, layout = own.sensors.n, own.layout
+    n, layout = params.sensors.n, params.layout
     signals, left = est.at.signals, est.innovation
     find_signals(layout, est.zero, est.turn, signals)
     subtract_errors(layout, est.states, signals, values, left)
@@ -263,13 +263,13 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
         if est.mask >> i & 1:
             left[i] = est.corrected[i]
             for a in range(3):
-                left[i] -= own.sensors.axes[i, a] * est.rate[a]
+                left[i] -= params.sensors.axes[i, a] * est.rate[a]
 
 
 @compiled
-def watch_for_motion(own: Constants, est: Estimator) -> None:
+def watch_for_motion(params: Constants, est: Estimator) -> None:
     """Let rest end where a rate shows, and no error that looks like it."""
-    n, noise = own.sensors.n, est.noise
+    n, noise = params.sensors.n, est.noise
     square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
     if noise.regime == MOTION or not square > 0.0:
         return
@@ -285,13 +285,13 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
         if est.mask >> i & 1:
             along = 0.0
             for a in range(3):
-                along += own.sensors.axes[i, a] * est.rate[a]
+                along += params.sensors.axes[i, a] * est.rate[a]
             moving += along * along / noise.now.sample[i]
             for j in range(n):
                 odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
     if moving > THREE_SIGMA * odd:
         change_regime(noise, n, MOTION, True)
-        weigh(own, est)
+        weigh(params, est)
 
 
 @compiled
@@ -301,12 +301,12 @@ def usual_chi(free: float) -> float:
 
 
 @compiled
-def find_statistics(own: Constants, est: Estimator) -> None:
+def find_statistics(params: Constants, est: Estimator) -> None:
     """Statistics of a sample: the innovation of each channel in its standard deviations.
 
     What is not known of the states grows with motion, which may be faster now than in the last block.
     """
-    n = own.sensors.n
+    n = params.sensors.n
     square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
     more = max((square + SLOW_TURN) / (est.speed_squared + SLOW_TURN), 1.0)
     chi, free = 0.0, -3.0
@@ -336,22 +336,22 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 
 @compiled
-def is_spike(own: Constants, est: Estimator) -> bool:
+def is_spike(params: Constants, est: Estimator) -> bool:
     """Whether the last sample is far off, as few before it were; what is so for longer is none."""
     far = False
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         far = far or est.statistic[i] * est.statistic[i] > FAR
     est.far = est.far + 1 if far else 0
     return 0 < est.far <= SPIKE
 
 
 @compiled
-def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) -> bool:
+def add_sample(params: Constants, est: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and to the block being filled; return whether that is complete.
 
     A block of other channels than those before is none of the same. From a spike nothing is learned.
     """
-    n, total, spike = own.sensors.n, est.total, is_spike(own, est)
+    n, total, spike = params.sensors.n, est.total, is_spike(params, est)
     total.sample = est.samples
     if est.filled == 0:
         est.begun = est.seconds - seconds
@@ -371,9 +371,9 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
         est.sum_rate[a] += total.instant[a]
     copy_total(n, total, est.last_samples[est.samples % SAMPLES])
     est.filled += 1
-    if est.filled < own.length:
+    if est.filled < params.length:
         return False
-    close_block(own, est)
+    close_block(params, est)
     copy_total(n, total, est.last_blocks[est.all_blocks % BLOCKS])
     if est.all_blocks % STRIDE == 0:
         copy_total(n, total, est.last_coarse[est.all_blocks // STRIDE % COARSE])
@@ -381,12 +381,12 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
 
 
 @compiled
-def close_block(own: Constants, est: Estimator) -> None:
+def close_block(params: Constants, est: Estimator) -> None:
     """Take the means of a block that is complete, and begin the next one."""
-    n, present, middle = own.sensors.n, 0, est.sum_seconds / own.length
+    n, present, middle = params.sensors.n, 0, est.sum_seconds / params.length
     for i in range(n):
         # A unit may be slower than the others.
-        if 2.0 * est.sum_count[i] >= own.length:
+        if 2.0 * est.sum_count[i] >= params.length:
             present |= 1 << i
         est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / max(est.sum_count[i], 1.0)
         est.middles[1, i] = est.middles[0, i]
@@ -396,7 +396,7 @@ def close_block(own: Constants, est: Estimator) -> None:
     for a in range(3):
         est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
         est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.total.instant[a]
-        est.rates[0, a] = est.sum_rate[a] / own.length
+        est.rates[0, a] = est.sum_rate[a] / params.length
         est.sum_rate[a] = 0.0
     est.times[2], est.times[1], est.times[0] = est.times[1], est.times[0], est.begun + middle
     est.ended[2], est.ended[1], est.ended[0] = est.ended[1], est.ended[0], est.seconds

@@ -147,19 +147,19 @@ class SharedNoise:
 
 
 @compiled
-def begin_noise(own: Noise, n: int, expected: Array) -> None:
-    """Begin with the variances expected (n,), (rad/s)^2; ``own`` is all zero."""
-    own.regime = MOTION
+def begin_noise(noise: Noise, n: int, expected: Array) -> None:
+    """Begin with the variances expected (n,), (rad/s)^2; ``noise`` is all zero."""
+    noise.regime = MOTION
     for i in range(n):
         for part in range(2):
-            fill_levels(own.kept[part], i, expected[i])
-        fill_levels(own.now, i, expected[i])
-        own.quick[i] = own.square[i] = own.share[i] = 1.0
-        own.squares[0, i] = own.squares[1, i] = 1.0
-        own.unknown[i] = 1.0 + UNKNOWN
-        own.degrees[i] = TRUST
-        own.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
-    find_longest(own, n)
+            fill_levels(noise.kept[part], i, expected[i])
+        fill_levels(noise.now, i, expected[i])
+        noise.quick[i] = noise.square[i] = noise.share[i] = 1.0
+        noise.squares[0, i] = noise.squares[1, i] = 1.0
+        noise.unknown[i] = 1.0 + UNKNOWN
+        noise.degrees[i] = TRUST
+        noise.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
+    find_longest(noise, n)
 
 
 @compiled
@@ -171,89 +171,89 @@ def fill_levels(levels: Levels, i: int, expected: float) -> None:
 
 
 @compiled
-def find_longest(own: Noise, n: int) -> None:
+def find_longest(noise: Noise, n: int) -> None:
     """Take over from the levels by how much the noise of longer times exceeds that of blocks, at least 1."""
     for i in range(n):
-        own.longest[i] = 1.0
+        noise.longest[i] = 1.0
         for k in range(QUARTER, SCALES + LAGS):
-            own.longest[i] = max(own.longest[i], SURELY * own.now.level[k, i])
+            noise.longest[i] = max(noise.longest[i], SURELY * noise.now.level[k, i])
 
 
 @compiled
-def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
+def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
     """Take up what was learned at rest, or in motion; ``at_least``: no less than now, as motion begins."""
-    before = own.kept[own.regime]
-    after = own.kept[regime]
+    before = noise.kept[noise.regime]
+    after = noise.kept[regime]
     for i in range(n):
-        before.sample[i], before.block[i] = own.now.sample[i], own.now.block[i]
-        own.now.sample[i] = max(after.sample[i], own.now.sample[i] if at_least else 0.0)
-        own.now.block[i] = max(after.block[i], own.now.block[i] if at_least else 0.0)
+        before.sample[i], before.block[i] = noise.now.sample[i], noise.now.block[i]
+        noise.now.sample[i] = max(after.sample[i], noise.now.sample[i] if at_least else 0.0)
+        noise.now.block[i] = max(after.block[i], noise.now.block[i] if at_least else 0.0)
         for k in range(SCALES + LAGS):
-            before.level[k, i] = own.now.level[k, i]
-            own.now.level[k, i] = max(after.level[k, i], own.now.level[k, i] if at_least else 0.0)
-    own.regime = regime
-    find_longest(own, n)
+            before.level[k, i] = noise.now.level[k, i]
+            noise.now.level[k, i] = max(after.level[k, i], noise.now.level[k, i] if at_least else 0.0)
+    noise.regime = regime
+    find_longest(noise, n)
 
 
 @compiled
-def place_of(own: Noise, mask: int) -> int:
-    """Find the place of the last statistics of the same channels, of two sets; ``own.repeats``: there are some."""
-    own.repeats = True
+def place_of(noise: Noise, mask: int) -> int:
+    """Find the place of the last statistics of the same channels, of two sets; ``noise.repeats``: there are some."""
+    noise.repeats = True
     for k in range(2):
-        if own.sets[k] == mask:
-            own.newest = k
+        if noise.sets[k] == mask:
+            noise.newest = k
             return k
-    own.newest, own.repeats = 1 - own.newest, False
-    own.sets[own.newest] = mask
-    return own.newest
+    noise.newest, noise.repeats = 1 - noise.newest, False
+    noise.sets[noise.newest] = mask
+    return noise.newest
 
 
 @compiled
-def take_sample_steps(own: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
+def take_sample_steps(noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
     """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
-    pace = 1.0 / min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    pace = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
     # Of other channels the rate is another: their difference would be that of the errors of the sensors.
-    place = place_of(own, mask)
+    place = place_of(noise, mask)
     for i in range(n):
         if mask >> i & 1:
-            step = t[i] - own.before[place, i]
-            own.before[place, i] = t[i]
-            if not own.repeats:
+            step = t[i] - noise.before[place, i]
+            noise.before[place, i] = t[i]
+            if not noise.repeats:
                 continue
             # What the state adds to the variance is slow: no difference of neighbours shows it.
-            own.steps[i] += min(0.5 * step * step * inflation[i], THREE_SIGMA)
-            own.counted[i] += 1.0
-            step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
+            noise.steps[i] += min(0.5 * step * step * inflation[i], THREE_SIGMA)
+            noise.counted[i] += 1.0
+            step = 0.5 * step * step / max(1.0, BURST * noise.quick[i])
             if learn:
-                own.neighbours[i] += pace * (min(step * own.squares[odd, i], FAR) - own.neighbours[i])
-                own.square[i] += pace * (step - own.square[i])
-            own.squares[odd, i] = step
-    count_wild(own, SAMPLE, n, mask, t)
+                noise.neighbours[i] += pace * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
+                noise.square[i] += pace * (step - noise.square[i])
+            noise.squares[odd, i] = step
+    count_wild(noise, SAMPLE, n, mask, t)
 
 
 @compiled
-def count_wild(own: Noise, scale: int, n: int, mask: int, t: Array) -> None:
+def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
     """Remember statistics (n,), and count wild ones that have come and gone: a lasting error does not.
 
     The inverse of how often a value is wild without a fault is the largest likelihood ratio of one value.
     """
     for i in range(n):
         if mask >> i & 1:
-            if abs(own.last[scale, i]) > WILD and abs(t[i]) < TAME:
-                own.wild[scale, i] += 1.0
-            own.last[scale, i] = t[i]
-        own.cap[scale, i] = (own.seen[scale] + WILD_SAMPLES) / (own.wild[scale, i] + WILD_EVENTS)
+            if abs(noise.last[scale, i]) > WILD and abs(t[i]) < TAME:
+                noise.wild[scale, i] += 1.0
+            noise.last[scale, i] = t[i]
+        noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (noise.wild[scale, i] + WILD_EVENTS)
 
 
 @compiled
 def take_block_of_samples(
-    own: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: Array, learn: bool
+    noise: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: Array, learn: bool
 ) -> None:
     """Learn the variance of samples from those of a block.
 
     Parameters
     ----------
-    own
+    noise
         The noise.
     n, mask
         Channels; those that delivered throughout.
@@ -269,18 +269,18 @@ def take_block_of_samples(
     gain = 1.0 / min(blocks + 25.0, 100.0)
     for i in range(n):
         if mask >> i & 1:
-            part = own.counted[i] / length
-            step = own.steps[i] / length - part
-            own.quick[i] += pace * (step + part * (1.0 - own.quick[i]))
+            part = noise.counted[i] / length
+            step = noise.steps[i] / length - part
+            noise.quick[i] += pace * (step + part * (1.0 - noise.quick[i]))
             if learn:
-                factor = 1.0 + gain * (step + part * own.cross[i])
-                own.now.sample[i] = max(own.now.sample[i] * factor, QUIETEST * expected[i])
-        own.steps[i] = own.counted[i] = 0.0
-    find_degrees(own, n, mask)
+                factor = 1.0 + gain * (step + part * noise.cross[i])
+                noise.now.sample[i] = max(noise.now.sample[i] * factor, QUIETEST * expected[i])
+        noise.steps[i] = noise.counted[i] = 0.0
+    find_degrees(noise, n, mask)
 
 
 @compiled
-def find_degrees(own: Noise, n: int, mask: int) -> None:
+def find_degrees(noise: Noise, n: int, mask: int) -> None:
     """Degrees of freedom, as of a Student's: ``3 + 0.5 / x`` with ``x = E[d d'] / E[d]^2 - 1`` of adjacent squares d.
 
     Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by itself if that is more for certain.
@@ -288,70 +288,72 @@ def find_degrees(own: Noise, n: int, mask: int) -> None:
     total, count = 0.0, 0
     for i in range(n):
         if mask >> i & 1:
-            total += own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0
+            total += noise.neighbours[i] / (noise.square[i] * noise.square[i]) - 1.0
             count += 1
-    scatter = TAIL_SCATTER / math.sqrt(min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY))
+    scatter = TAIL_SCATTER / math.sqrt(min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY))
     for i in range(n):
-        own_excess = own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0
+        own_excess = noise.neighbours[i] / (noise.square[i] * noise.square[i]) - 1.0
         excess = max(total / max(count, 1), own_excess - 2.0 * scatter, 1e-3)
-        own.degrees[i] = min(3.0 + 0.5 / excess, TRUST, 2.0 + own.seen[SAMPLE] / LEARNED_IN)
+        noise.degrees[i] = min(3.0 + 0.5 / excess, TRUST, 2.0 + noise.seen[SAMPLE] / LEARNED_IN)
 
 
 @compiled
-def take_block_steps(own: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
+def take_block_steps(noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
     """Take the statistics t (n,) of a block; expected: (n,) (rad/s)^2."""
-    gain = 1.0 / min(own.seen[BLOCK] + 25.0, 100.0)
+    gain = 1.0 / min(noise.seen[BLOCK] + 25.0, 100.0)
     for i in range(n):
         if mask >> i & 1:
-            step = t[i] - own.last[BLOCK, i]
-            if own.seen[BLOCK] > 1 and learn and mask == own.block_set:
-                ratio = min(0.5 * step * step * own.longest[i] / own.share[i], THREE_SIGMA)
-                least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected[i])
-                block = max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
-                own.now.block[i] = min(block, LOUDEST * expected[i])
-            own.now.level[BLOCK, i] = own.now.block[i] / own.now.sample[i]
-    own.block_set = mask
-    count_wild(own, BLOCK, n, mask, t)
+            step = t[i] - noise.last[BLOCK, i]
+            if noise.seen[BLOCK] > 1 and learn and mask == noise.block_set:
+                ratio = min(0.5 * step * step * noise.longest[i] / noise.share[i], THREE_SIGMA)
+                least = max(QUIETEST * noise.now.sample[i], QUIETEST_BLOCK * expected[i])
+                block = max(noise.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
+                noise.now.block[i] = min(block, LOUDEST * expected[i])
+            noise.now.level[BLOCK, i] = noise.now.block[i] / noise.now.sample[i]
+    noise.block_set = mask
+    count_wild(noise, BLOCK, n, mask, t)
 
 
 @compiled
-def take_level(own: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
+def take_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
-        level = own.now.level[k, i]
-        own.now.level[k, i] += gain * (min(0.5 * step * step * own.longest[i], THREE_SIGMA * max(level, 1.0)) - level)
+        level = noise.now.level[k, i]
+        noise.now.level[k, i] += gain * (
+            min(0.5 * step * step * noise.longest[i], THREE_SIGMA * max(level, 1.0)) - level
+        )
 
 
 @compiled
-def take_long_steps(own: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
+def take_long_steps(noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
     """Take the statistics t (n,) of a longer time: its level over that of blocks."""
-    quarter, gain = int(own.seen[QUARTER]) % 4, 1.0 / min(own.seen[scale] + 3.0, 80.0)
+    quarter, gain = int(noise.seen[QUARTER]) % 4, 1.0 / min(noise.seen[scale] + 3.0, 80.0)
     for i in range(n):
         if mask >> i & 1:
             if scale == QUARTER:
                 # Noise with a memory shows at a second's distance, a beat at half its period.
-                take_level(own, QUARTER, i, t[i] - own.apart[quarter, i], gain, learn and own.seen[scale] > 4)
+                take_level(noise, QUARTER, i, t[i] - noise.apart[quarter, i], gain, learn and noise.seen[scale] > 4)
                 for lag in range(1, LAGS + 1):
-                    step = t[i] - own.apart[(quarter - lag) % 4, i]
-                    take_level(own, SCALES + lag - 1, i, step, gain, learn and own.seen[scale] > lag)
-                own.apart[quarter, i] = t[i]
+                    step = t[i] - noise.apart[(quarter - lag) % 4, i]
+                    take_level(noise, SCALES + lag - 1, i, step, gain, learn and noise.seen[scale] > lag)
+                noise.apart[quarter, i] = t[i]
             else:
-                take_level(own, scale, i, t[i] - own.last[scale, i], gain, learn and own.seen[scale] > 1)
-    find_longest(own, n)
-    count_wild(own, scale, n, mask, t)
+                take_level(noise, scale, i, t[i] - noise.last[scale, i], gain, learn and noise.seen[scale] > 1)
+    find_longest(noise, n)
+    count_wild(noise, scale, n, mask, t)
 
 
 @compiled
-def meet_rate(own: Noise, square: float) -> None:
+def meet_rate(noise: Noise, square: float) -> None:
     """Begin to learn the slow noise of motion anew where the square of the rate is far beyond any before."""
-    if own.regime == MOTION and square > FASTER * own.met:
-        own.met, own.lived[MOTION] = square, 0.0
+    if noise.regime == MOTION and square > FASTER * noise.met:
+        noise.met, noise.lived[MOTION] = square, 0.0
 
 
 @compiled
-def find_unknown(own: Noise, n: int, seconds: float) -> None:
+def find_unknown(noise: Noise, n: int, seconds: float) -> None:
     """Of the slow noise nothing is known at first, at rest and in motion each, and longer where it is coloured."""
-    own.lived[own.regime] += seconds
-    lived = own.lived[own.regime]
+    noise.lived[noise.regime] += seconds
+    lived = noise.lived[noise.regime]
     for i in range(n):
-        own.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / own.longest[i])
+        noise.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / noise.longest[i])

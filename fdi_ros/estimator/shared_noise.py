@@ -67,17 +67,17 @@ def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
 
 
 @compiled
-def update_shared(own: Constants, est: Estimator) -> None:
+def update_shared(params: Constants, est: Estimator) -> None:
     """Take the innovations of a sample and, every 20 ms, fourth differences of the corrected values."""
     shared = est.shared
-    update_covariance(own, est)
+    update_covariance(params, est)
     for a in range(3):
         shared.rate_sum[a] += est.rate[a]
         shared.rate_squares[a] += est.rate[a] * est.rate[a]
-    if shared.fresh % own.stride == 0:
-        if shared.fresh >= PAST * own.stride:
-            take_fourth_difference(own, est)
-        for i in range(own.sensors.n):
+    if shared.fresh % params.stride == 0:
+        if shared.fresh >= PAST * params.stride:
+            take_fourth_difference(params, est)
+        for i in range(params.sensors.n):
             for k in range(PAST - 1, 0, -1):
                 shared.past[k, i] = shared.past[k - 1, i]
             shared.past[0, i] = est.corrected[i]
@@ -85,12 +85,12 @@ def update_shared(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def update_covariance(own: Constants, est: Estimator) -> None:
+def update_covariance(params: Constants, est: Estimator) -> None:
     """Take the innovations about their mean of half a second into R; what is absent leaves its rows as they are."""
-    shared, n, largest = est.shared, own.sensors.n, 0.0
+    shared, n, largest = est.shared, params.sensors.n, 0.0
     for i in range(n):
         largest = max(largest, abs(est.statistic[i]))
-    half = own.length / own.pace
+    half = params.length / params.pace
     shared.count = min(shared.count + 1.0, MEMORY * half)
     share = min(1.0, (FARTHEST / max(largest, 1.0)) ** 2)
     for i in range(n):
@@ -104,9 +104,9 @@ def update_covariance(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def take_fourth_difference(own: Constants, est: Estimator) -> None:
+def take_fourth_difference(params: Constants, est: Estimator) -> None:
     """Sum the products of what channels have in common and what they differ by, of one fourth difference."""
-    shared, n = est.shared, own.sensors.n
+    shared, n = est.shared, params.sensors.n
     past = shared.past
     for i in range(n):
         shared.difference[i] = 0.0
@@ -132,27 +132,27 @@ def take_fourth_difference(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def find_shape(own: Constants, est: Estimator) -> None:
+def find_shape(params: Constants, est: Estimator) -> None:
     """Work out the parity of the channels in use by their noise alone: once a block, and as they change.
 
     What was measured of others before stands: missing channels make no noise smaller. At rest, and in motion, R begins
     anew with the variances of that time.
     """
-    shared, n, noise = est.shared, own.sensors.n, est.noise
+    shared, n, noise = est.shared, params.sensors.n, est.noise
     kept = est.mask & ~est.aside & ~est.beyond
-    if not own.spans[kept]:
+    if not params.spans[kept]:
         kept = est.mask
     if kept == shared.kept and est.filled > 0:
         return
     weigh_each(shared.alone, n, kept, noise.now.sample)
-    eliminate_rate(shared.alone, n, own.sensors.axes, UNKNOWN_RATE)
+    eliminate_rate(shared.alone, n, params.sensors.axes, UNKNOWN_RATE)
     if kept != shared.kept:
         # Differences are of samples of the same channels.
         shared.kept, shared.fresh = kept, 0
         weigh_each(shared.even, n, kept, shared.ones)
-        eliminate_rate(shared.even, n, own.sensors.axes, UNKNOWN_RATE)
+        eliminate_rate(shared.even, n, params.sensors.axes, UNKNOWN_RATE)
     if noise.regime != shared.regime:
-        shared.regime, shared.count = noise.regime, 0.5 * own.length / own.pace
+        shared.regime, shared.count = noise.regime, 0.5 * params.length / params.pace
         for i in range(n):
             shared.local[i] = 0.0
             for j in range(n):
@@ -160,16 +160,16 @@ def find_shape(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def find_level(own: Constants, est: Estimator) -> None:
+def find_level(params: Constants, est: Estimator) -> None:
     """Find the variance of each channel now, with all that independent channels do not explain; once a block."""
-    shared, n, noise, k = est.shared, own.sensors.n, est.noise, -3.0
+    shared, n, noise, k = est.shared, params.sensors.n, est.noise, -3.0
     for i in range(n):
         k += shared.kept >> i & 1
-    coherent = find_coherence(own, est)
-    find_vibration(own, est)
+    coherent = find_coherence(params, est)
+    find_vibration(params, est)
     pooled = 0.0
     if k > 0.0:
-        coherent = max(coherent, find_dimensions(own, est, k))
+        coherent = max(coherent, find_dimensions(params, est, k))
         for i in range(n):
             for j in range(i + 1):
                 pooled += (1.0 if i == j else 2.0) * shared.even.information[i, j] * shared.outer[i, j]
@@ -179,25 +179,25 @@ def find_level(own: Constants, est: Estimator) -> None:
         level = noise.now.sample[i] * max(1.0, BURST * noise.quick[i], shared.excess)
         seen = 0.0
         for a in range(3):
-            seen += own.sensors.axes[i, a] * own.sensors.axes[i, a] * shared.vibration[a]
+            seen += params.sensors.axes[i, a] * params.sensors.axes[i, a] * shared.vibration[a]
         level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
         shared.level[i] = level + coherent * max(pooled - level, 0.0)
 
 
 @compiled
-def keep_line(own: Constants, est: Estimator) -> None:
+def keep_line(params: Constants, est: Estimator) -> None:
     """Remember what of R is a line, while nothing is suspicious: the onset of a fault is in R for a second."""
-    shared, pace = est.shared, own.pace / MEMORY
-    for i in range(own.sensors.n):
-        for j in range(own.sensors.n):
+    shared, pace = est.shared, params.pace / MEMORY
+    for i in range(params.sensors.n):
+        for j in range(params.sensors.n):
             now = shared.coherent * shared.outer[max(i, j), min(i, j)]
             shared.line[i, j] += pace * (now - shared.line[i, j])
 
 
 @compiled
-def find_dimensions(own: Constants, est: Estimator, k: float) -> float:
+def find_dimensions(params: Constants, est: Estimator, k: float) -> float:
     """Find the level of R over that of the variances; return the share of it that is a line, by its dimensions."""
-    shared, n, first, second = est.shared, own.sensors.n, 0.0, 0.0
+    shared, n, first, second = est.shared, params.sensors.n, 0.0, 0.0
     product = est.block_parity.weight
     for i in range(n):
         for j in range(i):
@@ -213,16 +213,16 @@ def find_dimensions(own: Constants, est: Estimator, k: float) -> float:
         for j in range(n):
             second += product[i, j] * product[j, i]
     shared.excess = max(first / k, 1.0)
-    chance = (k + 1.0) * own.length / (k * INDEPENDENT * shared.count)
+    chance = (k + 1.0) * params.length / (k * INDEPENDENT * shared.count)
     excess = second / max(first * first, 1e-30) - 1.0 / k - chance
     return min(max(excess / LINE, 0.0), 1.0)
 
 
 @compiled
-def find_coherence(own: Constants, est: Estimator) -> float:
+def find_coherence(params: Constants, est: Estimator) -> float:
     """Take the products of a block into their means, and what they say of each variance; return the coherent share."""
-    shared, n, noise = est.shared, own.sensors.n, est.noise
-    pace, count = own.pace / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
+    shared, n, noise = est.shared, params.sensors.n, est.noise
+    pace, count = params.pace / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
     steady = update_common(shared, pace, count) < STEADY
     explained = total = 0.0
     for i in range(n):
@@ -260,9 +260,9 @@ def update_common(shared: SharedNoise, pace: float, count: int) -> float:
 
 
 @compiled
-def find_vibration(own: Constants, est: Estimator) -> None:
+def find_vibration(params: Constants, est: Estimator) -> None:
     """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion."""
-    shared, length = est.shared, float(own.length)
+    shared, length = est.shared, float(params.length)
     for a in range(3):
         noise, within = shared.alone.inverse[a, a], 0.0
         if length > 2.0 and est.blocks > 0:
@@ -270,6 +270,6 @@ def find_vibration(own: Constants, est: Estimator) -> None:
             slope = est.rates[0, a] - est.rates[1, a]
             about = shared.rate_squares[a] - shared.rate_sum[a] * shared.rate_sum[a] / length
             within = (about - slope * slope * (length * length - 1.0) / (12.0 * length)) / (length - 2.0)
-        shared.within[a] += own.pace / MEMORY * (within - shared.within[a])
+        shared.within[a] += params.pace / MEMORY * (within - shared.within[a])
         shared.rate_sum[a] = shared.rate_squares[a] = 0.0
         shared.vibration[a] = max(shared.within[a] - noise, shared.square[a, a] - noise, 0.0)

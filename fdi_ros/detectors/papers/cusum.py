@@ -155,93 +155,93 @@ class State:
 
 @compiled
 def advance(
-    side: Side, own: Constants, step: float, factor: float, systematic: float, residual: NDArray[np.float64]
+    side: Side, params: Constants, step: float, factor: float, systematic: float, residual: NDArray[np.float64]
 ) -> None:
     """Take one sample into a running sum; it stays between 0 and 1.5 thresholds."""
-    side.total = min(max(side.total + step, 0.0), 1.5 * own.threshold)
+    side.total = min(max(side.total + step, 0.0), 1.5 * params.threshold)
     if side.total == 0.0 and side.count == 0:
         return
     if side.total == 0.0:
         side.count = 0
         side.factor = side.systematic = 0.0
-        for i in range(own.sensors.n):
+        for i in range(params.sensors.n):
             side.residual[i] = 0.0
-    elif side.count < own.window:
+    elif side.count < params.window:
         side.count += 1
         side.factor += factor
         side.systematic += systematic
-        for i in range(own.sensors.n):
+        for i in range(params.sensors.n):
             side.residual[i] += factor * residual[i]
 
 
 @compiled
-def name(own: Constants, side: Side, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def name(params: Constants, side: Side, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Name the channels that explain the average since the onset."""
     mean_part = side.systematic / side.count
     # The variance of the average is at most 1 / count + mean_part^2: over its root, that of a sample.
     root = 1.0 / math.sqrt(1.0 / side.count + mean_part * mean_part)
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         state.room.residual[i] = side.residual[i] / side.count * root
-    explain(own.resting, own.sensors, sample, state.room, verdict)
-    for i in range(own.sensors.n):
+    explain(params.resting, params.sensors, sample, state.room, verdict)
+    for i in range(params.sensors.n):
         verdict.error[i] *= side.count / max(side.factor, LEAST_FACTOR) / root
 
 
 @compiled
-def name_largest(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def name_largest(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Name the channels by the largest sum, the downward ones first where several are as large."""
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         if state.down[i].total == verdict.statistic:
-            name(own, state.down[i], state, sample, verdict)
+            name(params, state.down[i], state, sample, verdict)
             return
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         if state.up[i].total == verdict.statistic:
-            name(own, state.up[i], state, sample, verdict)
+            name(params, state.up[i], state, sample, verdict)
             return
 
 
 @callback(Constants, State, SampleInput, SampleVerdict)
-def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Advance all sums by one sample; on alarm, name the channels by the largest."""
-    sensors, room = own.sensors, state.room
+    sensors, room = params.sensors, state.room
     n = sensors.n
-    take_sample(own.resting, sensors, sample, room)
+    take_sample(params.resting, sensors, sample, room)
     for i in range(n):
         state.resting[i], state.variance[i] = room.residual[i], 1.0
     if not sensors.constant:
-        plain_variances(own, sample, state)
-        take_sample(own.hypotheses, sensors, sample, room)
+        plain_variances(params, sample, state)
+        take_sample(params.hypotheses, sensors, sample, room)
     largest = size = spread = 1.0
     systematic = 0.0
     for i in range(n):
-        w0 = state.resting[i] * own.scale[i]
+        w0 = state.resting[i] * params.scale[i]
         # The scores hold w until the sums are advanced.
-        verdict.scores[i] = w0 if sensors.constant else whitened(own.hypotheses, sensors, sample, room, i)
+        verdict.scores[i] = w0 if sensors.constant else whitened(params.hypotheses, sensors, sample, room, i)
         largest, size = max(largest, abs(w0)), max(size, abs(verdict.scores[i]))
         spread = max(spread, state.variance[i])
-        systematic = max(systematic, state.variance[i] - 1.0 + own.bias[i])
+        systematic = max(systematic, state.variance[i] - 1.0 + params.bias[i])
     factor = min(1.0 / math.sqrt(spread), LARGEST / largest)
     lasting = min(factor * math.sqrt(systematic), LARGEST)
     shrink = min(1.0, LARGEST / size)
-    verdict.statistic, verdict.threshold = 0.0, own.threshold
+    verdict.statistic, verdict.threshold = 0.0, params.threshold
     for i in range(n):
         w, variance = verdict.scores[i] * shrink, state.variance[i]
-        less = min(own.half_shift + SYSTEMATIC * math.sqrt((variance - 1.0 + own.bias[i]) / variance), LARGEST)
-        advance(state.down[i], own, -w - less, factor, lasting, state.resting)
-        advance(state.up[i], own, w - less, factor, lasting, state.resting)
+        less = min(params.half_shift + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance), LARGEST)
+        advance(state.down[i], params, -w - less, factor, lasting, state.resting)
+        advance(state.up[i], params, w - less, factor, lasting, state.resting)
         verdict.scores[i] = max(state.down[i].total, state.up[i].total)
         verdict.statistic = max(verdict.statistic, verdict.scores[i])
         if not sensors.detectable[i]:
             verdict.scores[i] = math.nan
-    verdict.alarm = verdict.statistic >= own.threshold
+    verdict.alarm = verdict.statistic >= params.threshold
     if verdict.alarm:
-        name_largest(own, state, sample, verdict)
+        name_largest(params, state, sample, verdict)
 
 
 @compiled
-def plain_variances(own: Constants, sample: SampleInput, state: State) -> None:
+def plain_variances(params: Constants, sample: SampleInput, state: State) -> None:
     """Variance of every w0 by all errors at the rate and acceleration of the sample, into ``state.variance``."""
-    sensors, rate = own.sensors, state.room.correction
+    sensors, rate = params.sensors, state.room.correction
     n = sensors.n
     for a in range(3):
         rate[a] = 0.0
@@ -252,7 +252,7 @@ def plain_variances(own: Constants, sample: SampleInput, state: State) -> None:
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += own.squares[i, j] * state.room.variance[j]
+            total += params.squares[i, j] * state.room.variance[j]
         state.variance[i] = max(total, 1.0)
 
 
@@ -327,18 +327,18 @@ class Cusum(Detector):
             per_hour=false_alarms_per_hour, run_length=run_length, sample_rate=sample_rate
         ).mean_run_length()
         super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
-        own, n = self.constants[0], geometry.n
-        prepare_hypotheses(own["resting"], geometry, self.noise, confidence, fixed=True)
-        prepare_hypotheses(own["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
-        residual = own["resting"]["residual"][:n, :n]
+        params, n = self.constants[0], geometry.n
+        prepare_hypotheses(params["resting"], geometry, self.noise, confidence, fixed=True)
+        prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
+        residual = params["resting"]["residual"][:n, :n]
         share = np.where(geometry.detectable, np.diag(residual), np.inf)
-        own["scale"][:n] = 1 / np.sqrt(share)
-        own["squares"][:n, :n] = residual**2 / share[:, None] / self.noise.noise_std**2
-        own["bias"][:n] = own["squares"][:n, :n] @ self.noise.bias_std**2
+        params["scale"][:n] = 1 / np.sqrt(share)
+        params["squares"][:n, :n] = residual**2 / share[:, None] / self.noise.noise_std**2
+        params["bias"][:n] = params["squares"][:n, :n] @ self.noise.bias_std**2
         self.threshold = _threshold(geometry, self.noise, shift / 2, self.run_length)
         self.window = math.ceil(16 * self.threshold / shift) + 1
         """Samples after the onset, at most, that the naming of the channel rests on."""
-        own["half_shift"], own["threshold"], own["window"] = shift / 2, self.threshold, self.window
+        params["half_shift"], params["threshold"], params["window"] = shift / 2, self.threshold, self.window
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).

@@ -147,27 +147,27 @@ class Findings:
 
 
 @compiled
-def check(own: Circuits, z: Array, found: Findings) -> float:
+def check(params: Circuits, z: Array, found: Findings) -> float:
     """Evaluate the checks of a sample z (n,), and return the size of the largest."""
-    for k in range(own.circuits):
+    for k in range(params.circuits):
         found.value[k] = 0.0
-    for i in range(own.sensors.n):
-        for k in range(own.circuits):
-            found.value[k] += own.checks[i, k] * z[i]
+    for i in range(params.sensors.n):
+        for k in range(params.circuits):
+            found.value[k] += params.checks[i, k] * z[i]
     largest = 0.0
-    for k in range(own.circuits):
+    for k in range(params.circuits):
         largest = max(largest, abs(found.value[k]))
     return largest
 
 
 @compiled
-def explain(own: Circuits, found: Findings) -> int:
+def explain(params: Circuits, found: Findings) -> int:
     """List the checks violated and the largest sets that explain them; return the bits of all sets ruled out."""
     found.violations = found.explanations = 0
     ruled_out = 0
-    for k in range(own.circuits):
+    for k in range(params.circuits):
         if abs(found.value[k]) > WITHIN:
-            ruled_out |= own.rules_out[k]
+            ruled_out |= params.rules_out[k]
             # The worst in front rejects most explanations at once.
             worst = found.violated[0]
             if found.violations and abs(found.value[k]) > abs(found.value[worst]):
@@ -175,23 +175,23 @@ def explain(own: Circuits, found: Findings) -> int:
             else:
                 found.violated[found.violations] = k
             found.violations += 1
-    for f in range(own.sets):
-        if not ruled_out >> (own.first + f) & 1:
+    for f in range(params.sets):
+        if not ruled_out >> (params.first + f) & 1:
             found.explains[found.explanations] = f
             found.explanations += 1
     return ruled_out
 
 
 @compiled
-def mildest(own: Circuits, found: Findings) -> float:
+def mildest(params: Circuits, found: Findings) -> float:
     """Size in bounds of the largest error in the mildest explanation of a sample that violates checks."""
     least = math.inf
     for m in range(found.explanations):
-        members, largest = own.members[found.explains[m]], 0.0
+        members, largest = params.members[found.explains[m]], 0.0
         for v in range(found.violations):
             k = found.violated[v]
             # Errors of t bounds in the faulty members stretch what the check allows to 1 + (t - 1) weight.
-            weight = own.weight[k, members[0]] + own.weight[k, members[1]]
+            weight = params.weight[k, members[0]] + params.weight[k, members[1]]
             largest = max(largest, (abs(found.value[k]) - 1) / weight)
             if largest >= least:
                 break
@@ -200,23 +200,23 @@ def mildest(own: Circuits, found: Findings) -> float:
 
 
 @compiled
-def intervals(own: Circuits, found: Findings) -> None:
+def intervals(params: Circuits, found: Findings) -> None:
     """Fill in the interval of each channel's error, over all explanations; NaN if there are none."""
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         lower, upper = math.inf, -math.inf
         # An interval is widest where the channel itself is faulty: then little is left to do for the other sets.
         for faulty in (True, False):
             for m in range(found.explanations):
                 f = found.explains[m]
-                if (own.members[f, 0] == i or own.members[f, 1] == i) != faulty:
+                if (params.members[f, 0] == i or params.members[f, 1] == i) != faulty:
                     continue
-                high = math.inf if faulty else own.bound[i]
+                high = math.inf if faulty else params.bound[i]
                 low = -high
-                for u in range(own.usable[i, f]):
+                for u in range(params.usable[i, f]):
                     if low >= lower and high <= upper:
                         break
-                    c = own.which[i, f, u]
-                    centre, half = found.value[own.circuit[i, c]] * own.slope[i, c], own.half[i, c]
+                    c = params.which[i, f, u]
+                    centre, half = found.value[params.circuit[i, c]] * params.slope[i, c], params.half[i, c]
                     low, high = max(low, centre - half), min(high, centre + half)
                 lower, upper = min(lower, low), max(upper, high)
         found.lower[i] = lower if found.explanations else math.nan
@@ -224,22 +224,22 @@ def intervals(own: Circuits, found: Findings) -> None:
 
 
 @compiled
-def name_suspects(own: Circuits, found: Findings, verdict: SampleVerdict) -> None:
+def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> None:
     """Fill in the channels that have failed in some explanation, whether all have in each, and their errors."""
-    n, any_found = own.sensors.n, False
+    n, any_found = params.sensors.n, False
     for i in range(n):
-        beyond = own.threshold * own.bound[i]
-        if own.sensors.detectable[i] and (found.upper[i] >= beyond or found.lower[i] <= -beyond):
+        beyond = params.threshold * params.bound[i]
+        if params.sensors.detectable[i] and (found.upper[i] >= beyond or found.lower[i] <= -beyond):
             any_found = True
             for j in range(n):
-                if own.sensors.alike[i, j]:
-                    verdict.suspects[j] = own.sensors.detectable[j]
+                if params.sensors.alike[i, j]:
+                    verdict.suspects[j] = params.sensors.detectable[j]
     verdict.isolated = True
     for i in range(n):
-        lower, upper, beyond = found.lower[i], found.upper[i], own.threshold * own.bound[i]
+        lower, upper, beyond = found.lower[i], found.upper[i], params.threshold * params.bound[i]
         # No explanation, or only channels whose faults the geometry hides could have failed: nothing to choose by.
         if not any_found:
-            verdict.suspects[i] = own.sensors.detectable[i]
+            verdict.suspects[i] = params.sensors.detectable[i]
         if verdict.suspects[i]:
             if not (lower >= beyond or upper <= -beyond):
                 verdict.isolated = False
@@ -248,34 +248,34 @@ def name_suspects(own: Circuits, found: Findings, verdict: SampleVerdict) -> Non
 
 
 @callback(Circuits, Findings, SampleInput, SampleVerdict)
-def judge(own: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(params: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by its checks, and if these need a fault by what all explanations have in common."""
-    verdict.statistic, verdict.threshold = check(own, sample.z, found), own.limit
-    if verdict.statistic < min(WITHIN, own.limit):
+    verdict.statistic, verdict.threshold = check(params, sample.z, found), params.limit
+    if verdict.statistic < min(WITHIN, params.limit):
         return
-    explain(own, found)
-    if found.violations and own.faults:
-        verdict.statistic = mildest(own, found)
-    verdict.alarm = verdict.statistic >= own.limit
-    intervals(own, found)
+    explain(params, found)
+    if found.violations and params.faults:
+        verdict.statistic = mildest(params, found)
+    verdict.alarm = verdict.statistic >= params.limit
+    intervals(params, found)
     # Comparisons with NaN are false: without an explanation nothing is known of a channel.
-    for i in range(own.sensors.n):
+    for i in range(params.sensors.n):
         if found.lower[i] > 0 or found.upper[i] < 0:
-            verdict.scores[i] = max(found.lower[i], -found.upper[i]) / own.bound[i]
+            verdict.scores[i] = max(found.lower[i], -found.upper[i]) / params.bound[i]
     if verdict.alarm:
-        name_suspects(own, found, verdict)
+        name_suspects(params, found, verdict)
 
 
 @compiled
 def explain_rows(
-    own: NDArray[Any], found: NDArray[Any], z: Array, ruled_out: NDArray[np.int64], lower: Array, upper: Array
+    params: NDArray[Any], found: NDArray[Any], z: Array, ruled_out: NDArray[np.int64], lower: Array, upper: Array
 ) -> None:
     """Fill in the bits of the sets that samples z (N, n) rule out, (N,), and the intervals of the errors, (N, n)."""
     for k in range(len(z)):
-        check(own[0], z[k], found[0])
-        ruled_out[k] = explain(own[0], found[0])
-        intervals(own[0], found[0])
-        for i in range(own[0].sensors.n):
+        check(params[0], z[k], found[0])
+        ruled_out[k] = explain(params[0], found[0])
+        intervals(params[0], found[0])
+        for i in range(params[0].sensors.n):
             lower[k, i], upper[k, i] = found[0].lower[i], found[0].upper[i]
 
 
@@ -344,9 +344,9 @@ class Guaranteed(Detector):
         self.threshold = threshold
         self.sets = tuple(f for size in range(self.max_faults + 1) for f in combinations(range(geometry.n), size))
         """Sets of channels that may be the faulty ones, smallest first; columns of `culprits`."""
-        own = self.constants[0]
-        own["bound"][: geometry.n], own["threshold"] = self.bound, threshold
-        own["limit"] = threshold if self.max_faults else WITHIN
+        params = self.constants[0]
+        params["bound"][: geometry.n], params["threshold"] = self.bound, threshold
+        params["limit"] = threshold if self.max_faults else WITHIN
         checks = circuits(geometry.axes)
         checks /= (np.abs(checks) * self.bound).sum(axis=1)[:, None]
         self._prepare_checks(checks)
@@ -359,33 +359,33 @@ class Guaranteed(Detector):
 
     def _prepare_checks(self, checks: Array) -> None:
         """Fill in checks (C, n), and for each the sets of channels that leave all its members healthy."""
-        own, (count, n) = self.constants[0], checks.shape
-        own["circuits"], own["checks"][:n, :count] = count, checks.T
-        own["weight"][:count, :n] = np.abs(checks) * self.bound
+        params, (count, n) = self.constants[0], checks.shape
+        params["circuits"], params["checks"][:n, :count] = count, checks.T
+        params["weight"][:count, :n] = np.abs(checks) * self.bound
         struck = np.array([[i in channels for i in range(n)] for channels in self.sets])
         untouched = (struck @ (checks != 0).T) == 0
-        own["rules_out"][:count] = (1 << np.arange(len(self.sets))) @ untouched
+        params["rules_out"][:count] = (1 << np.arange(len(self.sets))) @ untouched
         largest = [channels for channels in self.sets if len(channels) == self.max_faults]
-        own["faults"], own["sets"], own["first"] = self.max_faults, len(largest), len(self.sets) - len(largest)
-        own["members"] = ABSENT
-        own["members"][: len(largest), : self.max_faults] = largest
+        params["faults"], params["sets"], params["first"] = self.max_faults, len(largest), len(self.sets) - len(largest)
+        params["members"] = ABSENT
+        params["members"][: len(largest), : self.max_faults] = largest
 
     def _prepare_intervals(self, checks: Array) -> None:
         """Fill in how the circuits through each channel limit its error, and which do so for each set at fault."""
-        own = self.constants[0]
+        params = self.constants[0]
         for i, bound in enumerate(self.bound):
             through = np.flatnonzero(checks[:, i])
             half = 1 / np.abs(checks[through, i]) - bound
             # The narrowest first: they leave least to tighten.
             order = np.argsort(half, kind="stable")
             through, count = through[order], len(through)
-            own["circuit"][i, :count], own["half"][i, :count] = through, half[order]
-            own["slope"][i, :count] = 1 / checks[through, i]
+            params["circuit"][i, :count], params["half"][i, :count] = through, half[order]
+            params["slope"][i, :count] = 1 / checks[through, i]
             others = np.delete(checks[through] != 0, i, axis=1)
-            for f, channels in enumerate(self.sets[own["first"] :]):
+            for f, channels in enumerate(self.sets[params["first"] :]):
                 struck = [j in channels for j in range(self.geometry.n) if j != i]
                 usable = np.flatnonzero(~others[:, struck].any(axis=1))
-                own["usable"][i, f], own["which"][i, f, : len(usable)] = len(usable), usable
+                params["usable"][i, f], params["which"][i, f, : len(usable)] = len(usable), usable
 
     @property
     def isolable(self) -> Mask:

@@ -60,31 +60,31 @@ class OneNorm(SingleFault):
 
 
 @callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
-def judge_two_norm(own: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_two_norm(params: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by what a fault of each channel leaves unexplained."""
-    score_by_sums(own, sample, verdict)
-    named = worst(own, verdict)
-    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+    score_by_sums(params, sample, verdict)
+    named = worst(params, verdict)
+    conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
 
 
 @callback(OneNorm, NoState, SampleInput, SampleVerdict)
-def judge_one_norm(own: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_one_norm(params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the error of least 1-norm that explains it."""
-    n, z = own.sensors.n, sample.z
+    n, z = params.sensors.n, sample.z
     best, least = 0, np.inf
-    for b in range(own.sets):
+    for b in range(params.sets):
         norm = 0.0
         for k in range(n - 3):
-            norm += abs(value_of(own.solutions[b, k], z, n))
+            norm += abs(value_of(params.solutions[b, k], z, n))
             if norm >= least:
                 break
         if norm < least:
             best, least = b, norm
     # The scores of all other channels are zero as they come.
     for k in range(n - 3):
-        verdict.scores[own.channels[best, k]] = abs(value_of(own.solutions[best, k], z, n))
-    named = worst(own, verdict)
-    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+        verdict.scores[params.channels[best, k]] = abs(value_of(params.solutions[best, k], z, n))
+    named = worst(params, verdict)
+    conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
 
 
 class Projector(SingleFaultDetector):
@@ -158,14 +158,14 @@ class Projector(SingleFaultDetector):
         """U2, (n, n - 3)."""
         errors = _single_errors(self.basis, geometry.detectable)
         super().__init__(geometry, noise, rate, options, largest=norm == "l1", errors=errors)
-        own = self.constants[0]
+        params = self.constants[0]
         if norm == "l1":
             sets, solutions = _basic_solutions(self.basis, geometry.detectable)
             count, m, n = solutions.shape
-            own["sets"], own["channels"][:count, :m], own["solutions"][:count, :m, :n] = count, sets, solutions
+            params["sets"], params["channels"][:count, :m], params["solutions"][:count, :m, :n] = count, sets, solutions
         else:
-            set_forms(own, _unexplained(self.basis, geometry.detectable), squares=True)
-        own["limit"] = largest_form_threshold(errors, geometry, self.noise, self.probability)
+            set_forms(params, _unexplained(self.basis, geometry.detectable), squares=True)
+        params["limit"] = largest_form_threshold(errors, geometry, self.noise, self.probability)
         self._try_faults()
 
 
@@ -233,23 +233,23 @@ class Innovations(SingleFault):
 
 
 @callback(Innovations, NoState, SampleInput, SampleVerdict)
-def judge_innovations(own: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_innovations(params: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the largest k_s of all equations and permutations."""
-    n, constant = own.sensors.n, own.sensors.constant
+    n, constant = params.sensors.n, params.sensors.constant
     if not constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(own, sample, verdict.error)
+        find_variances(params, sample, verdict.error)
     largest = 0.0
     for i in range(n):
         before, last = 0.0, 0.0
         for k in range(n - 3):
-            innovation = value_of(own.innovations[k, i], sample.z, n)
+            innovation = value_of(params.innovations[k, i], sample.z, n)
             if not constant:
-                innovation /= std_of(own.innovations[k, i], verdict.error, n)
+                innovation /= std_of(params.innovations[k, i], verdict.error, n)
             before, last = last, innovation * innovation
             largest = max(largest, last)
         verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
-    conclude(own, worst(own, verdict), largest, own.limit, sample, verdict)
+    conclude(params, worst(params, verdict), largest, params.limit, sample, verdict)
 
 
 class Recursive(SingleFaultDetector):
@@ -309,9 +309,9 @@ class Recursive(SingleFaultDetector):
         forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
         super().__init__(geometry, noise, rate, {}, largest=True, scored=geometry.n > 4)
         n = geometry.n
-        own = self.constants[0]
-        own["innovations"][: n - 3, :n, :n] = forms
-        own["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
+        params = self.constants[0]
+        params["innovations"][: n - 3, :n, :n] = forms
+        params["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:
@@ -376,25 +376,27 @@ class Struck(SingleFault):
 
 
 @callback(Struck, NoState, SampleInput, SampleVerdict)
-def judge_determinants(own: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the largest determinant over its standard deviation."""
-    constant = own.sensors.constant
+    constant = params.sensors.constant
     if not constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(own, sample, verdict.error)
+        find_variances(params, sample, verdict.error)
     statistic = 0.0
     for j in range(CHANNELS):
-        size = abs(value_of(own.determinants[j], sample.z, CHANNELS))
+        size = abs(value_of(params.determinants[j], sample.z, CHANNELS))
         # A determinant that is always zero has no deviation.
         if size > 0:
-            std = own.determinants_resting[j] if constant else std_of(own.determinants[j], verdict.error, CHANNELS)
+            std = (
+                params.determinants_resting[j] if constant else std_of(params.determinants[j], verdict.error, CHANNELS)
+            )
             statistic = max(statistic, size / std)
-        verdict.scores[j] = condition_without(own, j, sample) if own.by_condition else size
-    conclude(own, worst(own, verdict), statistic, own.limit, sample, verdict)
+        verdict.scores[j] = condition_without(params, j, sample) if params.by_condition else size
+    conclude(params, worst(params, verdict), statistic, params.limit, sample, verdict)
 
 
 @compiled
-def condition_without(own: Struck, j: int, sample: SampleInput) -> float:
+def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     """2-norm condition number of [H z] without row j; infinite where that is singular.
 
     With ``U diag(s) Q'`` the singular value decomposition of the axes without row j, ``u = U' z`` and delta the last
@@ -403,8 +405,8 @@ def condition_without(own: Struck, j: int, sample: SampleInput) -> float:
     ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither divides by delta, which is zero for a failed
     row without noise.
     """
-    left, z = own.left[j], sample.z
-    s, t, v = own.singular[j, 0], own.singular[j, 1], own.singular[j, 2]
+    left, z = params.left[j], sample.z
+    s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
     a, b, c = value_of(left[0], z, CHANNELS), value_of(left[1], z, CHANNELS), value_of(left[2], z, CHANNELS)
     delta = abs(value_of(left[3], z, CHANNELS))
     largest = largest_root((a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0))
@@ -504,14 +506,14 @@ class Determinant(SingleFaultDetector):
         by_condition = criterion == "condition_number"
         super().__init__(geometry, noise, rate, {"criterion": criterion}, largest=by_condition)
         forms = determinant_forms(geometry.axes)
-        own = self.constants[0]
-        own["determinants"], own["determinants_resting"] = forms, resting_std(forms, self.noise)
-        own["by_condition"] = by_condition
-        own["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
+        params = self.constants[0]
+        params["determinants"], params["determinants_resting"] = forms, resting_std(forms, self.noise)
+        params["by_condition"] = by_condition
+        params["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
         for j in range(CHANNELS):
             others = np.delete(np.arange(CHANNELS), j)
-            left, own["singular"][j], _ = np.linalg.svd(geometry.axes[others])
-            own["left"][j][:, others] = left.T
+            left, params["singular"][j], _ = np.linalg.svd(geometry.axes[others])
+            params["left"][j][:, others] = left.T
 
     @classmethod
     def refuses(cls, n: int) -> str:

@@ -76,12 +76,12 @@ class Scratch:
     misfit: Channels  # chi-square of the best pair of each channel; of a unit, its three errors, rad/s
 
 
-def prepare_hypotheses(own: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:
+def prepare_hypotheses(params: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:
     """Fill a record of `Hypotheses`.
 
     Parameters
     ----------
-    own
+    params
         The record.
     geometry
         Sensitivity axes.
@@ -100,17 +100,17 @@ def prepare_hypotheses(own: Any, geometry: Geometry, noise: NoiseModel, confiden
     if not 0.5 < confidence < 1:
         raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
     n, m, rest = geometry.n, geometry.n - 3, 1 - confidence
-    own["fixed"] = fixed
-    own["residual"][:n, :n] = whitened_residuals(geometry, noise) if fixed else geometry.S
-    own["single_limit"] = chi2_isf(rest, m - 1) if m > 1 else math.inf
-    own["pair_limit"] = chi2_isf(rest, m - 2) if m > 2 else math.inf
-    own["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
-    own["rival_margin"] = 2 * math.log(confidence / rest)
+    params["fixed"] = fixed
+    params["residual"][:n, :n] = whitened_residuals(geometry, noise) if fixed else geometry.S
+    params["single_limit"] = chi2_isf(rest, m - 1) if m > 1 else math.inf
+    params["pair_limit"] = chi2_isf(rest, m - 2) if m > 2 else math.inf
+    params["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
+    params["rival_margin"] = 2 * math.log(confidence / rest)
     # With five channels a pair explains anything.
-    own["can_isolate"], own["pairs"] = m > 1, n > 5
+    params["can_isolate"], params["pairs"] = m > 1, n > 5
     units = [unit for unit in geometry.units if _may_be_one_fault(geometry, unit)]
-    own["units"] = len(units)
-    own["unit"][: len(units)] = np.reshape(units, (-1, 3))
+    params["units"] = len(units)
+    params["unit"][: len(units)] = np.reshape(units, (-1, 3))
 
 
 def whitened_residuals(geometry: Geometry, noise: NoiseModel) -> Array:
@@ -133,15 +133,15 @@ def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
 
 
 @compiled
-def take_sample(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
+def take_sample(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
     """Work out what all hypotheses on one sample share."""
     n = sensors.n
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += own.residual[i, j] * (sample.z[j] / sensors.noise_std[j] if own.fixed else sample.z[j])
+            total += params.residual[i, j] * (sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j])
         room.residual[i] = total
-    if not own.fixed:
+    if not params.fixed:
         a = sample.acceleration
         for i in range(n):
             h = sensors.axes[i]
@@ -150,9 +150,9 @@ def take_sample(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
 
 
 @compiled
-def leave_out(own: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int) -> None:
+def leave_out(params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int) -> None:
     """Residuals without channels a, b, c (b and c may be `NONE`) in `kept`, and in their own places their errors."""
-    S, r = own.residual, room.residual
+    S, r = params.residual, room.residual
     e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
     if c >= 0:
         p, q, t = S[a, a], S[a, b], S[a, c]
@@ -230,11 +230,11 @@ def along(axis: Array, vector: Array) -> float:
 
 
 @compiled
-def fit(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+def fit(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
     """Fit the hypothesis that channels a, b, c are faulty: chi-square of the others; errors in `estimate`, rad/s."""
-    leave_out(own, sensors.n, room, a, b, c)
+    leave_out(params, sensors.n, room, a, b, c)
     left = 0.0
-    if own.fixed:
+    if params.fixed:
         for j in range(sensors.n):
             if j != a and j != b and j != c:
                 left += room.kept[j] * room.kept[j]
@@ -242,7 +242,7 @@ def fit(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a
         left = weigh(sensors, sample, room, a, b, c)
     for place in range(3):
         i = a if place == 0 else b if place == 1 else c
-        if i >= 0 and own.fixed:
+        if i >= 0 and params.fixed:
             room.estimate[place] = room.kept[i] * sensors.noise_std[i]
         elif i >= 0:
             room.estimate[place] = room.kept[i] - along(sensors.axes[i], room.correction)
@@ -250,13 +250,13 @@ def fit(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a
 
 
 @compiled
-def whitened(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int) -> float:
+def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int) -> float:
     """Error of channel i over its standard deviation; 0 if no fault of it is seen."""
     if not sensors.detectable[i]:
         return 0.0
-    if own.fixed:
-        return room.residual[i] / math.sqrt(own.residual[i, i])
-    leave_out(own, sensors.n, room, i, NONE, NONE)
+    if params.fixed:
+        return room.residual[i] / math.sqrt(params.residual[i, i])
+    leave_out(params, sensors.n, room, i, NONE, NONE)
     weigh(sensors, sample, room, i, NONE, NONE)
     h, s = sensors.axes[i], room.inverse
     own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (s[3] * h[1] + 2 * s[4] * h[2])
@@ -265,7 +265,7 @@ def whitened(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scrat
 
 
 @compiled
-def explain(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
+def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
     """Name the channels that explain a sample taken by `take_sample`: suspects, whether isolated, their errors.
 
     With c(k) the chi-square with k degrees of freedom that a true hypothesis stays below with the confidence asked
@@ -286,15 +286,15 @@ def explain(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratc
     for i in range(n):
         room.remaining[i] = math.inf
         if sensors.detectable[i]:
-            room.remaining[i] = fit(own, sensors, sample, room, i, NONE, NONE)
+            room.remaining[i] = fit(params, sensors, sample, room, i, NONE, NONE)
             verdict.error[i] = room.estimate[0]
             best = min(best, room.remaining[i])
-    if best <= own.single_limit:
+    if best <= params.single_limit:
         for i in range(n):
-            verdict.suspects[i] = sensors.detectable[i] and room.remaining[i] <= best + own.rival_margin
-        verdict.isolated = own.can_isolate and add_alike(sensors, verdict.suspects) == 1
-    elif not explain_by_pairs(own, sensors, sample, room, verdict) and not explain_by_units(
-        own, sensors, sample, room, verdict
+            verdict.suspects[i] = sensors.detectable[i] and room.remaining[i] <= best + params.rival_margin
+        verdict.isolated = params.can_isolate and add_alike(sensors, verdict.suspects) == 1
+    elif not explain_by_pairs(params, sensors, sample, room, verdict) and not explain_by_units(
+        params, sensors, sample, room, verdict
     ):
         verdict.isolated = False
         for i in range(n):
@@ -306,10 +306,10 @@ def explain(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratc
 
 @compiled
 def explain_by_pairs(
-    own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
 ) -> bool:
     """Name the channels of all pairs that explain the sample; False, and nothing is named, if none does."""
-    if not own.pairs:
+    if not params.pairs:
         return False
     n, possible = sensors.n, 0
     for i in range(n):
@@ -319,8 +319,8 @@ def explain_by_pairs(
         for j in range(i + 1, n):
             # Two that cannot be told apart explain no more together than one of them.
             if sensors.detectable[i] and sensors.detectable[j] and not sensors.alike[i, j]:
-                left = fit(own, sensors, sample, room, i, j, NONE)
-                if left <= own.pair_limit:
+                left = fit(params, sensors, sample, room, i, j, NONE)
+                if left <= params.pair_limit:
                     possible += 1
                     take_estimate(room, verdict, i, left, room.estimate[0])
                     take_estimate(room, verdict, j, left, room.estimate[1])
@@ -345,13 +345,13 @@ def take_estimate(room: Scratch, verdict: SampleVerdict, i: int, left: float, es
 
 @compiled
 def explain_by_units(
-    own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
 ) -> bool:
     """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
     found = NONE
-    for k in range(own.units):
-        unit = own.unit[k]
-        if fit(own, sensors, sample, room, unit[0], unit[1], unit[2]) <= own.unit_limit:
+    for k in range(params.units):
+        unit = params.unit[k]
+        if fit(params, sensors, sample, room, unit[0], unit[1], unit[2]) <= params.unit_limit:
             if found != NONE:
                 return False
             found = k
@@ -362,8 +362,8 @@ def explain_by_units(
     for i in range(sensors.n):
         verdict.suspects[i] = False
     for place in range(3):
-        verdict.suspects[own.unit[found, place]] = True
-        verdict.error[own.unit[found, place]] = room.misfit[place]
+        verdict.suspects[params.unit[found, place]] = True
+        verdict.error[params.unit[found, place]] = room.misfit[place]
     verdict.isolated = True
     return True
 
@@ -396,19 +396,19 @@ class Constants:
 
 
 @callback(Constants, Scratch, SampleInput, SampleVerdict)
-def judge(own: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Largest whitened residual of all channels; on alarm, the channels that explain it."""
-    sensors, largest = own.sensors, 0.0
-    take_sample(own.hypotheses, sensors, sample, room)
+    sensors, largest = params.sensors, 0.0
+    take_sample(params.hypotheses, sensors, sample, room)
     for i in range(sensors.n):
         verdict.scores[i] = math.nan
         if sensors.detectable[i]:
-            verdict.scores[i] = abs(whitened(own.hypotheses, sensors, sample, room, i))
+            verdict.scores[i] = abs(whitened(params.hypotheses, sensors, sample, room, i))
             largest = max(largest, verdict.scores[i])
-    verdict.statistic, verdict.threshold = largest, own.threshold
-    verdict.alarm = largest >= own.threshold
+    verdict.statistic, verdict.threshold = largest, params.threshold
+    verdict.alarm = largest >= params.threshold
     if verdict.alarm:
-        explain(own.hypotheses, sensors, sample, room, verdict)
+        explain(params.hypotheses, sensors, sample, room, verdict)
 
 
 class LikelihoodRatio(Detector):
@@ -464,7 +464,7 @@ class LikelihoodRatio(Detector):
         options = {**rate.as_options(), "confidence": confidence}
         super().__init__(geometry, noise, options)
         self.probability = rate.per_sample()
-        own = self.constants[0]
-        prepare_hypotheses(own["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
+        params = self.constants[0]
+        prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
         self.threshold = max_normal_threshold(whitened_directions(geometry, self.noise), self.probability)
-        own["threshold"] = self.threshold
+        params["threshold"] = self.threshold

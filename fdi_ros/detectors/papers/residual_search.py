@@ -43,16 +43,16 @@ class SearchConstants(SumsOfForms):
 
 
 @callback(SearchConstants, NoState, SampleInput, SampleVerdict)
-def judge(own: SearchConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(params: SearchConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the tolerance of its worst channel."""
-    score_by_sums(own, sample, verdict)
-    named = worst(own, verdict)
-    if own.paper:
-        residual = error_of(own, named, sample)
-        zero, scale = own.sensors.noise_std[named], own.sensors.scale_std[named] * (sample.z[named] - residual)
-        conclude(own, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
+    score_by_sums(params, sample, verdict)
+    named = worst(params, verdict)
+    if params.paper:
+        residual = error_of(params, named, sample)
+        zero, scale = params.sensors.noise_std[named], params.sensors.scale_std[named] * (sample.z[named] - residual)
+        conclude(params, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
     else:
-        conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+        conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
 
 
 class ResidualSearch(SingleFaultDetector):
@@ -123,12 +123,12 @@ class ResidualSearch(SingleFaultDetector):
         scored = self.criterion_largest or geometry.n > 4
         largest = self.criterion_largest or not scored
         super().__init__(geometry, noise, rate, {"tolerance": tolerance}, largest=largest, scored=scored)
-        own = self.constants[0]
+        params = self.constants[0]
         forms = self._forms(geometry) if scored else self.errors[None]
-        set_forms(own, forms, squares=self.criterion_squares and scored)
-        own["paper"] = paper
+        set_forms(params, forms, squares=self.criterion_squares and scored)
+        params["paper"] = paper
         if not paper:
-            own["limit"] = largest_form_threshold(self.errors, geometry, self.noise, self.probability)
+            params["limit"] = largest_form_threshold(self.errors, geometry, self.noise, self.probability)
         self._try_faults()
 
     def _forms(self, geometry: Geometry) -> Array:

@@ -145,9 +145,9 @@ class SingleFaultDetector(Detector):
         self.probability = rate.per_sample()
         n = geometry.n
         self.errors = prediction_errors(geometry.axes) if errors is None else errors
-        own = self.constants[0]
-        own["errors"][:n, :n], own["resting"][:n] = self.errors, resting_std(self.errors, self.noise)
-        own["limit"], own["sign"], own["scored"] = np.inf, 1.0 if largest else -1.0, scored
+        params = self.constants[0]
+        params["errors"][:n, :n], params["resting"][:n] = self.errors, resting_std(self.errors, self.noise)
+        params["limit"], params["sign"], params["scored"] = np.inf, 1.0 if largest else -1.0, scored
         self._set_suspects(geometry.group_matrix & geometry.detectable, geometry.isolable)
 
     @property
@@ -159,8 +159,8 @@ class SingleFaultDetector(Detector):
         """Set the suspects when channel i is named, row i of (n, n), and whether that isolates the fault, (n,)."""
         n = self.geometry.n
         self._suspects, self._names = suspects, names
-        own = self.constants[0]
-        own["suspects"][:n, :n], own["names"][:n] = suspects, names
+        params = self.constants[0]
+        params["suspects"][:n, :n], params["names"][:n] = suspects, names
         # Constants that are already in use are copied anew.
         self._rows = None
 
@@ -182,71 +182,71 @@ class SingleFaultDetector(Detector):
         self._set_suspects(found, self.geometry.isolable & (found.sum(axis=1) == 1))
 
 
-def set_forms(own: Any, forms: Array, squares: bool) -> None:
+def set_forms(params: Any, forms: Array, squares: bool) -> None:
     """Fill in what `SumsOfForms` adds, from forms (t, n, n)."""
     terms, n, _ = forms.shape
-    own["terms"], own["squares"], own["forms"][:terms, :n, :n] = terms, squares, forms
+    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = terms, squares, forms
 
 
 @compiled
-def score_by_sums(own: SumsOfForms, sample: SampleInput, verdict: SampleVerdict) -> None:
+def score_by_sums(params: SumsOfForms, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Fill the scores with the sums."""
-    n = own.sensors.n
+    n = params.sensors.n
     for i in range(n):
         total = 0.0
-        for t in range(own.terms):
-            value = value_of(own.forms[t, i], sample.z, n)
-            total += value * value if own.squares else abs(value)
+        for t in range(params.terms):
+            value = value_of(params.forms[t, i], sample.z, n)
+            total += value * value if params.squares else abs(value)
         verdict.scores[i] = total
 
 
 @compiled
-def worst(own: SingleFault, verdict: SampleVerdict) -> int:
+def worst(params: SingleFault, verdict: SampleVerdict) -> int:
     """Return the channel of the worst score among those whose faults are seen."""
     named, most = -1, -math.inf
-    for i in range(own.sensors.n):
-        badness = own.sign * verdict.scores[i]
-        if own.sensors.detectable[i] and (named < 0 or badness > most):
+    for i in range(params.sensors.n):
+        badness = params.sign * verdict.scores[i]
+        if params.sensors.detectable[i] and (named < 0 or badness > most):
             named, most = i, badness
     return named
 
 
 @compiled
-def error_of(own: SingleFault, i: int, sample: SampleInput) -> float:
+def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
     """Error of channel i were it alone at fault, rad/s: ``z_i - z_ip``."""
-    return value_of(own.errors[i], sample.z, own.sensors.n)
+    return value_of(params.errors[i], sample.z, params.sensors.n)
 
 
 @compiled
-def find_variances(own: SingleFault, sample: SampleInput, variance: Array) -> None:
+def find_variances(params: SingleFault, sample: SampleInput, variance: Array) -> None:
     """Fill in the error variance of each channel at the least-squares rate of the sample, (rad/s)^2."""
-    for i in range(own.sensors.n):
-        rate_along = sample.z[i] - error_of(own, i, sample) * own.sensors.share[i]
-        variance[i] = variance_of(own.sensors, i, rate_along, sample.acceleration)
+    for i in range(params.sensors.n):
+        rate_along = sample.z[i] - error_of(params, i, sample) * params.sensors.share[i]
+        variance[i] = variance_of(params.sensors, i, rate_along, sample.acceleration)
 
 
 @compiled
-def error_ratio(own: SingleFault, named: int, sample: SampleInput, verdict: SampleVerdict) -> float:
+def error_ratio(params: SingleFault, named: int, sample: SampleInput, verdict: SampleVerdict) -> float:
     """``|z_i - z_ip|`` of the channel named over its standard deviation."""
-    std = own.resting[named]
-    if not own.sensors.constant:
+    std = params.resting[named]
+    if not params.sensors.constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(own, sample, verdict.error)
-        std = std_of(own.errors[named], verdict.error, own.sensors.n)
-    return abs(error_of(own, named, sample)) / std
+        find_variances(params, sample, verdict.error)
+        std = std_of(params.errors[named], verdict.error, params.sensors.n)
+    return abs(error_of(params, named, sample)) / std
 
 
 @compiled
 def conclude(
-    own: SingleFault, named: int, statistic: float, threshold: float, sample: SampleInput, verdict: SampleVerdict
+    params: SingleFault, named: int, statistic: float, threshold: float, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Fill the verdict, whose scores are there, from the channel named, the statistic and its threshold."""
     alarm = statistic >= threshold
     verdict.statistic, verdict.threshold, verdict.alarm = statistic, threshold, alarm
-    verdict.isolated = alarm and own.names[named]
-    for i in range(own.sensors.n):
-        suspect = alarm and own.suspects[named, i]
+    verdict.isolated = alarm and params.names[named]
+    for i in range(params.sensors.n):
+        suspect = alarm and params.suspects[named, i]
         verdict.suspects[i] = suspect
-        verdict.error[i] = error_of(own, i, sample) if suspect else 0.0
-        if not (own.scored and own.sensors.detectable[i]):
+        verdict.error[i] = error_of(params, i, sample) if suspect else 0.0
+        if not (params.scored and params.sensors.detectable[i]):
             verdict.scores[i] = math.nan
