@@ -179,7 +179,7 @@ def _parsed(file: _Bounded, path: str) -> Any:
         If it does not.
     """
     from pyulog import ULog
-    from pyulog.exceptions import ULogIncompatibleFlagException
+    from pyulog.exceptions import ULogException, ULogIncompatibleFlagException
 
     try:
         # pyulog prints what it thinks of a file.
@@ -191,7 +191,16 @@ def _parsed(file: _Bounded, path: str) -> Any:
             return ULog(file)
     except ULogIncompatibleFlagException as error:
         raise BagError(f"{path} is a ULog of a later version, whose flags say that it must not be read") from error
-    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        RuntimeError,
+        TypeError,
+        ULogException,
+        ValueError,
+    ) as error:
         raise BagError(f"{path} cannot be read by pyulog: {error}") from error
 
 

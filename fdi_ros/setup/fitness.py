@@ -187,7 +187,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
     rates = [_rate_quantiles(one) for one in chosen]
     for k, fast in enumerate(rates):
         for j, slow in enumerate(rates):
-            moving = slow > MOVING
+            moving = (slow > MOVING) & np.isfinite(fast + slow)
             factors = fast[moving] / slow[moving]
             if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
                 factor = float(np.median(factors))

@@ -671,3 +671,9 @@ def test_a_default_log_shows_a_bias_and_no_more_than_that_is_said(tmp_path, monk
         assert replayed.code == 0, replayed
         assert "A COARSE CHECK" in replayed.out
     assert "A COARSE CHECK" in fdi("convert", path, tmp_path / "bag").out
+
+
+def test_a_ulog_that_ends_in_its_header_is_refused_in_one_line(tmp_path, refused):
+    path = tmp_path / "cut.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(4))
+    assert "Header too short" in refused("inspect", path)

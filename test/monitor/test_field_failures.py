@@ -390,3 +390,22 @@ def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_i
     output = pipeline.process(Block(stream(pipeline.geometry, 4000).stamp, z))
     assert output.valid.all()
     assert Reason.ALL_REPEAT not in {event.reason for event in output.events}
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_value_that_stands_within_one_step_of_its_sensor_is_not_stuck(stuck):
+    pipeline = Pipeline(parallel(3, health__stuck_time=0.2, health__stuck_time_at_rest=0.0))
+    step, t = 0.024, np.arange(1500) / RATE
+    # Quick motion shows the step; then the body turns to and fro by less than the sensor can resolve.
+    size = np.where(t < 5.0, 0.3, 0.1 if stuck else 0.0115)
+    block = stream(pipeline.geometry, 1500, size=0.0)
+    rate = (size * np.sin(np.pi * t))[:, None] * [1.0, 0.0, 0.0]
+    block.z[:] += rate @ pipeline.geometry.axes.T
+    block.z[:, 3] = np.round(rate[:, 0] / step) * step
+    if stuck:
+        block.z[500:, 3] = 0.0
+    output = pipeline.process(block)
+    found = pipeline.status().channels[3]
+    assert (found.state == ChannelState.FAULTY) == stuck
+    assert stuck or found.stuck == 0
+    assert {e.channel for e in output.events if e.after == ChannelState.FAULTY} == ({3} if stuck else set())
