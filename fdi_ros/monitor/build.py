@@ -111,8 +111,8 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     """Detector of a configuration, with those of the options that it takes."""
     settings = config.detector
     accepted = accepted_options(detector_class(settings.name))
-    own = {field.name for field in fields(settings)} - _RATES
-    options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in own}
+    known = {field.name for field in fields(settings)} - _RATES
+    options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in known}
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
     errors: dict[str, Any] = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
     options |= {name: value for name, value in errors.items() if name in accepted}

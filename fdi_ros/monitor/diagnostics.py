@@ -157,7 +157,7 @@ def describe(
     channels = []
     for k, channel in enumerate(status.channels):
         level, message = _LEVELS[channel.state], channel_message(channel, status)
-        if degraded_words(channel, status) or _frozen_words(channel, status):
+        if format_degraded(channel, status) or _format_frozen(channel, status):
             level = max(level, Level.WARN)
         if silent is not None:
             level, message = Level.STALE, _no_sample(status, silent)
@@ -168,13 +168,13 @@ def describe(
 
 def channel_message(channel: ChannelStatus, status: Status) -> str:
     """Say in words how a channel stands."""
-    words = [_state_words(channel, status), *_frozen_words(channel, status), *degraded_words(channel, status)]
+    words = [_format_state(channel, status), *_format_frozen(channel, status), *format_degraded(channel, status)]
     return "; ".join(
         words + [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
     )
 
 
-def _frozen_words(channel: ChannelStatus, status: Status) -> list[str]:
+def _format_frozen(channel: ChannelStatus, status: Status) -> list[str]:
     """Say that the unit of a channel gives old values."""
     return [_unit_frozen(unit) for unit in _frozen_units(channel, status)]
 
@@ -187,7 +187,7 @@ def _unit_frozen(unit: UnitStatus) -> str:
     return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
 
 
-def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
+def format_degraded(channel: ChannelStatus, status: Status) -> list[str]:
     """Say in what a channel that is still used has become worse than it should be."""
     words: list[str] = []
     if channel.is_left_out:
@@ -203,12 +203,12 @@ def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
 
 def degraded(status: Status) -> dict[str, str]:
     """Say which channels and units are worse than they should be, beside what is declared; by their names."""
-    channels = {channel.name: degraded_words(channel, status) for channel in status.channels}
+    channels = {channel.name: format_degraded(channel, status) for channel in status.channels}
     reports = {name: f"{name}: {'; '.join(words)}" for name, words in channels.items() if words}
-    return reports | {unit.name: _late_words(unit) for unit in status.units if _is_late(unit)}
+    return reports | {unit.name: _format_late(unit) for unit in status.units if _is_late(unit)}
 
 
-def unit_words(status: Status) -> list[str]:
+def format_units(status: Status) -> list[str]:
     """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
     late = [unit for unit in status.units if _is_late(unit)]
     words = [
@@ -216,7 +216,7 @@ def unit_words(status: Status) -> list[str]:
         " look at topics and remappings"
         for first, second in status.copies
     ]
-    words += [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_late_words(unit) for unit in late]
+    words += [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_format_late(unit) for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
             round(before + (unit.late if unit in late else 0.0), 5)
@@ -226,11 +226,11 @@ def unit_words(status: Status) -> list[str]:
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
     words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
     groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
-    words += [_unit_set_words(names) for group in groups if (names := whole_units(group, status.units))]
-    return words if status.apart is None else [*words, apart_words(status.apart)]
+    words += [_format_unit_set(names) for group in groups if (names := whole_units(group, status.units))]
+    return words if status.apart is None else [*words, format_apart(status.apart)]
 
 
-def apart_words(pair: ApartStatus) -> str:
+def format_apart(pair: ApartStatus) -> str:
     """Say of two channels of one axis by how much they differ."""
     return f"{pair.who.removesuffix(',')}, {plus_minus(pair.size, pair.std)} rad/s apart"
 
@@ -245,19 +245,19 @@ def _is_late(unit: UnitStatus) -> bool:
     return abs(unit.late) > max(CERTAIN * unit.late_std, LEAST_DELAY)
 
 
-def _late_words(unit: UnitStatus) -> str:
+def _format_late(unit: UnitStatus) -> str:
     side = "late" if unit.late > 0 else "early"
     size = f"{1e3 * abs(unit.late):.1f} +- {1e3 * unit.late_std:.1f} ms"
     off = ", taken off" if unit.taken_off else ""
     return f"{unit.name} as a whole: its stamps are {size} {side} against {unit.against}'s{off}"
 
 
-def _unit_set_words(names: Sequence[str]) -> str:
+def _format_unit_set(names: Sequence[str]) -> str:
     who = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     return f"{who} is faulty as a whole or in part, the evidence cannot tell {'which' if len(names) > 1 else 'more'}"
 
 
-def _state_words(channel: ChannelStatus, status: Status) -> str:
+def _format_state(channel: ChannelStatus, status: Status) -> str:
     # No sample has changed the state that a channel starts in.
     ago = max(0, status.stamp - channel.since) / 1e9
     lasting = "since the start" if not channel.since else f"for {_seconds(ago)}" if ago else "from this sample on"
@@ -266,12 +266,12 @@ def _state_words(channel: ChannelStatus, status: Status) -> str:
     if channel.state == ChannelState.AMBIGUOUS:
         pair, units = status.apart, whole_units(channel.group, status.units)
         if pair is not None and set(pair.channels) == set(channel.group):
-            return f"{apart_words(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
+            return f"{format_apart(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
         if len(channel.group) == 1:
             return f"most likely faulty, the only one left in question: to be confirmed; {lasting}"
         one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
-        seen = "" if pair is None else f"; seen on {apart_words(pair)}"
-        return f"{_unit_set_words(units) if units else one_of}{seen}; {lasting}"
+        seen = "" if pair is None else f"; seen on {format_apart(pair)}"
+        return f"{_format_unit_set(units) if units else one_of}{seen}; {lasting}"
     words = channel.reason.value or channel.state.name.lower()
     if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
         words = f"{words} by {_figure(abs(channel.error))} rad/s"
@@ -298,9 +298,9 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
     alive = sum(not channel.is_left_out for channel in status.channels)
     undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
     reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
-    degraded = [channel.name for channel in status.channels if degraded_words(channel, status)]
+    degraded = [channel.name for channel in status.channels if format_degraded(channel, status)]
     about = [f"degraded: {', '.join(degraded)}"] if degraded else []
-    note = "".join(f"; {words}" for words in (status.note, *unit_words(status), *about) if words)
+    note = "".join(f"; {words}" for words in (status.note, *format_units(status), *about) if words)
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     if not status.can_detect:

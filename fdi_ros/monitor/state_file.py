@@ -312,10 +312,10 @@ def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
     core, names = pipeline.core[0], pipeline.channel_names
     number = {name: i for i, name in enumerate(names)}
     if state.bias is not None:
-        own = core["bias"]
-        own["value"][: len(names)] = [state.bias[name] for name in names]
-        own["known"], own["learning"] = mask_of(number[name] for name in state.known), False
-        own["outcome"] = IN_MOTION if state.in_motion else RESTORED
+        bias = core["bias"]
+        bias["value"][: len(names)] = [state.bias[name] for name in names]
+        bias["known"], bias["learning"] = mask_of(number[name] for name in state.known), False
+        bias["outcome"] = IN_MOTION if state.in_motion else RESTORED
         settings = core["settings"]
         std = settings["turn_on"] if state.in_motion else settings["learned"][: len(names)]
         core["known"]["bias_std"][: len(names)] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)

@@ -235,7 +235,7 @@ def status_of(
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
         can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
-        bias_state=_bias_words(core["bias"], names, float(settings["turn_on"])),
+        bias_state=_format_bias(core["bias"], names, float(settings["turn_on"])),
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["now"]["fused"]) & well)
@@ -411,7 +411,7 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     return seconds if is_old and seconds >= core["settings"]["health"]["stuck_time"] / 1e9 > 0 else 0.0
 
 
-def _motion_words(bias: Any) -> str:
+def _format_motion(bias: Any) -> str:
     """Say why a time was refused as rest in which no more than one channel was restless by itself."""
     if bias["common_rate"] > bias["max_common_rate"]:
         return (
@@ -427,7 +427,7 @@ def _motion_words(bias: Any) -> str:
     return f"refused: {heard} channels gave values, one of them was not at rest, expected 3 at rest at least"
 
 
-def _bias_words(bias: Any, names: Sequence[str], turn_on: float) -> str:
+def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
     outcome = bias["outcome"]
     if outcome == FIXED:
@@ -447,7 +447,7 @@ def _bias_words(bias: Any, names: Sequence[str], turn_on: float) -> str:
         heard = int(bias["heard"]).bit_count()
         return f"refused: {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
     if int(bias["restless"]).bit_count() <= 1:
-        return _motion_words(bias)
+        return _format_motion(bias)
     mean, std, max_std = bias["average"], bias["scatter"], bias["max_std"]
     excess = [
         abs(mean[i]) / bias["max_rate"] + std[i] / max_std[i] if is_in(i, int(bias["restless"])) else 0.0

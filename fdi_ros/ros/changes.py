@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from fdi_ros.monitor.diagnostics import apart_words
+from fdi_ros.monitor.diagnostics import format_apart
 from fdi_ros.monitor.output import ChannelState, Event
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.messages import BoundedLog
@@ -108,7 +108,7 @@ class ChangeLog:
         if len(event.group) > 1:
             group = [self._names[i] for i in event.group]
             words += f"; one of {', '.join(group)}" if pair is None or set(pair.channels) != set(group) else ""
-            words += f"; {apart_words(pair)}" if pair is not None else ""
+            words += f"; {format_apart(pair)}" if pair is not None else ""
         return words
 
     def _write(self, state: ChannelState, channels: Sequence[int], words: str) -> None:

@@ -126,19 +126,19 @@ class InjectorNode(parameters.CheckedParameters, Node):
     def _strike(self, k: int, data: bytes) -> bytes | None:
         """Return the message with the faults in it; None: it is lost."""
         n = len(self.names)
-        own = self.source.channels_of(k, n)
-        measured, values = self.source.parse(data, own.stop - own.start)
+        channels = self.source.channels_of(k, n)
+        measured, values = self.source.parse(data, channels.stop - channels.start)
         stamp = measured if self.source.stamped else self._now()
         if self._origin is None:
             self._origin = stamp
         z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
-        z[0, own], received[0, own] = values, True
+        z[0, channels], received[0, channels] = values, True
         self._injectors[k].start_stamp = self._origin
         out = self._injectors[k].apply(Block(np.array([stamp], dtype=np.int64), z, received))
-        if out.received is not None and not out.received[0, own].any():
+        if out.received is not None and not out.received[0, channels].any():
             self.struck += 1
             return None
-        after = out.z[0, own].tolist()
+        after = out.z[0, channels].tolist()
         self.struck += after != list(values)
         return self.source.patch(data, after)
 
@@ -153,9 +153,11 @@ class InjectorNode(parameters.CheckedParameters, Node):
 
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            own = {p.name: parameters.checked(p.name, INJECTOR[p.name], p.value) for p in changes if p.name in INJECTOR}
-            if own:
-                self._switch({**self.values(INJECTOR), **own})
+            changed = {
+                p.name: parameters.checked(p.name, INJECTOR[p.name], p.value) for p in changes if p.name in INJECTOR
+            }
+            if changed:
+                self._switch({**self.values(INJECTOR), **changed})
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -74,9 +74,9 @@ class AutopilotNode(parameters.CheckedParameters, Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", **options)
         self.config = parameters.declare(self, MAVLINK, subscribes=False)
-        own = self.values(MAVLINK)
-        settings = self._settings(own)
-        self.link = open_link(own["url"])
+        params = self.values(MAVLINK)
+        settings = self._settings(params)
+        self.link = open_link(params["url"])
         self.vehicle = Vehicle(settings, self.link.send, time.time)
         topics = self.config.topics if self.config.has_units else TOPICS
         names = self.config.imu_names if self.config.has_units else [topic.partition("/")[0] for topic in TOPICS]
@@ -92,50 +92,50 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._called = False
         """Whether the executor has found something to do."""
         channels = [f"{name}.{axis}" for name in names for axis in "xyz"]
-        self._announcer = Announcer(self.config.channel_names or channels) if own["statustext"] else None
-        self._values = bool(own["named_values"])
-        self._monitor = _full_name(self.get_namespace(), own["monitor"])
-        self._failover = None if own["failover"] == "off" else self._make_failover(own)
+        self._announcer = Announcer(self.config.channel_names or channels) if params["statustext"] else None
+        self._values = bool(params["named_values"])
+        self._monitor = _full_name(self.get_namespace(), params["monitor"])
+        self._failover = None if params["failover"] == "off" else self._make_failover(params)
         if self._announcer is not None or self._values or self._failover is not None:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
         self.every(REPORT_PERIOD, self._report)
-        self.get_logger().info(f"listening on {own['url']}")
+        self.get_logger().info(f"listening on {params['url']}")
 
-    def _settings(self, own: dict[str, Any]) -> Settings:
-        if not is_plain_name(own["monitor"]):
+    def _settings(self, params: dict[str, Any]) -> Settings:
+        if not is_plain_name(params["monitor"]):
             raise ConfigError(
-                f"monitor is {own['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
+                f"monitor is {params['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
             )
-        rate = own["rate"] or self.config.sample_rate
+        rate = params["rate"] or self.config.sample_rate
         if not 1.0 <= rate <= 1000.0:
             raise ConfigError(f"rate is {rate:g} Hz, expected 1 to 1000 Hz")
-        kind = "" if own["messages"] == "auto" else f"{own['messages'].upper()}_IMU"
-        key = read_key(own["signing_key"]) if own["signing_key"] else b""
-        return Settings(own["system_id"], own["component_id"], kind, rate, key)
+        kind = "" if params["messages"] == "auto" else f"{params['messages'].upper()}_IMU"
+        key = read_key(params["signing_key"]) if params["signing_key"] else b""
+        return Settings(params["system_id"], params["component_id"], kind, rate, key)
 
-    def _make_failover(self, own: dict[str, Any]) -> Failover:
+    def _make_failover(self, params: dict[str, Any]) -> Failover:
         units = len(self.config.topics)
-        if not self.config.has_units or not 2 <= units <= len(INS_USE) or own["messages"] not in ("auto", "scaled"):
+        if not self.config.has_units or not 2 <= units <= len(INS_USE) or params["messages"] not in ("auto", "scaled"):
             raise ConfigError(
-                f"failover is {own['failover']!r}, with {units} topics and messages {own['messages']!r}, expected"
+                f"failover is {params['failover']!r}, with {units} topics and messages {params['messages']!r}, expected"
                 f" input: imus, 2 to {len(INS_USE)} imus.topics, and messages: scaled"
             )
-        if not 1 <= own["failover_limit"] < units:
-            raise ConfigError(f"failover_limit is {own['failover_limit']}, expected 1 to {units - 1}")
+        if not 1 <= params["failover_limit"] < units:
+            raise ConfigError(f"failover_limit is {params['failover_limit']}, expected 1 to {units - 1}")
         name = f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
         home = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
-        path = Path(own["failover_file"] or home / name)
-        if not own["failover_file"]:
+        path = Path(params["failover_file"] or home / name)
+        if not params["failover_file"]:
             home.mkdir(parents=True, exist_ok=True)
         declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
         heard = self.create_subscription(message_class(INTEGRITY.type), declarations, self._on_integrity, 10, raw=True)
         self._sole = [heard.topic_name, *(output.topic_name for output in self._outputs)]
         """Topics that must have one publisher: names as they are after remapping."""
         self.create_service(Trigger, "~/restore", self._on_restore)
-        if not own["signing_key"]:
+        if not params["signing_key"]:
             self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
-        return Failover(self.vehicle, self.config.channel_names, own["failover_limit"], path)
+        return Failover(self.vehicle, self.config.channel_names, params["failover_limit"], path)
 
     def live(self, stop: Stop) -> None:
         """Wait for the link, pass on what came, and give the executor its turn, until stopped.

@@ -60,8 +60,10 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         self.config = parameters.declare(self, MONITOR, OVERRIDABLE)
-        own = self.values(MONITOR)
-        self._state_file = StateFile(Path(own["state_file"]), own["state_max_age"]) if own["state_file"] else None
+        params = self.values(MONITOR)
+        self._state_file = (
+            StateFile(Path(params["state_file"]), params["state_max_age"]) if params["state_file"] else None
+        )
         log_through(self.log)
         self._running: Running | None = None
         self._checked_at = time.monotonic()

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import gc
 import importlib
 import re
@@ -233,10 +232,7 @@ def _unknown_ros_argument(words: str) -> str:
     if not re.fullmatch(r"\['.*'\]", words):
         return ""
     unknown = next((word for word in ast.literal_eval(words) if word.startswith("-")), words)
-    near = difflib.get_close_matches(unknown, ROS_ARGUMENTS, n=1)
-    return f"unknown ROS argument {unknown!r}, " + (
-        f"did you mean {near[0]!r}?" if near else f"expected one of: {', '.join(ROS_ARGUMENTS)}"
-    )
+    return f"unknown ROS argument {unknown!r}, expected one of: {', '.join(ROS_ARGUMENTS)}"
 
 
 def _check_files(node: Any, arguments: list[str]) -> None:

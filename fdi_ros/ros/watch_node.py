@@ -164,15 +164,15 @@ class Watcher(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         # All nodes publish there: those of the monitor have its name, "drone/fdi_node: ...".
         prefix = f"{self.picture.monitor.strip('/')}: "
-        own = [status for status in message.status if status.name.startswith(prefix)]
-        if not own:
+        found = [status for status in message.status if status.name.startswith(prefix)]
+        if not found:
             return
-        for status in own:
+        for status in found:
             if status.level not in LEVELS:
                 self._ignore("DiagnosticArray", f"level {ord(status.level)}, expected 0 to {max(Level)}")
                 return
         picture, channels, inputs = self.picture, {}, []
-        for status in own:
+        for status in found:
             name, values = status.name.removeprefix(prefix), {value.key: value.value for value in status.values}
             if name == WHOLE:
                 picture.whole, picture.whole_level = status.message, LEVELS[status.level]
