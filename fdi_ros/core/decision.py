@@ -256,8 +256,9 @@ def follow_declared(limits: DecisionSettings, decision: Decision, n: int, eviden
         # That of one that is not declared counts from its declaration, not from that of another.
         is_declared = decision.faulty >> i & 1 and not limits.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
-            decision.last_bad[i] = evidence.stamp
+            decision.last_bad[i] = decision.renewed[i] = evidence.stamp
             decision.error_sum[i], decision.error_count[i] = 0.0, 0
+            decision.earlier_sum[i], decision.earlier_count[i] = 0.0, 0
         else:
             decision.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
             decision.error_count[i] += 1
@@ -265,15 +266,20 @@ def follow_declared(limits: DecisionSettings, decision: Decision, n: int, eviden
 
 @compiled
 def find_returns(limits: DecisionSettings, decision: Decision, n: int, stamp: int) -> int:
-    """Bits of the declared channels that have agreed for the clean time."""
+    """Bits of the declared channels that have agreed for the clean time.
+
+    A small fault agrees sample by sample. So the mean is of the last one or two clean times: of what was before it is
+    no more.
+    """
     returns = 0
     for i in range(n):
         if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= limits.clean_time:
-            if abs(decision.error_sum[i]) <= limits.mean_limit[i] * decision.error_count[i]:
+            total = abs(decision.error_sum[i] + decision.earlier_sum[i])
+            if total <= limits.mean_limit[i] * (decision.error_count[i] + decision.earlier_count[i]):
                 returns |= 1 << i
-            else:
-                # A small fault agrees sample by sample: after its end the mean begins anew.
-                decision.last_bad[i], decision.error_sum[i], decision.error_count[i] = stamp, 0.0, 0
+            elif stamp - decision.renewed[i] >= limits.clean_time:
+                decision.earlier_sum[i], decision.earlier_count[i] = decision.error_sum[i], decision.error_count[i]
+                decision.error_sum[i], decision.error_count[i], decision.renewed[i] = 0.0, 0, stamp
     return returns
 
 

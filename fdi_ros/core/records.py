@@ -486,8 +486,11 @@ class Decision:
     count: Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]  # of these in whose set a channel is, by kind
     alarms: Whole  # samples of the window with an alarm that counts
     last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
+    renewed: Stamps  # when the sum of its errors was begun, ns
     error_sum: Channels  # of its errors since then, rad/s
     error_count: Counts  # of its samples since then
+    earlier_sum: Channels  # of its errors in the clean time before that, rad/s
+    earlier_count: Counts
     last_doubt: Whole  # last sample with an alarm, or that could not be judged, ns
     suspicion: Mask  # named by an alarm in the window
 
