@@ -181,6 +181,8 @@ LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
 """A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
+LARGEST_STEP = 0.015
+"""By so much at once at most: motors that start move biases by some 5 mrad/s, and no more."""
 FASTEST = 2.5
 """And so many times as fast as that for a moment."""
 RUINED = math.e * LARGEST_MOVE
@@ -577,7 +579,7 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
     """Go on with biases that have all moved by so much, rad/s, if that is not too far; return whether it is done."""
     est, case, n = state.estimator, state.case, params.sensors.n
     lately = case.moved * math.exp(-(est.seconds - case.moved_at) / WARMS) + std
-    if lately > LARGEST_MOVE:
+    if lately > LARGEST_MOVE or std > LARGEST_STEP:
         return False
     case.moved, case.moved_at, case.moved_since = lately, est.seconds, case.onset
     copy_biases(est.states, n, case.reference)
