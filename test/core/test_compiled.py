@@ -221,9 +221,9 @@ def test_a_change_of_a_called_function_is_compiled(warm: tuple[Path, Path]) -> N
     assert "compiled it in" not in outcome(start(copy))[2]
     source = copy / "fdi_ros" / "core" / "decision.py"
     text = source.read_text()
-    line = "own.faulty = own.ambiguous = own.voted = own.suspicion = 0"
+    line = "decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0"
     assert line in text
-    source.write_text(text.replace(line, "own.faulty = own.suspicion = 0"))
+    source.write_text(text.replace(line, "decision.faulty = decision.suspicion = 0"))
     assert outcome(start(copy))[1] == "0 5"
 
 
