@@ -64,7 +64,8 @@ def test_every_offline_command_runs(
     # A faulty gyro in a recording is exit code 3.
     faulty = "copter_crash" in command and "replay" in command
     assert main(shlex.split(command)[1:]) == (3 if faulty else 0)
-    assert capfd.readouterr().err == ""
+    # On a busy machine a long one says how far it is.
+    assert [line for line in capfd.readouterr().err.splitlines() if "% done" not in line] == []
     if "--json" in command:
         assert (tmp_path / "out.json").stat().st_size > 0
 
