@@ -224,7 +224,9 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     value, std = size.rad_s * unit.factor, size.std_rad_s * unit.factor
     figure = f"{plus_minus(abs(value), std)} {unit.name}"
     if size.course == "proportional":
-        return f"{100 * (size.share_of_rate or 0.0):+.2g} % of the rate, {figure} rms"
+        # Two digits, and never -1e+02.
+        share = float(f"{100 * (size.share_of_rate or 0.0):.2g}")
+        return f"{share:+g} % of the rate, {figure} rms"
     if size.course == "noisy":
         return f"noise of {figure}"
     if size.course == "varying":

@@ -73,7 +73,8 @@ def _faulty(summary: Summary) -> list[Episode]:
 
 def _without_state(one: Episode, unit: Unit) -> str:
     """Tell of an episode behind the word FAULTY."""
-    state = {"FAULTY": "", "AMBIGUOUS": ", which of them cannot be told,", "STALE": " silent"}[one.state]
+    untold = ", which of them cannot be told," if len(one.channels) > 1 else ", to be confirmed,"
+    state = {"FAULTY": "", "AMBIGUOUS": untold, "STALE": " silent"}[one.state]
     return episode_words(one, unit).replace(f" {one.state} from", f"{state} from", 1)
 
 
@@ -82,9 +83,16 @@ def _verdict_on_faults(summary: Summary) -> Verdict:
     scores = summary.scores
     plural = "fault" if len(scores.faults) == 1 else "faults"
     words = f"{len(scores.detected)} of {len(scores.faults)} injected {plural} detected, {scores.isolated} isolated."
-    if any(not one.injected for one in summary.story.declared):
+    if _wrongly_named(summary) or any(not one.injected for one in summary.story.declared):
         return Verdict(Severity.BAD, words)
     return Verdict(Severity.GOOD if scores.isolated == len(scores.faults) else Severity.UNKNOWN, words)
+
+
+def _wrongly_named(summary: Summary) -> list[str]:
+    """Return the channels that are declared faulty by themselves and that no injected fault strikes."""
+    struck = {name for fault in summary.scores.faults for name in fault.channels}
+    faulty = [one.channel for one in summary.scores.declared if one.state == "FAULTY"]
+    return list(dict.fromkeys(name for name in faulty if name not in struck))
 
 
 def _untold(summary: Summary) -> str:
@@ -226,6 +234,8 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
         first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
         return [f"{count} that no injected fault explains{first}:", *lines]
+    if wrong := _wrongly_named(summary):
+        return [f"Declared faulty, and not struck by a fault: {', '.join(wrong)}."]
     if why := _untold(summary):
         return [f"Of the others it cannot be told: {why}."]
     struck = {name for fault in scores.faults for name in fault.channels}

@@ -109,7 +109,7 @@ def _turned_units(path: Path, config: Config) -> str:
     with Recording(path) as recording:
         for block in Samples(recording, config, means[0].shape[1]).blocks():
             rows = len(block) // size
-            means.append(block.z[: rows * size].reshape(rows, size, -1).mean(axis=1))
+            means.append(block.z[: rows * size].reshape(rows, size, block.z.shape[1]).mean(axis=1))
     slow = np.concatenate(means)
     slow = slow[np.isfinite(slow).all(axis=1)]
     if len(slow) < _ENOUGH:

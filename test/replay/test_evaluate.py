@@ -118,6 +118,15 @@ def test_which_declaration_is_whose_doing(faults, events, found, others):
     assert [(one.channel, one.at_s) for one in scores.declared] == others
 
 
+def test_the_healthy_channel_that_a_fault_made_faulty_is_named():
+    # Two of three gyros of an axis shift alike: the third is named, and struck by nothing.
+    fault = ["channel=g1,g4 kind=bias size=0.1 start=10"]
+    doubted = [event(12, i, S.AMBIGUOUS, (0, 5)) for i in (0, 5)]
+    told = summary_of(replace(scored(fault, *doubted, event(14, 5, S.FAULTY, before=S.AMBIGUOUS)), samples_judged=40))
+    assert verdict(told) == (Severity.BAD, "1 of 1 injected fault detected, 0 isolated.")
+    assert sentences(told)[-1] == "Declared faulty, and not struck by a fault: g6."
+
+
 def test_sentence_and_table_agree_on_two_faults_at_once():
     faults = ["channel=g1 kind=bias size=0.05 start=10", "channel=g6 kind=bias size=0.05 start=10"]
     both = [event(12, i, S.AMBIGUOUS, (0, 3, 5)) for i in (0, 3, 5)]
