@@ -143,8 +143,9 @@ class CsvReader(LogReader):
         tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
         rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
         said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
-        degrees = " in deg/s" if _DEGREES in rates else ""
-        self.note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{degrees}")
+        stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
+        unit = " in deg/s" if _DEGREES in rates else "" if stated else "; no unit is named: taken as rad/s"
+        self.note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}")
         places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
         return Columns(names.index(time), tick, places, tuple(rates))
 

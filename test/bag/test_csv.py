@@ -49,7 +49,7 @@ def test_columns_are_those_that_their_names_say(tmp_path, names):
         assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
     assert damage == (
         f"flight.csv: columns by their names: time is {names[0]}; /imu_0 is {', '.join(names[1:4])}; /imu_1 is"
-        f" {', '.join(names[4:])}",
+        f" {', '.join(names[4:])}" + ("" if "rad" in names[1] else "; no unit is named: taken as rad/s"),
     )
 
 
