@@ -198,6 +198,11 @@ def format_degraded(channel: ChannelStatus, status: Status) -> list[str]:
         words.append(
             f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g} (bias.max_drift)"
         )
+    if status.is_far(channel):
+        words.append(
+            f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is {status.turn_on_std:g}:"
+            " learned, as a fault from before the start would be"
+        )
     return words
 
 

@@ -34,6 +34,10 @@ UNUSUAL = 3.0
 """An error beyond so many standard deviations expected of it is not what was expected."""
 
 
+MAX_START_BIAS = 4.0
+"""A bias learned at the start that is off by more ``bias.turn_on_std`` is reported: one healthy start in 16 000."""
+
+
 @dataclass(frozen=True)
 class ChannelStatus:
     """One channel as it stands."""
@@ -60,6 +64,8 @@ class ChannelStatus:
     """Share of the samples that it has lately given a finite number for."""
     drift: float = 0.0
     """How far its bias has been followed in flight from that at the start, rad/s."""
+    start_bias: float = 0.0
+    """What was learned of its bias at the start, beyond ``bias.fixed``, rad/s."""
     bias_std: float = math.nan
     """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
     noise: float = 0.0
@@ -170,6 +176,8 @@ class Status:
     """Standard deviation of each, s."""
     delays_taken_off: tuple[float, ...] = ()
     """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
+    turn_on_std: float = 0.0
+    """Standard deviation of a bias from one start to the next, rad/s (``bias.turn_on_std``)."""
     max_drift: float = 0.0
     """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
     errors: tuple[ErrorStatus, ...] = ()
@@ -180,6 +188,10 @@ class Status:
     """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
     apart: ApartStatus | None = None
     """Where a set is declared: the pair in it that surely differs."""
+
+    def is_far(self, channel: ChannelStatus) -> bool:
+        """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
+        return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.turn_on_std > 0
 
 
 @dataclass(frozen=True)
@@ -246,6 +258,7 @@ def status_of(
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
+        turn_on_std=float(settings["turn_on"]),
         errors=_errors(detector, names, begun),
         names_rest_on=capability.rests_on,
         copies=_copies(core, detector, config),
@@ -274,6 +287,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
+        start_bias=float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
         bias_std=float(core["remaining"][i]) if followed else math.nan,
         noise=float(core["now"]["verdict"]["noise"][i]),
         noisy=followed and is_in(i, int(core["now"]["noisy"])),

@@ -232,7 +232,11 @@ class Judge(Walk):
             channels=tuple(evaluation.channel_at(end, i, one) for i, one in enumerate(status.channels)),
             delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
             degraded=tuple(self._degraded.values()),
-            bias=BiasResult(status.bias_state, tuple(status.bias)),
+            bias=BiasResult(
+                status.bias_state,
+                tuple(status.bias),
+                tuple(one.name for one in status.channels if status.is_far(one)),
+            ),
             note=status.note,
             protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),

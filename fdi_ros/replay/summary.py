@@ -158,6 +158,8 @@ class BiasResult:
     state: str
     value: tuple[float, ...]
     """Per channel, rad/s."""
+    far: tuple[str, ...] = ()
+    """Channels that began with more than four ``bias.turn_on_std``: learned, as a fault from before would be."""
 
 
 @dataclass(frozen=True)

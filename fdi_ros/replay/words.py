@@ -106,6 +106,8 @@ def _untold(summary: Summary) -> str:
     if longest:
         words = ", ".join(f"{name} for {seconds:.1f} s" for name, seconds in longest.items())
         return f"not checked without a break, of {summary.scores.duration_s:.1f} s: {words}"
+    if far := summary.monitor.bias.far:
+        return f"{', '.join(far)} began with a bias far beyond bias.turn_on_std, as after a fault before the start"
     return ""
 
 

@@ -336,6 +336,18 @@ def test_a_noisy_channel_is_told_and_stays_in_use():
     assert pipeline.status().channels[1].state == ChannelState.OK
 
 
+def test_a_gyro_that_begins_far_off_is_used_and_told_as_it_may_be_faulty():
+    learned = {"bias__startup_bias_duration": 1.0, "bias__turn_on_std": 0.01}
+    for size, level in ((0.03, Level.OK), (0.08, Level.WARN)):
+        pipeline = Pipeline(config(**learned))
+        z = 1e-4 * np.random.default_rng(1).standard_normal((600, 6)) + size * (np.arange(6) == 1)
+        pipeline.process(Block(np.arange(600) * SECOND // 100, z))
+        lines = by_name(describe(pipeline.status()))
+        assert lines["g2"].level == lines["monitor"].level == level
+        assert ("began with a bias of 0.08" in lines["g2"].message) == (level == Level.WARN)
+        assert lines["g3"].level == Level.OK
+
+
 def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_own_name():
     config = Config.from_file(CONFIG.with_name("three_imus.yaml"), LOOSE | {"noise.bias_walk": [2e-3]})
     pipeline = Pipeline(config)
