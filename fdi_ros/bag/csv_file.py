@@ -107,6 +107,11 @@ class CsvReader(LogReader):
         line = self._header()
         delimiter = max("\t;,", key=line.count)
         names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
+        if np.isfinite([_number(names, k) for k in range(len(names))]).all():
+            raise BagError(
+                f"{self.file.name} has no names of columns: its first line holds numbers. Put a line of names before"
+                f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
+            )
         return delimiter, self._columns(names)
 
     def _header(self) -> str:

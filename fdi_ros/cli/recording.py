@@ -42,7 +42,8 @@ def _inspect(arguments: Namespace) -> int:
     """Print what it is fit for, a table of the topics, and a config to start from."""
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.fitness import verdict
+    from fdi_ros.setup.findings import verdict_of
+    from fdi_ros.setup.fitness import recording_findings
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
     from fdi_ros.system.result_file import write_json, write_text
 
@@ -51,7 +52,7 @@ def _inspect(arguments: Namespace) -> int:
     # All of it first: what is compiled for it is announced before the result, not within.
     topics = topics_text(reports, damage, unit)
     config, refused = _starting_config(reports, arguments.bag)
-    found = verdict(reports, refused, unit)
+    found = verdict_of(recording_findings(reports, refused, unit))
     figures = {"verdict": {"severity": found.severity.value, "words": found.words}, "config": config}
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), **figures})
     outputs.say(f"{found.words}\n", found.severity)
@@ -99,6 +100,7 @@ def _add_setup(parser: ArgumentParser) -> None:
     _add_settings(parser)
     add_report(parser, "page of what was found; default: beside the parameter file")
     add_results(parser)
+    add_degrees(parser)
 
 
 def _add_settings(parser: ArgumentParser) -> None:
@@ -124,6 +126,7 @@ def _setup(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.pipeline import Pipeline
+    from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
     from fdi_ros.setup.run import set_up
     from fdi_ros.system.result_file import whole_file, write_json
@@ -133,15 +136,15 @@ def _setup(arguments: Namespace) -> int:
     outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
         found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
-    names = str(arguments.bag), str(arguments.output)
+    said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
     with whole_file(report) as page, whole_file(arguments.output) as path:
         origin = shown(f"made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
         # What the node would refuse is not written.
         Pipeline.from_config(Config.from_file(path))
         write_json(arguments.json, setup_figures(found, str(arguments.bag)))
-        page.write_text(setup_page(found, *names), encoding="utf-8")
-    return outputs.finish(setup_text(found, *names), severity=verdict(found).severity)
+        page.write_text(setup_page(found, *said), encoding="utf-8")
+    return outputs.finish(setup_text(found, *said), severity=verdict(found).severity)
 
 
 SETUP = Verb(
@@ -189,17 +192,17 @@ def _calibrate(arguments: Namespace) -> int:
         text = with_parameters(arguments.config, settings, origin, found.remarks, REPLACED if settings else ())
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
-    names = str(arguments.bag), str(arguments.output)
-    words = f"{setup_text(found, *names, unit_of(arguments.degrees))}set: {', '.join(settings) or 'nothing'}\n"
+    said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
+    words = f"{setup_text(found, *said)}set: {', '.join(settings) or 'nothing'}\n"
     figures = setup_figures(found, str(arguments.bag))
-    return outputs.finish(words, figures, lambda: setup_page(found, *names), verdict(found).severity)
+    return outputs.finish(words, figures, lambda: setup_page(found, *said), verdict(found).severity)
 
 
 def _calibration_origin(arguments: Namespace, result: Calibration, kept: str) -> str:
     bag, configs = shown(arguments.bag.name), ", ".join(shown(file.name) for file in arguments.config)
     if kept:
         return f"made by fdi calibrate: all is as in {configs}; what {bag} gives is no better"
-    end = min(arguments.end, arguments.start + result.seconds.all)
+    end = min(arguments.end, arguments.start + result.duration)
     return (
         f"made by fdi calibrate from {bag}, {arguments.start:g} s to {end:.1f} s:\n"
         f"{', '.join(result.settings)}; all else is as in {configs}.\n"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -28,13 +27,6 @@ def _add_geometry(parser: ArgumentParser) -> None:
     parser.add_argument(
         "config", type=resolve, nargs="+", metavar="CONFIG", help="ROS 2 parameter file; of several, later ones win"
     )
-    parser.add_argument(
-        "--freedom",
-        type=float,
-        default=10.0,
-        metavar="DEG",
-        help="angle by which the second of two triads may be turned, deg; default 10",
-    )
     add_report(parser, "write a page with tables and a picture")
     add_results(parser)
     add_degrees(parser)
@@ -47,10 +39,8 @@ def _geometry(arguments: Namespace) -> int:
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
 
-    if not 0 <= arguments.freedom <= 180:
-        raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")
     outputs = Outputs(arguments, ("report", "json"), arguments.config)
-    result = assess(Config.from_file(arguments.config), math.radians(arguments.freedom))
+    result = assess(Config.from_file(arguments.config))
     text = mounting_text(result, unit_of(arguments.degrees))
     return outputs.finish(text, mounting_figures(result), lambda: mounting_page(result, config_words(arguments)))
 

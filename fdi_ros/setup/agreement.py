@@ -3,9 +3,6 @@
 
 """How units and channels agree by the motion that they share: mounts found, contradictions named and refused.
 
-Units must rotate at one rate (`check_units`) and about the same axes (`check_axes`), and channels follow the rotation
-(`check_response`). Each raises DisagreementError.
-
 All units of a rigid body see one rotation, each in its own frame: the mount of a unit against the first is the rotation
 that takes its rates into those of the first (Wahba 1965). Rotation about one axis alone leaves the turn about that axis
 open; which axes of the vehicle the first unit has, no gyro measures.
@@ -14,16 +11,17 @@ open; which axes of the vehicle the first unit has, no gyro measures.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.samples import Array, Int
+from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import WINDOW, Data
 
 LEAST_ROTATION = 0.05
@@ -36,29 +34,56 @@ LEAST_WINDOWS = 20
 """In motion; with fewer, units are not compared, and no mount is estimated."""
 SHARED, SAME = 0.7, 0.9
 """Share of the rotation that units have in common: less contradicts, more shows by which axes it would not."""
+SIGNED_AXES = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in itertools.permutations(range(3))
+    for signs in itertools.product((1.0, -1.0), repeat=3)
+]
+"""All 48 ways to swap and reverse three axes."""
 
 
-def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]) -> None:
-    """Refuse units of three channels on quite different scales; the mounts do not matter.
+def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) -> None:
+    """Refuse units and channels that do not show one rotation, whatever the fit would make of them.
 
     Parameters
     ----------
     data
         The recording.
-    units
-        Channels of each unit; those that are not three are left out.
-    names
-        Of all channels, ``unit.axis``.
+    nominal
+        Axes as configured: good enough to tell a dead channel from a live one.
+    unknown
+        Channels of which nobody knows how they are mounted.
 
     Raises
     ------
     DisagreementError
-        Naming the unit that most others contradict, or all where nothing decides, and by what factor.
+        Naming the unit that turns by another factor or about other axes than most, the channel that does not follow,
+        or all among which nothing decides.
     """
-    whole = [list(unit) for unit in units if len(unit) == 3]
-    means = _means(data)
-    if len(whole) < 2 or len(means) < LEAST_WINDOWS:
+    means, names = data.slow_rates(), nominal.channel_names
+    units = [list(unit) for unit in nominal.units if len(unit) == 3]
+    _check_scales(means, {names[unit[0]].rpartition(".")[0]: unit for unit in units})
+    moving = means
+    if len(means):
+        rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1)
+        moving = means[rate >= LEAST_ROTATION / 2]
+    if len(moving) < LEAST_WINDOWS:
         return
+    _check_axes(moving, nominal, [unit for unit in units if not {*unit} & {*unknown}])
+    if not unknown:
+        _check_response(moving, nominal)
+
+
+def _majority(agree: Mask) -> Int:
+    """Units that agree with one another by a table (u, u) of pairs: most of them, or the first ones."""
+    return np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+
+
+def _check_scales(means: Array, units: dict[str, list[int]]) -> None:
+    """Refuse units on quite different scales, such as deg/s; the mounts do not matter."""
+    if len(units) < 2 or len(means) < LEAST_WINDOWS:
+        return
+    names, whole = list(units), list(units.values())
     turning = np.stack([np.linalg.norm(means[:, unit], axis=1) for unit in whole], axis=1)
     moving = np.median(turning, axis=1) >= LEAST_ROTATION
     if moving.sum() < LEAST_WINDOWS:
@@ -68,59 +93,28 @@ def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]
     # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
     along = np.sqrt(np.maximum([np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in whole], 1e-18))
     least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
-    agree = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
-    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-    if len(most) < len(whole):
-        raise DisagreementError(_contradiction([names[unit[0]].rpartition(".")[0] for unit in whole], most, ratio))
-
-
-def _contradiction(units: list[str], most: Int, ratio: Array) -> str:
-    """Name the unit that those which agree (k,) contradict, or all; ratio (u, u) of their rotations."""
-    if 2 * len(most) > len(units):
-        odd = next(k for k in range(len(units)) if k not in most)
-        others = " and ".join(units[k] for k in most)
-        factor = float(np.median(ratio[odd, most]))
-        return (
-            f"{units[odd]} shows {factor:.3g} times the rotation that {others} show:"
-            f" mend it or name its channels in excluded_channels"
+    most = _majority((least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE))
+    if 2 * len(most) <= len(names):
+        low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
+        raise DisagreementError(
+            f"{' and '.join(names)} do not show one rotation, and nothing decides which is right:"
+            f" {names[high]} shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
         )
-    low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
-    return (
-        f"{' and '.join(units)} do not show one rotation, and nothing decides which is right:"
-        f" {units[high]} shows {ratio[high, low]:.3g} times that of {units[low]}; mend the one that is wrong"
-    )
+    if len(most) < len(names):
+        odd = next(k for k in range(len(names)) if k not in most)
+        raise DisagreementError(
+            f"{names[odd]} shows {np.median(ratio[odd, most]):.3g} times the rotation that"
+            f" {' and '.join(names[k] for k in most)} show: mend it or name its channels in excluded_channels"
+        )
 
 
-def _means(data: Data) -> Array:
-    """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
-    starts, counts = data.starts[:-1], np.diff(data.starts)
-    # A window at the end, or beside a gap, may hold few samples.
-    good = np.minimum.reduceat(data.complete, starts) & (counts >= 0.5 * np.median(counts))
-    means = np.add.reduceat(np.where(np.isfinite(data.z), data.z, 0.0), starts, axis=0)[good] / counts[good, None]
-    return means - np.median(means, axis=0) if len(means) else means
-
-
-def _moving(means: Array, axes: Array) -> Array:
-    """Windows (W, n) in which the vehicle turns, by most of the channels."""
-    rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(axes, axis=1), 1e-9), axis=1) if len(means) else []
-    return means[np.asarray(rate) >= LEAST_ROTATION / 2]
-
-
-def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) -> None:
-    """Refuse units of three channels that turn about other axes than the others, and name their axes.
-
-    Raises
-    ------
-    DisagreementError
-        Naming the unit, and how its axes would agree.
-    """
-    whole = [list(unit) for unit in units if len(unit) == 3 and spans_space(nominal.axes[list(unit)])]
-    means = _moving(_means(data), nominal.axes)
-    if len(whole) < 2 or len(means) < LEAST_WINDOWS:
-        return
+def _check_axes(means: Array, nominal: Geometry, units: list[list[int]]) -> None:
+    """Refuse a unit that turns about other axes than the others, and say how its axes would agree."""
+    whole = [unit for unit in units if spans_space(nominal.axes[unit])]
     rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in whole]
-    agree = np.array([[_in_common(a, b) > SHARED for b in rates] for a in rates])
-    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+    if len(whole) < 2:
+        return
+    most = _majority(np.array([[_in_common(a, b) > SHARED for b in rates] for a in rates]))
     if len(most) == len(whole):
         return
     names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in whole]
@@ -153,9 +147,13 @@ def _wrong_axes(signed: Array) -> str:
     """Say what a unit shows whose channels are these rows (3, 3) of its axes as configured."""
     if (np.diag(signed) != 0.0).all():
         return " and ".join(_REVERSED[a] for a in range(3) if signed[a, a] < 0.0)
-    axes = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in signed]
     kind = "has mirrored axes" if np.linalg.det(signed) < 0 else "has swapped axes"
-    return f"{kind}: its channels x, y, z are {', '.join(axes)} of its mount as configured"
+    return f"{kind}: its channels x, y, z are {', '.join(_axes_of(signed))} of its mount as configured"
+
+
+def _axes_of(signed: Array) -> list[str]:
+    """Name the axis, with its sign, that each row of signed axes (3, 3) is along."""
+    return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in signed]
 
 
 def _in_common(one: Array, other: Array) -> float:
@@ -163,34 +161,11 @@ def _in_common(one: Array, other: Array) -> float:
     return 1.0 - float(((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30))
 
 
-SIGNED_AXES = [
-    np.eye(3)[list(order)] * np.array(signs)[:, None]
-    for order in itertools.permutations(range(3))
-    for signs in itertools.product((1.0, -1.0), repeat=3)
-]
-"""All 48 ways to swap and reverse three axes."""
-
-
-def check_response(data: Data, nominal: Geometry) -> None:
+def _check_response(moving: Array, nominal: Geometry) -> None:
     """Refuse a channel that does not follow the rotation the others see.
 
     A channel that agrees with any three others is not refused: a faulty one contradicts only the threes it is among.
-
-    Parameters
-    ----------
-    data
-        The recording.
-    nominal
-        Axes as configured: good enough to tell a dead channel from a live one.
-
-    Raises
-    ------
-    DisagreementError
-        Naming the channel, and those that cannot be distinguished from it.
     """
-    moving = _moving(_means(data), nominal.axes)
-    if len(moving) < LEAST_WINDOWS:
-        return
     square = moving.T @ moving / len(moving)
     for i, name in enumerate(nominal.channel_names):
         found = _contradicted(square, nominal.axes, i)
@@ -198,25 +173,18 @@ def check_response(data: Data, nominal: Geometry) -> None:
             continue
         response, seen = found
         shows = f"{response:.0%} of" if abs(response) < 1 else f"{response:.3g} times"
-        what = f"it shows {shows} the {seen:.2f} rad/s rms that the others see along its axis"
         alike = [nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])]
-        if len(alike) > 1:
-            raise DisagreementError(
-                f"{name} does not follow the rotation: {what}, and nothing decides which of {', '.join(alike)} is"
-                " right; mend the one that is wrong or name it in excluded_channels"
-            )
-        raise DisagreementError(f"{name} does not follow the rotation: {what}; mend it or name it in excluded_channels")
+        which = f", and nothing decides which of {', '.join(alike)} is right" if len(alike) > 1 else ""
+        raise DisagreementError(
+            f"{name} does not follow the rotation: it shows {shows} the {seen:.2f} rad/s rms that the others see along"
+            f" its axis{which}; mend {'the one that is wrong' if which else 'it'} or name it in excluded_channels"
+        )
 
 
 def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | None:
     """Share of the rotation that channel i shows, and the rotation, rad/s rms, where all others contradict it.
 
-    Parameters
-    ----------
-    square
-        (n, n) mean products of the channels, (rad/s)^2.
-    axes
-        (n, 3).
+    By mean products (n, n) of the channels, (rad/s)^2.
     """
     size, found = float(np.sqrt(square[i, i])), []
     for chosen in itertools.combinations([j for j in range(len(axes)) if j != i], 3):
@@ -252,31 +220,56 @@ LARGEST_SCALE = 3.0
 """Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
-MIRRORED = 0.9
-"""Share of the rotation that a mirrored frame must explain, and no mount, to be one."""
 SURELY = 3.0
 """Standard errors from which a mount is not along axes."""
 SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
 
+class Turn(NamedTuple):
+    """The rotation that takes the rates of one unit best into those of another."""
+
+    rotation: Array
+    """(3, 3): v_first = R v_unit."""
+    mirrored: Array
+    """(3, 3) the same of all mirrored frames."""
+    uncertainty: float
+    """Variance of the least certain direction, rad^2, over the mean square of what is left, (rad/s)^2; infinite: the
+    two never turn about two axes together."""
+
+
+def find_turn(first: Array, unit: Array) -> Turn:
+    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976)."""
+    left, size, right = np.linalg.svd(first.T @ unit)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation, mirrored = (left * sign) @ right, (left * sign * [1.0, 1.0, -1.0]) @ right
+    if size[1] <= ROUNDING * size[0]:
+        return Turn(rotation, mirrored, math.inf)
+    a, b, c = size * sign
+    gram = (left * size**2) @ left.T
+    spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / ((a + b) * (b + c) * (c + a))
+    return Turn(rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1]))
+
+
+def angle_of(rotation: Array) -> float:
+    """Angle of a rotation (3, 3), rad."""
+    return 2.0 * math.asin(min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0))
+
+
 @dataclass(frozen=True)
 class Mount:
     """How one unit is turned against the first."""
 
-    rotation: Array
-    """(3, 3) by rows: v_first = R v_unit; identity where it is not shown."""
-    shown: bool
-    square: bool
-    """Taken for axes along axes."""
-    off: float
-    """What it was measured to be away from `rotation`, rad."""
-    error: float
-    """Standard error in the least certain direction, rad; infinite: not shown at all."""
-    shared: float
-    """Share of the rotation of the unit that is that of the first one."""
     words: str
     """What it is, or why it is not known."""
+    shared: float = 0.0
+    """Share of the rotation of the unit that is that of the first one."""
+    rotation: Array | None = None
+    """(3, 3) by rows: v_first = R v_unit; None: it is not shown."""
+    off: float = 0.0
+    """What it was measured to be away from `rotation`, rad."""
+    error: float = math.inf
+    """Standard error in the least certain direction, rad; infinite: not shown at all."""
     contradicts: bool = False
     """It turns, and not as the first unit does, however it may be mounted."""
     mirrored: bool = False
@@ -291,63 +284,49 @@ def find_mounts(data: Data) -> tuple[Mount, ...]:
     data
         The recording, channels as measured, three by three.
     """
-    means = _means(data)
+    means = data.slow_rates()
     # What is taken off must turn with the unit: means do, medians do not.
     means = means - means.mean(axis=0) if len(means) else means
-    first = Mount(np.eye(3), True, True, 0.0, 0.0, 1.0, "the body frame is taken to be its own")
+    first = Mount("the body frame is taken to be its own", 1.0, np.eye(3), error=0.0)
     return (first, *(_against(means[:, :3], means[:, k : k + 3]) for k in range(3, means.shape[1], 3)))
 
 
 def _against(first: Array, unit: Array) -> Mount:
     """Mount of a unit whose rates are these (W, 3) against the one that shows first (W, 3), rad/s."""
     if len(unit) < LEAST_WINDOWS:
-        return _unknown(f"only {len(unit) * WINDOW:.0f} s in which every unit gives values", 0.0)
+        return Mount(f"NOT KNOWN: only {len(unit) * WINDOW:.0f} s in which every unit gives values")
     most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0))[:0:-1]
     if most < LEAST_RATE:
-        return _unknown(f"it does not turn ({most:.2g} rad/s rms)", 0.0)
-    scale = float(np.sqrt((unit**2).sum() / max((first**2).sum(), 1e-30)))
+        return Mount(f"NOT KNOWN: it does not turn ({most:.2g} rad/s rms)")
+    power = max(float((first**2).sum()), 1e-30)
+    scale = math.sqrt(float((unit**2).sum()) / power)
     if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
         # Another unit of measurement hides the share that is in common, not the turn.
         unit = unit / scale
-    in_common = np.linalg.svd(first.T @ unit, compute_uv=False)
-    if in_common[1] <= ROUNDING * in_common[0]:
-        return _unknown("it and the first unit never turn about two axes together", 0.0)
-    found, _, sensitivity = Rotation.align_vectors(first, unit, return_sensitivity=True)
-    residual = first - found.apply(unit)
-    shared = 1.0 - float((residual**2).sum() / (first**2).sum())
-    error = float(np.sqrt(np.mean(residual**2) * np.linalg.eigvalsh(sensitivity)[-1]))
-    # Vibration that units see differently looks like a turn between them, however long it lasts.
-    apart = float(np.sqrt((residual**2).sum() / (first**2).sum()))
-    doubt = apart * min(1.0, apart / UNEQUAL)
-    mirrored = -Rotation.align_vectors(first, -unit)[0].as_matrix()
-    if shared < MIRRORED < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum() / (first**2).sum()):
-        return replace(_unknown("mirrored against the first unit", shared), contradicts=True, mirrored=True)
+    found = find_turn(first, unit)
+    if math.isinf(found.uncertainty):
+        return Mount("NOT KNOWN: it and the first unit never turn about two axes together")
+    residual = first - unit @ found.rotation.T
+    missed = float((residual**2).sum()) / power
+    shared, error = 1.0 - missed, math.sqrt(float(np.mean(residual**2)) * found.uncertainty)
+    if shared < SAME < 1.0 - float(((first - unit @ found.mirrored.T) ** 2).sum()) / power:
+        return Mount("NOT KNOWN: mirrored against the first unit", shared, contradicts=True, mirrored=True)
     if shared < LEAST_SHARED:
-        words = f"it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
-        return replace(_unknown(words, shared), contradicts=True)
+        words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
+        return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
-        return _unknown(f"{words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg", shared)
-    nearest = min(_SQUARE, key=lambda one: (one.inv() * found).magnitude())
-    off = float((nearest.inv() * found).magnitude())
+        return Mount(f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg", shared)
+    # Vibration that units see differently looks like a turn between them, however long it lasts.
+    doubt = math.sqrt(missed) * min(1.0, math.sqrt(missed) / UNEQUAL)
+    # Of all signed axes, a mirrored one is never the nearest.
+    nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - found.rotation)))
+    off = angle_of(nearest.T @ found.rotation)
     if off > max(SQUARE, SURELY * doubt):
-        words = f"turned by {np.degrees(found.magnitude()):.1f} +- {np.degrees(error):.1f} deg"
-        return Mount(np.round(found.as_matrix(), 6), True, False, 0.0, error, shared, words)
+        words = f"turned by {np.degrees(angle_of(found.rotation)):.1f} +- {np.degrees(error):.1f} deg"
+        return Mount(words, shared, np.round(found.rotation, 6), 0.0, error)
     error = max(error, doubt)
-    return Mount(nearest.as_matrix().round() + 0.0, True, True, off, error, shared, _square_words(nearest, off, error))
-
-
-def _unknown(words: str, shared: float) -> Mount:
-    return Mount(np.eye(3), False, True, 0.0, np.inf, shared, f"NOT KNOWN: {words}")
-
-
-def _square_words(rotation: Rotation, off: float, error: float) -> str:
-    axes = ["xyz"[int(np.abs(row).argmax())] for row in rotation.as_matrix()]
-    signs = ["-" if row.min() < -0.5 else "" for row in rotation.as_matrix()]
-    along = ", ".join(f"{body} is its {sign}{axis}" for body, sign, axis in zip("xyz", signs, axes, strict=True))
-    turn = "as the first" if rotation.magnitude() < 0.1 else f"turned: body {along}"
-    return f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
-
-
-_SQUARE = [Rotation.from_matrix(axes) for axes in SIGNED_AXES if np.linalg.det(axes) > 0]
-"""All 24 rotations that take axes to axes."""
+    along = ", ".join(f"{body} is its {axis}" for body, axis in zip("xyz", _axes_of(nearest), strict=True))
+    turn = "as the first" if (nearest == np.eye(3)).all() else f"turned: body {along}"
+    words = f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
+    return Mount(words, shared, nearest, off, error)

@@ -68,26 +68,20 @@ class Data:
         """Usual time from sample to sample, s."""
         return float(np.median(np.diff(self.stamp))) * 1e-9
 
-    @property
-    def complete(self) -> Mask:
-        """(N,): every channel is usable."""
-        return np.asarray(np.isfinite(self.z).all(axis=1))
-
-    @property
-    def windows(self) -> int:
-        """Number of windows."""
-        return int(self.window[-1]) + 1
-
-    @property
-    def starts(self) -> Int:
-        """(windows + 1,) first sample of each window, and the end."""
-        return np.searchsorted(self.window, np.arange(self.windows + 1))
+    def slow_rates(self) -> Array:
+        """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
+        complete = np.isfinite(self.z).all(axis=1)
+        starts = np.flatnonzero(np.diff(self.window, prepend=-1))
+        counts = np.diff(starts, append=len(self.window))
+        # A window at the end, or beside a gap, may hold few samples.
+        good = np.logical_and.reduceat(complete, starts) & (counts >= 0.5 * np.median(counts))
+        means = np.add.reduceat(np.where(np.isfinite(self.z), self.z, 0.0), starts, axis=0)[good] / counts[good, None]
+        return np.asarray(means - np.median(means, axis=0)) if len(means) else means
 
 
 def prepare(block: Block, max_rate: Array) -> Data:
     """Mark what cannot be used: not delivered, not finite, beyond max_rate (n,) rad/s, repeated for long."""
-    received = np.ones(block.z.shape, dtype=bool) if block.received is None else block.received
-    finite = np.isfinite(block.z)
+    received, finite = block.delivered, np.isfinite(block.z)
     with np.errstate(invalid="ignore"):
         inside = np.abs(block.z) < max_rate
     step = float(np.median(np.diff(block.stamp))) * 1e-9 if len(block) > 1 else 0.0
@@ -96,36 +90,30 @@ def prepare(block: Block, max_rate: Array) -> Data:
     old = repeated(z, step)
     z[old] = np.nan
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
-    # A gap leaves no empty windows behind: they are numbered without it.
-    window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
     reasons = {
         "missing": ~received,
         "not_finite": received & ~finite,
         "out_of_range": received & finite & ~inside,
         "repeated": old,
     }
-    return Data(block.stamp, z, window, {why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()})
+    return Data(
+        block.stamp, z, consecutive(window), {why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()}
+    )
+
+
+def consecutive(number: Int) -> Int:
+    """Return the numbers (N,) of spans without those that are empty, from 0 on."""
+    return np.cumsum(np.diff(number, prepend=number[0]) > 0)
 
 
 def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
     """Prepare some channels of a recording, by their numbers in the configuration."""
     rates = np.broadcast_to(np.array(config.health.max_rate), block.z.shape[1])
-    if len(channels) < block.z.shape[1]:
-        received = None if block.received is None else block.received[:, channels]
-        block = Block(block.stamp, block.z[:, channels], received)
-    return prepare(block, rates[channels])
+    return prepare(Block(block.stamp, block.z[:, channels], block.delivered[:, channels]), rates[channels])
 
 
 def spikes(z: Array, axes: Array) -> Mask:
-    """Find single values (N, n) far off what both neighbours and all other channels say.
-
-    Parameters
-    ----------
-    z
-        (N, n) channels, rad/s.
-    axes
-        (n, 3), roughly.
-    """
+    """Find single values of z (N, n), rad/s, far off what both neighbours and all other channels say; axes (n, 3)."""
     found = np.zeros(z.shape, dtype=bool)
     projector = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
     # What is usual changes with the vibration.
@@ -160,15 +148,7 @@ def run_lengths(values: Array) -> NDArray[np.int64]:
 
 
 def repeated(z: Array, step: float) -> Mask:
-    """Find samples (N, n) of each channel that are part of a long run of one value.
-
-    Parameters
-    ----------
-    z
-        (N, n) channels, NaN where there is none.
-    step
-        Time from sample to sample, s.
-    """
+    """Find samples of z (N, n), which come every `step` s, that are part of a long run of one value of a channel."""
     found, least = np.zeros(z.shape, dtype=bool), least_run(step)
     for k, values in enumerate(z.T):
         lengths = run_lengths(values)
@@ -268,8 +248,7 @@ def make_blocks(data: Data, late: Array) -> Blocks:
     number = np.floor(source.seconds / span + 0.25 * data.step / span).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1))
     ends = np.append(first[1:], len(number))
-    window = number[first] // BLOCKS_IN_WINDOW
-    window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
+    window = consecutive(number[first] // BLOCKS_IN_WINDOW)
     start = np.flatnonzero(np.diff(window, prepend=-1))
     begin = np.append(first[start], len(number))
     n = data.z.shape[1]

@@ -21,17 +21,16 @@ from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.run import Kept, Walk
-from fdi_ros.setup.agreement import check_axes, check_response, check_units
+from fdi_ros.replay.run import Kept, Sink, Walk
+from fdi_ros.report.spectrum import Spectrum
+from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, check_agreement
 from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
-from fdi_ros.setup.estimate import Estimate, Sensors, estimate
-from fdi_ros.setup.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
+from fdi_ros.setup.estimate import SCALE_STD, Estimate, Sensors, estimate
+from fdi_ros.setup.result import SHOWN, Calibration, Delay, Span
 from fdi_ros.sources import source_of
 
-SCALE_STD = 0.008
-"""Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""
 UNKNOWN_MOUNT = 0.58
 """Of each component of an axis that may point anywhere."""
 UNKNOWN_AXES = 0.1
@@ -67,8 +66,6 @@ class _Task:
 
     config: Config
     active: list[int]
-    nominal: Geometry
-    """Of the channels in use, as configured."""
     data: Data
     sensors: Sensors
 
@@ -93,63 +90,49 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
     FdiError
         If the recording is too short, or its channels contradict each other, naming which.
     """
-    try:
-        return _calibrated(block, config, reference, unknown)
-    except np.linalg.LinAlgError as error:
-        raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
-
-
-def _calibrated(block: Block, config: Config, reference: str, unknown: Sequence[int]) -> Calibration:
     full = build_geometry(config)
     active = [i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels]
-    mask = np.zeros(full.n, dtype=bool)
-    mask[active] = True
-    nominal = full.subset(mask)
+    nominal = full.subset(np.isin(np.arange(full.n), active))
     chosen = [active.index(i) for i in _reference(config, full, active, reference)]
     data = prepare_channels(block, config, active)
     _check_amount(data, nominal.channel_names)
     spiky = spikes(data.z, nominal.axes)
     data.z[spiky] = np.nan
-    units = _units(nominal)
+    units, lost = _units(nominal), [place for place, i in enumerate(active) if i in unknown]
     if source_of(config).units:
-        check_units(data, units, nominal.channel_names)
-        check_axes(data, nominal, [unit for unit in units if not {active[i] for i in unit} & {*unknown}])
-        if not unknown:
-            check_response(data, nominal)
+        check_agreement(data, nominal, lost)
     sensors = _sensors(config, nominal, data, chosen, units)
-    if lost := [place for place, i in enumerate(active) if i in unknown]:
+    if lost:
         sensors.axes[lost] = _axes_against_others(data, sensors.axes, lost)
         sensors.scale_std[lost] = UNKNOWN_MOUNT
-    task = _Task(config, active, nominal, data, sensors)
-    found = estimate(data, task.sensors)
-    changed = _settings(task, found)
-    tried = Config.from_parameters({**config.parameters(), **changed})
-    faults = _find_faults(_aligned(block, data, found.late[task.sensors.unit], active), tried, active)
-    if faults:
-        _check_share(faults, data, nominal.channel_names)
-        task = replace(task, data=_left_out(data, faults))
-        found = estimate(task.data, task.sensors)
+    task = _Task(config, active, data, sensors)
+    try:
+        found = estimate(data, sensors)
         changed = _settings(task, found)
-    step = data.step
-    late = found.late[task.sensors.unit]
-    result = Calibration(
+        tried = Config.from_parameters({**config.parameters(), **changed})
+        faults, spectrum = _watch(_aligned(block, data, found.late[sensors.unit], active), tried, active)
+        if faults:
+            _check_share(faults, data, nominal.channel_names)
+            task = replace(task, data=_left_out(data, faults))
+            found = estimate(task.data, sensors)
+            changed = _settings(task, found)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
+    delays = [
+        Delay(tuple(unit), float(found.late[k]), float(found.late_std[k])) for k, unit in enumerate(units) if k and unit
+    ]
+    return Calibration(
         names=nominal.channel_names,
-        channels=tuple(active),
         nominal=nominal.axes,
         estimate=found,
-        scale=found.disagreement(),
         timing=_timing(task, found)[1],
-        delays=tuple(
-            Delay(tuple(unit), float(late[unit[0]]), float(found.late_std[k]))
-            for k, unit in enumerate(units)
-            if k and len(unit)
-        ),
+        delays=tuple(delays),
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
-        seconds=Seconds(len(data.stamp) * step, found.rest_seconds, len(data.stamp) * step - found.rest_seconds),
+        duration=len(data.stamp) * data.step,
         settings=changed,
+        spectrum=spectrum,
     )
-    return replace(result, weak=weak_of(result, config), warnings=warnings_of(result))
 
 
 def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterator[Block]:
@@ -165,26 +148,23 @@ def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterat
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:
-    if len(data.stamp) < 2 or data.duration < LEAST_DURATION:
-        raise CalibrationError(
-            f"the recording is {data.duration if len(data.stamp) else 0:.1f} s long, a calibration needs at least"
-            f" {LEAST_DURATION:g} s"
-        )
-    if len(data.stamp) < LEAST_SAMPLES:
-        raise CalibrationError(
-            f"the recording has {len(data.stamp)} samples, a calibration needs at least {LEAST_SAMPLES}"
-        )
-    if data.step > LONGEST_STEP:
-        raise CalibrationError(
-            f"the recording has a sample every {data.step:g} s, a calibration needs one every {LONGEST_STEP:g} s"
-        )
+    """Refuse a recording that is too short, too slow, or lacks too much of a channel."""
+    samples, duration = len(data.stamp), data.duration if len(data.stamp) else 0.0
+    for few, words, needed in (
+        (samples < 2 or duration < LEAST_DURATION, f"is {duration:.1f} s long", f"at least {LEAST_DURATION:g} s"),
+        (samples < LEAST_SAMPLES, f"has {samples} samples", f"at least {LEAST_SAMPLES}"),
+        (samples > 1 and data.step > LONGEST_STEP, "has a sample every {step:g} s", f"one every {LONGEST_STEP:g} s"),
+    ):
+        if few:
+            step = data.step if samples > 1 else 0.0
+            raise CalibrationError(f"the recording {words.format(step=step)}, a calibration needs {needed}")
     for i, name in enumerate(names):
         seconds = data.seconds[np.isfinite(data.z[:, i])]
         # Of those that it would give at its own rate: a unit may be slower than the others.
         usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-        share = len(seconds) * usual / (len(data.stamp) * data.step)
+        share = len(seconds) * usual / (samples * data.step)
         if share < LEAST_USABLE:
-            lost = ", ".join(f"{count[i]} {WHY[why]}" for why, count in data.unusable.items())
+            lost = ", ".join(f"{count[i]} {why.replace('_', ' ')}" for why, count in data.unusable.items())
             raise CalibrationError(
                 f"{name} gives a usable value in {share:.0%} of its samples, expected at least {LEAST_USABLE:.0%}"
                 f" ({lost}): mend it or name it in excluded_channels"
@@ -237,41 +217,47 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], u
 
 WRONG_AXES = 0.1
 """Axes of an array that the motion shows to be off by more than this are not those configured."""
-LEAST_ROTATION, LITTLE_ROTATION = 0.05, 0.01
-"""rad/s; motion that shows axes, and that shows nothing of them."""
+LITTLE_ROTATION = 0.01
+"""rad/s; motion that shows nothing of axes."""
 
 
 def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
     """Axes (n, 3) of all channels from those of three, by plain least squares; as they were where nothing turns."""
-    means = _short_means(data)
+    means = data.slow_rates()
     x = means[:, chosen]
-    if len(x) < 20 or np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) < LEAST_ROTATION:
+    if len(x) < LEAST_WINDOWS or np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) < LEAST_ROTATION:
         return axes
     return np.asarray(np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen])
 
 
 def _axes_against_others(data: Data, axes: Array, lost: list[int]) -> Array:
     """Axes of channels of unknown mount by the rate that the others show; about what does not turn as they were."""
-    means, others = _short_means(data), [i for i in range(len(axes)) if i not in lost]
+    means, others = data.slow_rates(), [i for i in range(len(axes)) if i not in lost]
     rate = means[:, others] @ np.linalg.pinv(axes[others]).T
     weak = max(len(means), 1) * LITTLE_ROTATION**2 * np.eye(3)
     return np.asarray(np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T)
 
 
-def _short_means(data: Data) -> Array:
-    """Means (K, n) over 0.1 s of the samples that are complete, less what is usual: a bias is no rotation."""
-    whole = data.z[data.complete]
-    length = max(round(0.1 / data.step), 1)
-    means = whole[: len(whole) // length * length].reshape(-1, length, whole.shape[1]).mean(axis=1)
-    return np.asarray(means - np.median(means, axis=0)) if len(means) else means
+class _Residuals(Sink):
+    """Takes the spectrum of what channels differ by from the fused rate."""
+
+    def __init__(self, names: Sequence[str], rate: float) -> None:
+        self.spectrum = Spectrum(names, rate)
+
+    def begin_stretch(self) -> None:
+        self.spectrum.begin_stretch()
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        self.spectrum.add(output.residual)
 
 
-def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> tuple[Span, ...]:
-    """Find the times in which the monitor itself, with the settings found, has something declared."""
+def _watch(parts: Iterable[Block], config: Config, active: list[int]) -> tuple[tuple[Span, ...], Spectrum]:
+    """Find when the monitor itself, with the settings found, has something declared, and the spectrum of residuals."""
     # So that what was declared ends when it has gone.
     pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
     kept = Kept(lambda output: (output.stamp, output.state[:, active]))
-    walk = Walk(pipeline, [kept])
+    residuals = _Residuals(pipeline.channel_names, config.sample_rate)
+    walk = Walk(pipeline, [kept, residuals])
     for part in parts:
         walk.take(part)
     stamp, state = kept.columns
@@ -285,7 +271,7 @@ def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> t
     for first, end in flag_runs(np.asarray(among.any(axis=1))):
         sets = tuple(int(place) for place in np.flatnonzero(among[first:end].any(axis=0)))
         spans.append(Span(sets, float(seconds[first]), float(seconds[end - 1])))
-    return tuple(sorted(spans, key=lambda span: span.start))
+    return tuple(sorted(spans, key=lambda span: span.start)), residuals.spectrum
 
 
 def _left_out(data: Data, faults: tuple[Span, ...]) -> Data:

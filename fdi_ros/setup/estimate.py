@@ -39,6 +39,8 @@ from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, 
 from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
+SCALE_STD = 0.008
+"""Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""

@@ -3,13 +3,13 @@
 
 """What a recording is fit for: gyros enough, in rad/s, stamped by one clock, each a sensor of its own.
 
-The verdict of ``fdi inspect``, and the refusals that inspection, set-up, calibration, replay and fleet share.
+The findings of ``fdi inspect``, and the refusals that inspection, set-up, calibration, replay and fleet share.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,15 @@ import numpy as np
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.config.config import Config, is_plain_name
 from fdi_ros.errors import BagError
+from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.report.verdict import Severity, Verdict
-from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect
+from fdi_ros.setup.findings import Finding, Role
+from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
+from fdi_ros.setup.noise_segments import LENGTH
 from fdi_ros.sources import SOURCES, Source
 from fdi_ros.system.text import shown
 
@@ -108,8 +110,8 @@ def needs(reports: Sequence[TopicReport]) -> str:
     return in_degrees(chosen) if chosen else missing(reports)
 
 
-def verdict(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Verdict:
-    """Say in one line what a recording is fit for.
+def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Iterator[Finding]:
+    """Say what a recording is fit for.
 
     Parameters
     ----------
@@ -121,38 +123,41 @@ def verdict(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADI
         Of rates.
     """
     chosen = candidates(reports)
-    lacking = needs(reports) or refused
-    clocks = clocks_apart(chosen)
+    lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
     if lacking or clocks:
-        return Verdict(Severity.BAD, f"NEEDS {lacking or f'one clock: {clocks}'}")
+        words = lacking or f"one clock: {clocks}"
+        yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
+        return
     if copies := copy_words(reports):
-        return Verdict(Severity.BAD, f"NEEDS A LOOK: {copies}; the copy is left out")
-    channels = sum(one.channels for one in chosen)
-    units = f"{len(chosen)} units" if len(chosen) > 1 else "one array"
-    words = f"{channels} channels in {units} at {max(one.rate for one in chosen):.3g} Hz"
-    if noisy := noisy_words(chosen, unit):
-        return Verdict(Severity.UNKNOWN, f"READY, BUT LOOK: {noisy}; {words}")
-    return Verdict(Severity.GOOD, f"READY: {words}")
+        words = f"{copies}; the copy is left out"
+        yield Finding(Role.WARNING, "copy", words, headline="NEEDS A LOOK")
+    names: list[str] = []
+    units: list[list[int]] = []
+    for one in chosen:
+        assert one.kind is not None
+        places = list(range(len(names), len(names) + one.channels))
+        units += [places] if len(chosen) > 1 else [[i] for i in places]
+        names += [f"{shown(one.topic.name)} {place}" for place in one.kind.value_names(one.channels)]
+    words = f"{len(names)} channels in {f'{len(chosen)} units' if len(chosen) > 1 else 'one array'}"
+    words += f" at {max(one.rate for one in chosen):.3g} Hz"
+    noise = np.concatenate([one.segments.moving_noise() for one in chosen])
+    if noisy := noisier_words(names, noise, units, unit.name, unit.factor):
+        yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
+    yield Finding(Role.WORTH, "ready", words, headline="READY")
+
+
+def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Iterator[Finding]:
+    """Say what is wrong with the messages of each topic."""
+    for one in chosen:
+        words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
+        if words := words + troubles(one, unit):
+            yield Finding(Role.WARNING, "messages", f"{one.topic.name}: {', '.join(words)}", (one.topic.name,))
 
 
 def copy_words(reports: Sequence[TopicReport]) -> str:
     """Say which topics give the values of others; empty: none does."""
     copies = [f"{shown(one.topic.name)} gives the values of {shown(one.copy_of)}" for one in reports if one.copy_of]
     return f"{' and '.join(copies)}: one sensor on two topics is no redundancy" if copies else ""
-
-
-def noisy_words(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> str:
-    """Say which values are much noisier in motion than those of all other units; empty: none is."""
-    names: list[str] = []
-    units: list[list[int]] = []
-    for one in chosen:
-        assert one.kind is not None
-        places = [f"{shown(one.topic.name)} {place}" for place in one.kind.value_names(one.channels)]
-        places_of_unit = range(len(names), len(names) + len(places))
-        units += [list(places_of_unit)] if len(chosen) > 1 else [[i] for i in places_of_unit]
-        names += places
-    noise = np.concatenate([one.segments.moving_noise() for one in chosen])
-    return noisier_words(names, noise, units, unit.name, unit.factor)
 
 
 # Degrees a second -----------------------------------------------------------------------------------------------------
@@ -167,8 +172,9 @@ FEWEST_QUANTILES = 2
 """That must show motion."""
 MOVING = 0.05
 """rad/s; less may be noise."""
-FAST_SHARE = 0.01
-"""Of the time beyond every gyro's range: less is a shock or damage."""
+FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
+"""Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
+than so many times the factor of a degree."""
 STILL, NOISIEST, LARGEST_BIAS = 0.3, 0.02, 0.1
 """Share of a recording that lies still; noise of a sample and mean value there, rad/s, that no gyro at rest has."""
 
@@ -195,7 +201,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
                 return f"rad/s: {fast_name} is in deg/s, it shows {factor:.3g} times the rotation of {slow_name}"
     names = " and ".join(shown(one.topic.name) for one in chosen)
     verb = "is" if len(chosen) == 1 else "are"
-    if chosen and all(_share_beyond(one, largest_rate) > FAST_SHARE for one in chosen):
+    if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
         largest = max(one.largest for one in chosen)
         return (
             f"rad/s: {names} {verb} in deg/s, {largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
@@ -218,8 +224,13 @@ def _rate_quantiles(report: TopicReport) -> Array:
     return np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), QUANTILES)
 
 
-def _share_beyond(report: TopicReport, largest_rate: float) -> float:
-    return float((np.abs(_block_means(report)) > largest_rate).any(axis=1).mean())
+def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
+    """Whether rates, less than a shock or damage makes, are beyond the range of gyros for long."""
+    largest = np.abs(_block_means(report)).max(axis=1)
+    beyond = largest > largest_rate
+    lasting = beyond & (largest < FAST_RANGE * DEGREES * largest_rate)
+    seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())
+    return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
 
 
 def _no_gyro_at_rest(report: TopicReport) -> bool:

@@ -1,17 +1,14 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a mounting can do before it flies: accuracy, smallest errors found at once and by waiting, better turns.
-
-In figures, and as sections that a terminal and a page show alike.
-"""
+"""What a mounting can do before it flies: accuracy, smallest errors found at once and by waiting, losses."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,73 +36,6 @@ from fdi_ros.report.layout import (
     told,
 )
 
-ORTHOGONAL = 0.8
-"""Determinant of the axes of a triad at least."""
-SETTLED = 1e-6
-"""Angle, rad, and |rho|, below which a better turn is none."""
-OPTIMUM = 2 / 3
-"""Smallest largest |rho| of two orthogonal triads, at ``R = 2/3 ones - I`` and equivalent rotations."""
-
-
-@dataclass(frozen=True)
-class Turn:
-    """The second of two triads, turned so that faults are easier to tell apart."""
-
-    largest_rho: float
-    """Between channels of different triads, as mounted."""
-    freedom: float
-    """Angle by which the triad may be turned, rad."""
-    better: float
-    """Largest |rho| then."""
-    vector: Array
-    """(3,) rotation vector of the second triad in the body frame, rad."""
-
-    @property
-    def angle(self) -> float:
-        """Angle of the rotation, rad."""
-        return float(np.linalg.norm(self.vector))
-
-    @property
-    def axis(self) -> Array:
-        """(3,) axis of the rotation in the body frame; zero where there is none."""
-        return self.vector / max(self.angle, 1e-12)
-
-
-def best_turn(geometry: Geometry, freedom: float) -> Turn:
-    """Turn the second of two triads within a cone so that the largest |rho| between the triads becomes smallest.
-
-    Parameters
-    ----------
-    geometry
-        Six channels, three of each triad.
-    freedom
-        Largest angle of the turn, rad.
-    """
-    # Three numbers, a kinked function, many equal optima: draws around the best so far need no solver.
-    rng, best, spread = np.random.default_rng(0), np.zeros((20, 3)), 0.5 * freedom
-    while spread > SETTLED:
-        tried = (best[:, None] + spread * rng.standard_normal((len(best), 100, 3))).reshape(-1, 3)
-        tried *= np.minimum(1.0, freedom / np.linalg.norm(tried, axis=1))[:, None]
-        tried = np.vstack([best, tried])
-        best = tried[np.argsort(_largest_turned(geometry.axes, tried))[:8]]
-        spread *= 0.7
-    now, found = _largest_turned(geometry.axes, np.vstack([np.zeros(3), best[0]]))
-    return Turn(float(now), freedom, *((float(found), best[0]) if found < now - SETTLED else (float(now), np.zeros(3))))
-
-
-def _largest_turned(axes: Array, vectors: Array) -> Array:
-    """Largest |rho| (K,) between the triads with the second one turned by rotation vectors (K, 3), rad."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    u = vectors / np.maximum(angle[:, 0], 1e-12)
-    # Rodrigues; rows e_i x u are the matrix of u x.
-    rotation = np.cos(angle) * np.eye(3) + np.sin(angle) * np.cross(np.eye(3), u[:, None])
-    rotation += (1.0 - np.cos(angle)) * u[:, :, None] * u[:, None]
-    turned = np.concatenate([np.broadcast_to(axes[:3], rotation.shape), axes[3:] @ rotation.swapaxes(1, 2)], axis=1)
-    S = np.eye(6) - turned @ np.linalg.pinv(turned)
-    scale = np.sqrt(np.maximum(np.einsum("kii->ki", S), 1e-9))
-    return np.asarray(np.abs(S / (scale[:, :, None] * scale[:, None]))[:, :3, 3:].max(axis=(1, 2)))
-
-
 # Found by waiting ----------------------------------------------------------------------------------------------------
 
 
@@ -117,33 +47,24 @@ LEAST_SAMPLES = 1.5
 """Below so many samples a mean delay is not computed: it depends on single samples."""
 
 
-@dataclass(frozen=True)
-class Waiting:
-    """Smallest errors that are found by waiting, in one condition."""
+def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
+    """Find the smallest errors (waits, n), rad/s, in the order of WAITS, that are found by waiting, by condition.
 
-    condition: str
-    size: Array
-    """(waits, n) rad/s, in the order of WAITS; infinite: never, NaN: the wait is shorter than two samples."""
-
-
-def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> tuple[Waiting, ...]:
-    """Smallest errors found by waiting: at rest, while turning as fast as integrity.max_rate, and in vibration.
-
-    White noise averages out in time. What scale and timing errors make of a turn does not while the turn lasts: they
-    stay the same from sample to sample and add to the variance of the mean.
+    At rest, while turning as fast as integrity.max_rate, and in vibration; infinite: never, NaN: the wait is shorter
+    than two samples. White noise averages out in time. What scale and timing errors make of a turn does not while the
+    turn lasts: they stay the same from sample to sample and add to the variance of the mean.
     """
-    limits = config.integrity
-    white = noise.noise_std**2
+    limits, white = config.integrity, noise.noise_std**2
     lasting = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
-    turning = f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2"
-    return tuple(
-        Waiting(condition, np.array([_found_within(config, geometry, wait, *variances) for wait in WAITS]))
-        for condition, *variances in (
-            ("at rest", white, np.zeros_like(white)),
-            (turning, white, lasting),
-            (f"in vibration, noise {VIBRATION:g} times", VIBRATION**2 * white, np.zeros_like(white)),
-        )
-    )
+    conditions = {
+        "at rest": (white, 0.0 * white),
+        f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2": (white, lasting),
+        f"in vibration, noise {VIBRATION:g} times": (VIBRATION**2 * white, 0.0 * white),
+    }
+    return {
+        condition: np.array([_found_within(config, geometry, wait, *variances) for wait in WAITS])
+        for condition, variances in conditions.items()
+    }
 
 
 def _found_within(config: Config, geometry: Geometry, wait: float, white: Array, lasting: Array) -> Array:
@@ -195,12 +116,12 @@ class Loss:
     """What is left after some channels are lost."""
 
     lost: tuple[int, ...]
-    gdop: float
+    gdop: float = math.inf
     """Infinite where the rest does not span space."""
-    std: Array
+    std: Array = field(default_factory=lambda: np.full(3, np.inf))
     """(3,) of the rate about each body axis at rest, rad/s."""
-    detectable: tuple[int, ...]
-    isolable: tuple[int, ...]
+    detectable: tuple[int, ...] = ()
+    isolable: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -213,41 +134,34 @@ class Mounting:
     """Per sample."""
     smallest: Array
     """(n,) error of each channel that is seen in one sample with probability DETECTION, rad/s; infinite: never."""
-    waiting: tuple[Waiting, ...]
-    """The errors that an optimal sequential test finds, on average, within WAITS."""
-    whole: Loss
-    single: tuple[Loss, ...]
-    """After the loss of each channel in turn."""
-    double: tuple[Loss, ...]
-    """After the loss of each pair."""
-    turn: Turn | None
-    """Where there are two triads."""
+    waiting: dict[str, Array]
+    """The errors (waits, n), rad/s, that an optimal sequential test finds, on average, within WAITS, by condition."""
+    losses: tuple[Loss, ...]
+    """Of nothing, of each channel in turn, of each pair."""
 
-    @property
-    def alike(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of channels that cannot be told apart."""
-        return self._pairs(SAME_DIRECTION, np.inf)
-
-    @property
-    def similar(self) -> tuple[tuple[int, int], ...]:
-        """Pairs that can be told apart with effort."""
-        return self._pairs(ALIKE, SAME_DIRECTION)
-
-    def _pairs(self, low: float, high: float) -> tuple[tuple[int, int], ...]:
+    def pairs(self, above: float, up_to: float = math.inf) -> list[tuple[int, int]]:
         """Pairs of channels whose |rho| is above the one and not above the other."""
         rho = np.abs(self.geometry.rho)
-        return tuple(zip(*np.nonzero(np.triu((rho > low) & (rho <= high), 1)), strict=True))
+        found = np.argwhere(np.triu((rho > above) & (rho <= up_to), 1))
+        return [(int(i), int(j)) for i, j in found]
+
+    @property
+    def alike(self) -> list[tuple[int, int]]:
+        """Pairs of channels that cannot be told apart."""
+        return self.pairs(SAME_DIRECTION)
+
+    @property
+    def similar(self) -> list[tuple[int, int]]:
+        """Pairs that can be told apart with effort."""
+        return self.pairs(ALIKE, SAME_DIRECTION)
+
+    def lost(self, *numbers: int) -> list[Loss]:
+        """Losses of these numbers of channels."""
+        return [one for one in self.losses if len(one.lost) in numbers]
 
 
-def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
+def assess(config: Config) -> Mounting:
     """Assess the mounting of a configuration.
-
-    Parameters
-    ----------
-    config
-        Mounting, noise and false-alarm rate.
-    freedom
-        Angle by which the second of two triads may be turned, rad, 0 to pi.
 
     Raises
     ------
@@ -255,20 +169,15 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
         If the settings do not fit each other.
     """
     geometry = build_geometry(config)
-    noise = build_noise(config, geometry.n)
-    probability = alarm_probability(config)
-    n = geometry.n
-    triads = n == 6 and all(abs(np.linalg.det(half)) > ORTHOGONAL for half in np.split(geometry.axes, 2))
+    noise, probability = build_noise(config, geometry.n), alarm_probability(config)
+    sets = itertools.chain.from_iterable(itertools.combinations(range(geometry.n), lost) for lost in range(3))
     return Mounting(
         geometry,
         noise,
         probability,
         smallest_detectable(geometry, noise, probability),
         waiting(config, geometry, noise),
-        loss(geometry, noise, ()),
-        tuple(loss(geometry, noise, (i,)) for i in range(n)),
-        tuple(loss(geometry, noise, pair) for pair in itertools.combinations(range(n), 2)),
-        best_turn(geometry, freedom) if triads else None,
+        tuple(loss(geometry, noise, lost) for lost in sets),
     )
 
 
@@ -277,7 +186,7 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     kept = np.array([i not in lost for i in range(geometry.n)])
     axes = geometry.axes[kept]
     if np.linalg.matrix_rank(axes, tol=1e-2) < 3:
-        return Loss(lost, math.inf, np.full(3, np.inf), (), ())
+        return Loss(lost)
     unit = np.linalg.inv(axes.T @ axes)
     weighted = np.linalg.inv((axes.T / noise.noise_std[kept] ** 2) @ axes)
     detectable: tuple[int, ...] = ()
@@ -345,28 +254,20 @@ def _or_none(names: Sequence[str]) -> str:
 
 def mounting_figures(result: Mounting) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    g, turn = result.geometry, result.turn
-    names = g.channel_names
+    g, names = result.geometry, result.geometry.channel_names
     return {
         "channels": figures_of(_channels(result)),
         "false_alarm_probability": result.false_alarm_probability,
         "smallest_within": [
-            {
-                "condition": waiting.condition,
-                "within_s": list(WAITS),
-                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
-            }
-            for waiting in result.waiting
+            {"condition": condition, "within_s": list(WAITS), "rad_s": dict(zip(names, sizes.T, strict=True))}
+            for condition, sizes in result.waiting.items()
         ],
         "gdop": g.gdop,
         "covariance": g.covariance(result.noise.noise_std**2),
         "rho": np.abs(g.rho),
         "alike": [[names[i], names[j]] for i, j in result.alike],
         "similar": [[names[i], names[j]] for i, j in result.similar],
-        "losses": figures_of(_losses(result, (result.whole, *result.single, *result.double))),
-        "turn": None
-        if turn is None
-        else {"largest_rho": turn.largest_rho, "better": turn.better, "angle_rad": turn.angle, "axis": turn.axis},
+        "losses": figures_of(_losses(result, result.losses)),
     }
 
 
@@ -392,36 +293,20 @@ def pair_lines(result: Mounting) -> list[str]:
     return lines or ["every single fault is seen and can be told from all others"]
 
 
-def double_lines(result: Mounting) -> list[str]:
+def _double_words(result: Mounting) -> str:
     """Summary of the losses of two channels."""
-    spanning = [loss for loss in result.double if np.isfinite(loss.gdop)]
-    names = result.geometry.channel_names
-    lines = [f"two lost: {len(spanning)} of {len(result.double)} pairs leave a rate"]
-    if spanning:
-        worst = max(spanning, key=lambda loss: loss.gdop)
-        lines[0] += f", GDOP {min(loss.gdop for loss in spanning):.3f} to {worst.gdop:.3f}"
-        lines[0] += f" (worst without {' and '.join(names[i] for i in worst.lost)})"
-        named = sum(1 for loss in spanning if loss.isolable)
-        seen = sum(1 for loss in spanning if loss.detectable)
-        lines.append(f"of these, {seen} still see a third fault in some channel and {named} can isolate it in some")
-    return lines
-
-
-def turn_lines(turn: Turn) -> list[str]:
-    """How far two triads are from the best turn, and a better one within reach."""
-    within = f"within {np.degrees(turn.freedom):.0f} deg"
-    better = f"{within} there is no better turn"
-    if turn.better < turn.largest_rho - 1e-3:
-        axis = ", ".join(f"{v:.3f}" for v in turn.axis)
-        better = (
-            f"{within}: turn the second triad by {np.degrees(turn.angle):.1f} deg about ({axis}) of the body: largest"
-            f" |rho| {turn.better:.3f}"
-        )
-    return [
-        f"largest |rho| between the two triads {turn.largest_rho:.3f}; the best turn of the second has {OPTIMUM:.3f}"
-        " (the first one's axes seen as 2/3, 2/3, -1/3)",
-        better,
-    ]
+    double, names = result.lost(2), result.geometry.channel_names
+    spanning = [loss for loss in double if np.isfinite(loss.gdop)]
+    words = f"two lost: {len(spanning)} of {len(double)} pairs leave a rate"
+    if not spanning:
+        return words
+    worst = max(spanning, key=lambda loss: loss.gdop)
+    seen, named = sum(bool(loss.detectable) for loss in spanning), sum(bool(loss.isolable) for loss in spanning)
+    return (
+        f"{words}, GDOP {min(loss.gdop for loss in spanning):.3f} to {worst.gdop:.3f} (worst without"
+        f" {' and '.join(names[i] for i in worst.lost)}); of these, {seen} still see a third fault in some channel and"
+        f" {named} can isolate it in some"
+    )
 
 
 def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
@@ -431,7 +316,6 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
         summary_line(result.geometry, result.noise, result.false_alarm_probability, unit.name, unit.factor),
         *([f"names rest on {assumed}"] if assumed else []),
         *pair_lines(result),
-        *(turn_lines(result.turn) if result.turn else []),
     ]
 
 
@@ -441,10 +325,9 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
         f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
         f" {result.false_alarm_probability:.3g} a sample. Smaller faults need time: below."
     )
-    conditions = [one.condition for one in result.waiting]
-    worst = np.array([one.size.max(axis=1) for one in result.waiting])
+    worst = np.array([sizes.max(axis=1) for sizes in result.waiting.values()])
     heads = [f"{wait:g} s" for wait in WAITS]
-    waited = [Column("", conditions, ("condition",), str), Column("", worst, heads, _size, unit.factor)]
+    waited = [Column("", list(result.waiting), ("condition",), str), Column("", worst, heads, _size, unit.factor)]
     return [
         Section("Smallest faults seen", hint, told(_channels(result, unit), unit)),
         Section("Found by waiting", unit.named(WAITING_HINT), told(waited), [_waiting_figure(result, unit)]),
@@ -454,9 +337,9 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
 def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
     """Draw the smallest errors found over the time waited: a band for all channels, a line for the worst."""
     data: list[dict[str, object]] = []
-    for k, one in enumerate(result.waiting):
-        low, high = ([drawn(value * unit.factor) for value in values] for values in (one.size.min(1), one.size.max(1)))
-        look = {"x": list(WAITS), "name": one.condition, "line": {"color": colour_of(k)}}
+    for k, (condition, sizes) in enumerate(result.waiting.items()):
+        low, high = ([drawn(value * unit.factor) for value in values] for values in (sizes.min(1), sizes.max(1)))
+        look = {"x": list(WAITS), "name": condition, "line": {"color": colour_of(k)}}
         data.append({"type": "band", **look, "low": low, "high": high, "showlegend": False})
         data.append({"type": "scatter", "mode": "lines+markers", **look, "y": high})
     axes = {"xaxis": "time waited, s", "yaxis": f"smallest error, {unit.name}"}
@@ -485,8 +368,8 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
         Section("Look-alikes", RHO_TITLE, rho, [_rho_figure(result)]),
         Section(
             "After each possible first fault",
-            "; ".join(double_lines(result)),
-            told(_losses(result, [result.whole, *result.single], unit), unit),
+            _double_words(result),
+            told(_losses(result, result.lost(0, 1), unit), unit),
         ),
     ]
 
@@ -505,7 +388,7 @@ def mounting_page(result: Mounting, title: str) -> str:
     sections = [
         Section("Axes", turned, "", [_axes_figure(result)]),
         *mounting_sections(result),
-        Section("After two", "", told(_losses(result, result.double))),
+        Section("After two", "", told(_losses(result, result.lost(2)))),
     ]
     return page(f"fdi_ros: mounting of {title}", summary_lines(result), sections)
 

@@ -1,14 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a setup or a calibration found, with its uncertainty, what is weak, and what to do next.
-
-In words and tables, as JSON, and as a page.
-"""
+"""What a setup or a calibration found, what is weak, and what to do next: as words and tables, as JSON, as a page."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -31,10 +29,11 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.fitness import copy_words
-from fdi_ros.setup.inspect import topic_columns, troubles
+from fdi_ros.setup.findings import Finding, Role, findings_figures, lines_of, verdict_of
+from fdi_ros.setup.fitness import copy_words, topic_findings
+from fdi_ros.setup.inspect import topic_columns
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns, faults_words, noisier
+from fdi_ros.setup.result import Calibration, calibration_figures, calibration_findings, channel_columns
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
 from fdi_ros.sources import source_of
 from fdi_ros.system.limits import LINE
@@ -42,7 +41,6 @@ from fdi_ros.system.text import shown
 
 LEAST_JUDGED = 0.5
 """Share of the samples that a monitor should judge."""
-MOST_WARNINGS = 5
 MOST_POINTS = 2000
 """Of a curve on the page."""
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
@@ -53,134 +51,125 @@ NOISE_HINT = (
 BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
 
 
-# In words -------------------------------------------------------------------------------------------------------------
+# What was found -------------------------------------------------------------------------------------------------------
+
+
+def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> list[Finding]:
+    """List everything: what the settings are from and are worth, what is not known, what to look at."""
+    result, mounting = found.calibration, found.mounting
+    calibrated = [] if result is None else calibration_findings(result, found.config.body_frame, unit)
+    seen = summary_line(
+        mounting.geometry,
+        mounting.noise,
+        mounting.false_alarm_probability,
+        unit.name,
+        unit.factor,
+        agree=not found.disagree,
+    )
+    return [
+        *_worth(found, unit),
+        *_inputs(found),
+        *calibrated,
+        Finding(Role.FOUND, "mounting", seen),
+        *_unknown(found, unit),
+        *_copies(found),
+        *topic_findings(found.chosen, unit),
+        *(
+            Finding(Role.WARNING, "mounting", line)
+            for line in pair_lines(mounting)
+            if "not" in line.split(":")[-1] or "never" in line
+        ),
+    ]
 
 
 def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
     """Say in one line whether the settings may be used, and why not."""
+    return verdict_of(setup_findings(found, unit))
+
+
+def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
+    """Say what the settings are worth: what is wrong, the worst first, or what they isolate."""
     proof = found.proof
     tried = proof.before if found.kept else proof.after
     judged = 0.0 if tried.baseline is None else tried.baseline.judged
     if found.disagree:
-        return Verdict(Severity.BAD, f"DO NOT USE: {found.refused}")
-    if found.calibration is None and not source_of(found.config).units:
-        return Verdict(
-            Severity.BAD, f"DO NOT USE: the axes of the array are not known (a cone is assumed): {found.refused}"
-        )
-    if judged < LEAST_JUDGED:
-        why = tried.note or "channels are missing"
-        return Verdict(Severity.BAD, f"DO NOT USE: only {judged:.0%} of the samples of the proof are judged: {why}")
-    if tried.declared:
-        words = f"the monitor declares {tried.declared_words} on {proof.source}"
-        return Verdict(Severity.BAD, f"DO NOT USE: {words}: a gyro is faulty there, or the settings do not fit it")
-    if found.kept:
+        yield Finding(Role.WARNING, "agreement", found.refused, headline="DO NOT USE")
+    elif found.calibration is None and not source_of(found.config).units:
+        words = f"the axes of the array are not known (a cone is assumed): {found.refused}"
+        yield Finding(Role.WARNING, "axes", words, headline="DO NOT USE")
+    elif judged < LEAST_JUDGED:
+        words = f"only {judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
+        yield Finding(Role.WARNING, "judged", words, (), judged, None, LEAST_JUDGED, "DO NOT USE")
+    elif tried.declared:
+        words = f"the monitor declares {tried.declared_words} on {proof.source}: a gyro is faulty there, or the"
+        words += " settings do not fit it"
+        yield Finding(Role.WARNING, "declared", words, list(tried.declared), headline="DO NOT USE")
+    elif found.kept:
         words = f"on {proof.source}, {found.kept}; the settings before are written"
-        return Verdict(Severity.UNKNOWN, f"NO BETTER THAN BEFORE: {words}")
-    if found.calibration is None:
-        return Verdict(Severity.UNKNOWN, f"USABLE, NOT CALIBRATED: {found.refused}")
-    looks = [copy_words(found.reports), noisier(found.calibration, unit), faults_words(found.calibration)]
-    if looks := [words for words in looks if words]:
-        return Verdict(Severity.UNKNOWN, f"USABLE, BUT LOOK: {'; '.join(looks)}")
-    words = "nothing is declared without a fault"
-    if not found.mounting.whole.isolable:
-        return Verdict(Severity.GOOD, f"USABLE: {words}; a fault is detected, which channel it is not")
-    if tried.isolated:
-        isolated, biases = (sum(counts) for counts in zip(*tried.isolated.values(), strict=True))
-        words += f"; {isolated} of {biases} biases of {SIZES[0]:g} to {SIZES[-1]:g} rad/s isolated on {proof.source}"
-    return Verdict(Severity.GOOD, f"USABLE: {words}")
+        yield Finding(Role.WARNING, "proof", words, headline="NO BETTER THAN BEFORE")
+    if found.calibration is None and not found.disagree and source_of(found.config).units:
+        words = f"{found.refused}: axes, delays and noise in motion are not known"
+        yield Finding(Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED")
+    words, isolated, biases = "nothing is declared without a fault", *tried.isolated_of
+    if not found.mounting.losses[0].isolable:
+        words += "; a fault is detected, which channel it is not"
+    elif biases:
+        sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
+        words += f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
+    yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
 
 
-def found_lines(found: SetupResult, unit: Unit = RADIANS) -> list[str]:
-    """List what was found, one line each."""
-    rate, n, result = found.config.sample_rate, len(found.names), found.calibration
-    units = source_of(found.config).units
-    lines = [
-        f"{n} channels in {f'{len(units)} units' if units else 'one array'} at {rate:.4g} Hz",
-    ]
-    if known := [mount for mount in found.mounts[1:] if mount.shown]:
-        lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
-    if result is not None:
-        seconds = result.seconds
-        lines.append(f"axes, biases and noise, from {seconds.rest:.1f} s at rest and {seconds.motion:.1f} s in motion")
-        lines += noise_lines(result, unit)
-    g = found.mounting
-    return [*lines, summary_line(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)]
+def _inputs(found: SetupResult) -> Iterator[Finding]:
+    """Say what there is, and how it is mounted."""
+    rate, units = found.config.sample_rate, source_of(found.config).units
+    where = f"{len(units)} units" if units else "one array"
+    yield Finding(
+        Role.FOUND, "channels", f"{found.mounting.geometry.n} channels in {where} at {rate:.4g} Hz", value=rate
+    )
+    if known := sum(mount.rotation is not None for mount in found.mounts[1:]):
+        words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
+        yield Finding(Role.FOUND, "mounts", words, value=known)
 
 
-def noise_lines(result: Calibration, unit: Unit = RADIANS) -> list[str]:
-    """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
-    found, name, factor = result.estimate, unit.name, unit.factor
-    std, usual = found.floor.std * factor, np.median(found.moment, axis=0) * factor
-    walk = f"biases walk {found.walk.value * factor:.2g} {name} per sqrt(s)"
-    if not found.walk.value:
-        walk = f"no walk of the biases shown, below {found.walk.possible * factor:.2g} {name} per sqrt(s)"
-    return [
-        f"noise_std {std.min():.2g} to {std.max():.2g} {name}, from the quietest {found.floor.share:.0%} of the"
-        f" recording; usually {usual.min():.2g} to {usual.max():.2g}",
-        f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; {walk}",
-        *(_delay_line(result, delay) for delay in result.delays),
-    ]
+def _copies(found: SetupResult) -> Iterator[Finding]:
+    """Say which topics were left out, as they give the values of others."""
+    if words := copy_words(found.reports):
+        yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
 
 
-def _delay_line(result: Calibration, delay: Delay) -> str:
-    names = ", ".join(result.names[i] for i in delay.channels)
-    size, error = 1e3 * abs(delay.value), 1e3 * delay.error
-    side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
-    words = f"{names}: stamps {size:.2f} +- {error:.2f} ms {side} against the first unit"
-    if "imus.delays" not in result.settings:
-        return f"{words}, not taken off: one message"
-    return f"{words}, {'taken off' if delay.shown else 'not taken off: it may be none'}"
-
-
-def unknown_lines(found: SetupResult) -> list[str]:
-    """List what the recording does not show, what is taken instead, and how to get it, one line each."""
-    lines = list(found.damage) + list(found.calibration.weak if found.calibration is not None else ())
-    if found.calibration is None:
-        lines.append(f"no calibration: {found.refused}. Axes, delays and noise in motion are not known")
-    unshown = [f"{n} ({m.words})" for n, m in zip(found.config.imu_names, found.mounts, strict=False) if not m.shown]
-    if unshown:
-        lines.append(f"mounts taken for the identity: {'; '.join(unshown)}")
+def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
+    """List what the recording does not show, what is taken instead, and how to get it."""
+    yield from (Finding(Role.UNKNOWN, "damage", line) for line in found.damage)
+    named = zip(found.config.imu_names, found.mounts, strict=False)
+    if unshown := {name: mount.words for name, mount in named if mount.rotation is None}:
+        words = "; ".join(f"{name} ({why})" for name, why in unshown.items())
+        yield Finding(Role.UNKNOWN, "mounts", f"mounts taken for the identity: {words}", list(unshown))
     if not found.chosen:
-        return [shown(line, LINE) for line in lines]
+        return
     if source_of(found.config).units:
-        lines.append(
+        words = (
             "where the vehicle's forward, left and up are: the body frame is that of the mounts, all units together;"
             " turn all axes of the config if it is mounted otherwise"
         )
     elif found.calibration is None:
-        lines.append(
+        words = (
             "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
             " worth anything before the true ones stand there (geometry.axes, or a preset)"
         )
     else:
-        lines.append(
+        words = (
             "the body frame: of an array only how its channels hang together is seen; the axes of its first three are"
             " an assumption (a cone)"
         )
-    lines.append(
-        f"the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
-        f" (bias.turn_on_std: {found.config.bias.turn_on_std:g} rad/s is assumed)"
-    )
+    yield Finding(Role.UNKNOWN, "body frame", words)
+    turn_on = found.config.bias.turn_on_std
+    words = "the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
+    words += f" (bias.turn_on_std: {turn_on * unit.factor:g} {unit.name} is assumed)"
+    yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on)
     possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
     if others := [report.topic.name for report in possible if report not in found.chosen]:
-        lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
-    return [shown(line, LINE) for line in lines]
-
-
-def warning_lines(found: SetupResult) -> list[str]:
-    """List what to look at before the config is trusted: one line for each kind of trouble, the worst first."""
-    lines = list(found.calibration.warnings) if found.calibration is not None else []
-    lines += [copies] if (copies := copy_words(found.reports)) else []
-    for report in found.chosen:
-        words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
-        if words := words + troubles(report):
-            lines.append(f"{report.topic.name}: {', '.join(words)}")
-    if limits := [line for line in pair_lines(found.mounting) if "not" in line.split(":")[-1] or "never" in line]:
-        lines.append("; ".join(limits))
-    kept = (
-        lines if len(lines) <= MOST_WARNINGS else [*lines[: MOST_WARNINGS - 1], "; ".join(lines[MOST_WARNINGS - 1 :])]
-    )
-    return [shown(line, LINE) for line in kept]
+        words = f"topics that were not used, though they could be gyros: {', '.join(others)}"
+        yield Finding(Role.UNKNOWN, "topics", words, others)
 
 
 def next_lines(bag: str, config: str, usable: bool) -> list[str]:
@@ -203,50 +192,43 @@ def next_lines(bag: str, config: str, usable: bool) -> list[str]:
 def _mounts(found: SetupResult) -> list[Column]:
     """Figures of the mount of every unit."""
     mounts = found.mounts
+    known = [mount.rotation is not None for mount in mounts]
     shared = [f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)]
     return [
         Column("unit", found.config.imu_names[: len(mounts)], ("unit",)),
-        Column("known", [mount.shown for mount in mounts]),
-        Column("rotation", [mount.rotation for mount in mounts]),
-        Column("error_rad", [mount.error if mount.shown else None for mount in mounts]),
+        Column("known", known),
+        Column("rotation", [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]),
+        Column("error_rad", [mount.error if shows else None for mount, shows in zip(mounts, known, strict=True)]),
         Column("off_rad", [mount.off for mount in mounts]),
         Column("", [mount.words for mount in mounts], ("mount",)),
         Column("", shared, ("motion in common with the first",)),
     ]
 
 
-def _tried(found: SetupResult) -> list[Column]:
+def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
     """Figures of the settings before and after on the recording of the proof."""
     both = [found.proof.before, found.proof.after]
+    judged = [0.0 if one.baseline is None else one.baseline.judged for one in both]
     declared = ["-" if one.baseline is None else one.declared_words for one in both]
     shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
     isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
+    heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in SIZES]
     return [
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
-        Column(
-            "judged", [one.baseline.judged if one.baseline is not None else 0.0 for one in both], ("judged",), ".0%"
-        ),
+        Column("judged", judged, ("judged",), ".0%"),
         Column("declared", [declared_figures(one.baseline) for one in both]),
         Column("isolated", isolated),
-        Column(
-            "",
-            shares,
-            [f"{size:g} rad/s isolated" for size in SIZES],
-            lambda share: f"{share[0]} of {share[1]}" if share[1] else "-",
-        ),
+        Column("", shares, heads, lambda share: f"{share[0]} of {share[1]}" if share[1] else "-"),
     ]
 
 
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     """Return everything, for programs, in SI units."""
-    result, first = found.calibration, verdict(found)
+    result = found.calibration
     return {
         "bag": bag,
-        "verdict": {"severity": first.severity.value, "words": first.words},
-        "found": found_lines(found),
-        "not_found": unknown_lines(found),
-        "warnings": warning_lines(found),
+        **findings_figures(setup_findings(found)),
         "topics": [report.topic.name for report in found.chosen],
         "mounts": figures_of(_mounts(found)),
         "calibrated": result is not None,
@@ -265,73 +247,78 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
 # For a terminal, and as a page ----------------------------------------------------------------------------------------
 
 
-def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> list[Section]:
-    """Lay out what a reader is to know first."""
-    proof, result, usable = found.proof, found.calibration, verdict(found).severity is not Severity.BAD
+def _sections(
+    found: SetupResult, findings: Sequence[Finding], bag: str, config: str, unit: Unit
+) -> tuple[list[str], list[Section]]:
+    """Lay out what a reader is to know first: the verdict and what it is from; and the rest in sections."""
+    proof, result, first = found.proof, found.calibration, verdict_of(findings)
     hint = (
         f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
         f" to be isolated within {WITHIN:g} s."
     )
+    steps = [shown(line, LINE) for line in next_lines(bag, config, first.severity is not Severity.BAD)]
     sections = [
-        Section("Warnings", "", warning_lines(found)),
-        Section("Not shown by this recording", "", unknown_lines(found)),
-        Section("Proof", hint, told(_tried(found))),
-        Section("What to do next", "", [shown(line, LINE) for line in next_lines(bag, config, usable)]),
+        Section("Warnings", "", lines_of(findings, Role.WARNING)),
+        Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),
+        Section("Proof", hint, told(_tried(found, unit))),
+        Section("What to do next", "", steps),
     ]
     if result is not None:
         channels = told(channel_columns(result, unit), unit)
         sections.insert(0, Section("Axes, biases and noise", "With standard errors (+-).", channels))
-    return sections
+    return [shown(first.words, LINE), *lines_of(findings, Role.FOUND)], sections
 
 
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    first = shown(verdict(found, unit).words, LINE)
-    lines = [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
-    for section in setup_sections(found, bag, config, unit):
-        lines += ["", *section_lines(section)]
-    return "\n".join([*lines, "", ""])
+    (first, *lines), sections = _sections(found, setup_findings(found, unit), bag, config, unit)
+    text = [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)]
+    for section in sections:
+        text += ["", *section_lines(section)]
+    return "\n".join([*text, "", ""])
 
 
-def setup_page(found: SetupResult, bag: str, config: str) -> str:
+def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, and the course of it over time, as a page."""
-    topics = [report for report in found.reports if report.could_be_gyros]
+    findings, topics = setup_findings(found, unit), [report for report in found.reports if report.could_be_gyros]
+    (first, *lines), sections = _sections(found, findings, bag, config, unit)
     used = Column("", ["yes" if report in found.chosen else "no" for report in topics], ("used",))
-    sections = [
-        *setup_sections(found, bag, config),
-        *_courses(found.refused, found.calibration),
-        *([Section("Mounts", "", told(_mounts(found)))] if found.mounts else []),
-        *([Section("Topics", "The whole recording.", told([*topic_columns(topics), used]))] if topics else []),
-        *fault_sections(found.mounting),
-        Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'),
-    ]
-    first = verdict(found)
-    summary = [first.words, *(f"Found: {line}." for line in found_lines(found))]
-    return page(f"fdi_ros: settings from {bag}", summary, sections, severity=first.severity)
+    sections += _courses(found.refused, found.calibration, unit)
+    if found.mounts:
+        sections.append(Section("Mounts", "", told(_mounts(found))))
+    if topics:
+        sections.append(Section("Topics", "The whole recording.", told([*topic_columns(topics, unit), used])))
+    sections += fault_sections(found.mounting, unit)
+    sections.append(Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'))
+    summary = [first, *(f"Found: {line}." for line in lines)]
+    return page(f"fdi_ros: settings from {bag}", summary, sections, severity=verdict_of(findings).severity)
 
 
-def _courses(refused: str, result: Calibration | None) -> list[Section]:
-    """Plot what changes over the recording."""
+def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Section]:
+    """Plot what changes over the recording, and the spectrum of what channels differ by."""
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
-    found = result.estimate
+    found, factor = result.estimate, unit.factor
     rests = _spans(found.blocks.time, found.rest)
-    usual = time_layout(300, yaxis={"type": "log", "title": {"text": "noise, rad/s"}}, shapes=rests)
-    walk = time_layout(280, yaxis={"title": {"text": "bias minus its mean, rad/s"}}, shapes=rests)
-    rate = time_layout(260, yaxis={"title": {"text": "rate, rad/s"}}, shapes=rests)
+    usual = time_layout(300, yaxis={"type": "log", "title": {"text": f"noise, {unit.name}"}}, shapes=rests)
+    walk = time_layout(280, yaxis={"title": {"text": f"bias minus its mean, {unit.name}"}}, shapes=rests)
+    rate = time_layout(260, yaxis={"title": {"text": f"rate, {unit.name}"}}, shapes=rests)
     times = found.blocks.time
     floors = [
-        {**_curve(name, times[:1], found.floor.std[i : i + 1], i), "mode": "markers", "showlegend": False}
+        {**_curve(name, times[:1], factor * found.floor.std[i : i + 1], i), "mode": "markers", "showlegend": False}
         for i, name in enumerate(result.names)
     ]
-    curves = [_curve(name, times, found.moment[:, i], i) for i, name in enumerate(result.names)]
-    biases = [_curve(name, found.times, found.curve[:, i] - found.bias[i], i) for i, name in enumerate(result.names)]
-    turns = [_curve(axis, found.blocks.seconds, found.rate[:, a], a) for a, axis in enumerate("xyz")]
-    shaded = f"Shaded: at rest, {result.seconds.rest:.1f} s." if rests else "Nowhere at rest."
+    curves = [_curve(name, times, factor * found.moment[:, i], i) for i, name in enumerate(result.names)]
+    walks = factor * (found.curve - found.bias)
+    biases = [_curve(name, found.times, walks[:, i], i) for i, name in enumerate(result.names)]
+    turns = [_curve(axis, found.blocks.seconds, factor * found.rate[:, a], a) for a, axis in enumerate("xyz")]
+    shaded = f"Shaded: at rest, {found.rest_seconds:.1f} s." if rests else "Nowhere at rest."
+    spectrum = result.spectrum.section(unit)
     return [
         Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
         Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
         Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),
+        *([] if spectrum is None else [spectrum]),
     ]
 
 

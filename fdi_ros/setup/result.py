@@ -1,27 +1,45 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration found: figures with their uncertainty, in words, and the settings that follow."""
+"""What a calibration found: figures with their uncertainty, the settings that follow, and what to say of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.config.config import Config
-from fdi_ros.model.noise import noisier_words
+from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
-from fdi_ros.setup.estimate import Estimate
+from fdi_ros.report.spectrum import Spectrum
+from fdi_ros.setup.estimate import SCALE_STD, Estimate
+from fdi_ros.setup.findings import Finding, Role
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""
+UNMEASURED = SCALE_STD / 2
+"""Uncertainty of the axes along a direction of the body from which they are not measured."""
+SHOWN_AXES = SCALE_STD / 4
+"""The same from which they are not well shown."""
+SHOWN_DELAY = 0.001
+"""The same of delays, s."""
+LEAST_SHARE = 0.2
+"""Part of a recording that supports its noise."""
+LARGE_SWING = float(np.radians(0.03))
+"""Change of a bias within a recording that is worth a look, rad/s."""
+LARGE_BIAS = 0.2
+"""rad/s."""
+LARGE_ANGLE, LARGE_SCALE = np.radians(5.0), 0.05
+"""Axes that far from nominal are worth a look."""
+MANY = 0.01
+"""Share of the samples that are missing or spikes, which is worth a look."""
 
 
-@dataclass(frozen=True)
-class Delay:
+class Delay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
@@ -36,24 +54,12 @@ class Delay:
         return abs(self.value) > SHOWN * self.error
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """Length of the recording, of its times at rest and of its motion, s."""
-
-    all: float
-    rest: float
-    motion: float
-
-
-@dataclass(frozen=True)
-class Span:
-    """Channels, one of which at least is faulty from one time to another."""
+class Span(NamedTuple):
+    """Channels, one of which at least is faulty from one time to another, s from the start of the part used."""
 
     channels: tuple[int, ...]
     start: float
-    """s from the start of the part calibrated on."""
     end: float
-    """s."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +67,9 @@ class Calibration:
     """Result for the channels in use; all that is per channel is in their order."""
 
     names: tuple[str, ...]
-    channels: tuple[int, ...]
-    """Number of each of these channels in the configuration."""
     nominal: Array
     """(n, 3) as configured."""
     estimate: Estimate
-    scale: tuple[float, float]
-    """Scale error left between channels, as written, and its uncertainty."""
     timing: float
     """What is not known of the sampling instants, s, as written."""
     delays: tuple[Delay, ...]
@@ -75,13 +77,12 @@ class Calibration:
     faults: tuple[Span, ...]
     unusable: dict[str, Int]
     """(n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes."""
-    seconds: Seconds
+    duration: float
+    """Of the recording, s."""
     settings: dict[str, object]
     """Parameters to be changed, ``{"section.field": value}``."""
-    weak: tuple[str, ...] = ()
-    """What the recording does not show, what is taken instead, and how to get it, one line each."""
-    warnings: tuple[str, ...] = ()
-    """What to look at before trusting it, one line each."""
+    spectrum: Spectrum
+    """Of what channels differ by from the fused rate with these settings."""
 
     @property
     def units(self) -> tuple[tuple[int, ...], ...]:
@@ -104,38 +105,59 @@ class Calibration:
         """(n,) standard errors of the mean biases, rad/s."""
         return np.sqrt(np.diag(self.estimate.bias_covariance))
 
-    @property
-    def scale_error(self) -> Array:
-        """(n,) standard error of each scale factor, relative."""
-        unit, n = self.axes / np.linalg.norm(self.axes, axis=1)[:, None], len(self.names)
-        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
-        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", unit, each, unit), 0))
+    @cached_property
+    def scale(self) -> tuple[float, float]:
+        """Scale error left between channels, as written, and its uncertainty."""
+        return self.estimate.disagreement()
 
     @property
-    def measured(self) -> Mask:
-        """(n,) channels whose scale factor the recording shows, against the others."""
-        error, unit = axis_errors(self), self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
-        return np.asarray(np.sqrt(unit**2 @ error**2) < UNMEASURED)
+    def angle(self) -> Array:
+        """(n,) angle between calibrated and nominal axes, rad."""
+        sine = np.linalg.norm(np.cross(self.axes, self.nominal), axis=1)
+        return np.arctan2(sine, (self.axes * self.nominal).sum(axis=1))
 
     @property
     def angle_error(self) -> Array:
         """(n,) standard error of each direction, rad, in each of the two directions across it."""
-        across = (self.axes_std**2).sum(axis=1) - self.scale_error**2
+        across = (self.axes_std**2).sum(axis=1) - self.factor_error**2
         return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
 
+    @property
+    def factor(self) -> Array:
+        """(n,) scale factor relative to nominal."""
+        return np.asarray(np.linalg.norm(self.axes, axis=1) / np.linalg.norm(self.nominal, axis=1))
 
-def deviations(axes: Array, nominal: Array) -> tuple[Array, Array]:
-    """Angle (n,) rad between calibrated and nominal axes, and scale factor (n,) relative to nominal."""
-    norm, nominal_norm = np.linalg.norm(axes, axis=1), np.linalg.norm(nominal, axis=1)
-    sine = np.linalg.norm(np.cross(axes, nominal), axis=1)
-    return np.arctan2(sine, (axes * nominal).sum(axis=1)), norm / nominal_norm
+    @property
+    def factor_error(self) -> Array:
+        """(n,) its standard error, relative."""
+        n = len(self.names)
+        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
+        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", self._directions, each, self._directions), 0))
+
+    @property
+    def _directions(self) -> Array:
+        return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
+
+    @cached_property
+    def axis_errors(self) -> Array:
+        """Uncertainty (3,) of the disagreement of axes along x, y and z of the body."""
+        n = len(self.names)
+        apart = np.eye(n) - self.axes @ np.linalg.pinv(self.axes)
+        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)
+        square = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
+        return np.sqrt(np.maximum(square, 0.0))
+
+    @property
+    def measured(self) -> Mask:
+        """(n,) channels whose scale factor the recording shows, against the others."""
+        return np.asarray(np.sqrt(self._directions**2 @ self.axis_errors**2) < UNMEASURED)
 
 
 def calibration_figures(result: Calibration) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    names, found = result.names, result.estimate
+    names, found, rest = result.names, result.estimate, result.estimate.rest_seconds
     return {
-        "seconds": asdict(result.seconds),
+        "seconds": {"all": result.duration, "rest": rest, "motion": result.duration - rest},
         "channels": figures_of(channel_columns(result)),
         "noise": {
             "share_of_recording": found.floor.share,
@@ -154,15 +176,12 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
             for span in result.faults
         ],
         "settings": result.settings,
-        "weak": list(result.weak),
-        "warnings": list(result.warnings),
     }
 
 
 def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
-    angle, scale = deviations(result.axes, result.nominal)
 
     def measured(values: Array, form: str) -> list[str]:
         return [
@@ -174,12 +193,12 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
         Column("name", result.names, ("channel",)),
         Column("axis", result.axes, ("axis x", "y", "z"), ".5f"),
         Column("axis_std", result.axes_std),
-        Column("scale", scale),
-        Column("scale_std", result.scale_error),
+        Column("scale", result.factor),
+        Column("scale_std", result.factor_error),
         Column("scale_measured", result.measured),
-        Column("", measured(scale, ".5f"), ("scale",)),
-        Column("", measured(100 * result.scale_error, ".3f"), ("+-%",)),
-        Column("off_nominal_rad", angle, ("off nominal deg",), ".3f", degrees),
+        Column("", measured(result.factor, ".5f"), ("scale",)),
+        Column("", measured(100 * result.factor_error, ".3f"), ("+-%",)),
+        Column("off_nominal_rad", result.angle, ("off nominal deg",), ".3f", degrees),
         Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
         Column("bias", found.bias, ("bias rad/s",), ".6f", rate),
         Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
@@ -191,132 +210,135 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     ]
 
 
-# In words ------------------------------------------------------------------------------------------------------------
-
-WHY = {
-    "missing": "missing",
-    "not_finite": "not finite",
-    "out_of_range": "out of range",
-    "repeated": "frozen",
-    "spikes": "spikes",
-}
-"""Words for values that were not used."""
-SHOWN_AXES = 0.002
-"""Uncertainty of the axes along a direction of the body from which they are not well shown."""
-UNMEASURED = 0.004
-"""The same from which they are not measured: half of what is not known of scale factors before."""
-SHOWN_DELAY = 0.001
-"""The same of delays, s."""
-LEAST_SHARE = 0.2
-"""Part of a recording that supports its noise."""
-LARGE_SWING = float(np.radians(0.03))
-"""Change of a bias within a recording that is worth a look, rad/s."""
-LARGE_BIAS = 0.2
-"""rad/s."""
-LARGE_ANGLE, LARGE_SCALE = np.radians(5.0), 0.05
-"""Axes that far from nominal are worth a look."""
+# What to say of it ----------------------------------------------------------------------------------------------------
 
 
-def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
+def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADIANS) -> Iterator[Finding]:
+    """List what was found, what is not known, and what to look at."""
+    yield from _found(result, unit)
+    yield from _unknown(result, body_frame, unit)
+    yield from _warnings(result, unit)
+
+
+def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
+    """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
+    found, name, factor = result.estimate, unit.name, unit.factor
+    rest, walk = found.rest_seconds, found.walk
+    words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
+    yield Finding(Role.FOUND, "time at rest", words, value=rest)
+    std, usual = found.floor.std * factor, np.median(found.moment, axis=0) * factor
+    words = f"noise_std {std.min():.2g} to {std.max():.2g} {name}, from the quietest {found.floor.share:.0%} of the"
+    words += f" recording; usually {usual.min():.2g} to {usual.max():.2g}"
+    largest = int(std.argmax())
+    yield Finding(Role.FOUND, "noise", words, (), float(found.floor.std[largest]), float(found.floor.error[largest]))
+    words = f"biases walk {walk.value * factor:.2g} {name} per sqrt(s)"
+    if not walk.value:
+        words = f"no walk of the biases shown, below {walk.possible * factor:.2g} {name} per sqrt(s)"
+    words = (
+        f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; {words}"
+    )
+    yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
+    for delay in result.delays:
+        names = [result.names[i] for i in delay.channels]
+        side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+        words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
+        taken = "taken off" if delay.shown else "not taken off: it may be none"
+        if "imus.delays" not in result.settings:
+            taken = "not taken off: one message"
+        words += f" the first unit, {taken}"
+        yield Finding(Role.FOUND, "delay", words, names, delay.value, delay.error, SHOWN * delay.error)
+
+
+def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
     """List what is not observed, what is taken instead, and how to get it."""
-    found, lines = result.estimate, []
-    if not result.seconds.rest:
+    found = result.estimate
+    if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
-        lines.append(
-            f"nowhere at rest: what all biases have in common looks like a rotation (+-{common:.2g} rad/s);"
-            " noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s, motors off"
+        words = (
+            "nowhere at rest: what all biases have in common looks like a rotation"
+            f" (+-{common * unit.factor:.2g} {unit.name}); noise_std is the lower envelope in motion. Let the vehicle"
+            " stand still for 10 s, motors off"
         )
+        yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif (share := found.floor.share) <= LEAST_SHARE:
-        lines.append(f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better")
-    error, rate = axis_errors(result), found.rate - np.median(found.rate, axis=0)
-    rms = np.sqrt(np.mean(rate**2, axis=0))
+        words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
+        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
+    error, rms = result.axis_errors, np.std(found.rate, axis=0)
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
-        axes = "" if len(unmeasured) == 3 else f" about {' and '.join(unmeasured)}"
-        lines.append(
-            f"scale factors{axes.replace('about', 'along')}: not measured (no turns{axes} beyond what vibration"
-            " explains); they stay near those configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
+        along, about = (
+            "" if len(unmeasured) == 3 else f" {word} {' and '.join(unmeasured)}" for word in ("along", "about")
         )
-    poor = [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]
-    if poor:
-        words = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in poor)
-        lines.append(
-            f"too little rotation about {words} of {config.body_frame}: the axes stay near those configured there."
+        words = (
+            f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near those"
+            " configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
+        )
+        yield Finding(Role.UNKNOWN, "scale factors", words, unmeasured, None, float(error.max()), UNMEASURED)
+    if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
+        turns = [f"{'xyz'[a]} ({rms[a] * unit.factor:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor]
+        words = (
+            f"too little rotation about {', '.join(turns)} of {body_frame}: the axes stay near those configured there."
             " Turn it back and forth about them, some 1 rad/s"
         )
-    late = [d for d in result.delays if d.error > SHOWN_DELAY]
-    if late:
-        names = ", ".join(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
+        yield Finding(Role.UNKNOWN, "axes", words, ["xyz"[a] for a in poor], None, float(error[poor].max()), SHOWN_AXES)
+    if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
+        names = list(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
         worst = max(d.error for d in late)
-        lines.append(f"delays of {names} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth")
-    return tuple(lines)
+        words = f"delays of {', '.join(names)} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth"
+        yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
 
 
-def axis_errors(result: Calibration) -> Array:
-    """Uncertainty (3,) of the disagreement of axes along x, y and z of the body."""
-    found, n = result.estimate, len(result.names)
-    apart = np.eye(n) - found.axes @ np.linalg.pinv(found.axes)
-    each = found.axes_covariance.reshape(n, 3, n, 3)
-    error = [np.sqrt(max(np.trace(apart @ each[:, a, :, a] @ apart), 0.0) / max(n - 3, 1)) for a in range(3)]
-    return np.array(error)
-
-
-def warnings_of(result: Calibration) -> tuple[str, ...]:
+def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """List what to look at before the settings are trusted, grouped."""
-    return tuple(
-        line
-        for line in (faults_words(result), _unusable(result), _noise(result), _axes(result), _biases(result))
-        if line
-    )
-
-
-def _who(names: Sequence[str], total: int) -> str:
-    return "every channel" if len(names) == total else ", ".join(names)
-
-
-def faults_words(result: Calibration) -> str:
-    """Say what the monitor declares in the recording that it was set up on; empty: nothing."""
-    if not result.faults:
-        return ""
-    shown = [
-        f"{' or '.join(result.names[i] for i in span.channels)} from {span.start:.1f} s to {span.end:.1f} s"
-        for span in result.faults
-    ]
-    return f"the monitor declares channels in this very recording: {first_of(shown, 3, '; ')}"
-
-
-def _unusable(result: Calibration) -> str:
-    parts = []
+    if result.faults:
+        spans = [
+            f"{' or '.join(result.names[i] for i in one.channels)} from {one.start:.1f} s to {one.end:.1f} s"
+            for one in result.faults
+        ]
+        words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
+        struck = [result.names[i] for i in sorted({i for span in result.faults for i in span.channels})]
+        yield Finding(Role.WARNING, "declared", words, struck, headline="USABLE, BUT LOOK")
+    samples, lost = result.estimate.blocks.count.sum(), []
     for why, count in result.unusable.items():
-        bad = [result.names[i] for i in np.flatnonzero(count)]
-        if bad and (why not in ("missing", "spikes") or count.max() > 0.01 * result.estimate.blocks.count.sum()):
-            parts.append(f"{int(count.sum())} {WHY[why]} ({_who(bad, len(result.names))})")
-    return f"values not used: {'; '.join(parts)}" if parts else ""
+        if count.any() and (why not in ("missing", "spikes") or count.max() > MANY * samples):
+            why = "frozen" if why == "repeated" else why.replace("_", " ")
+            lost.append(f"{int(count.sum())} {why} ({_who(result, np.flatnonzero(count))})")
+    if lost:
+        yield Finding(Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}")
+    yield from _noisy(result, "in motion", np.median(result.estimate.moment, axis=0), "USABLE, BUT LOOK", unit)
+    yield from _noisy(result, "at rest", result.estimate.floor.std, "", unit)
+    yield from _odd_axes(result)
+    yield from _odd_biases(result, unit)
 
 
-def noisier(result: Calibration, unit: Unit = RADIANS) -> str:
-    """Say which channels are much noisier in motion than those of all other units; empty: none is."""
-    return noisier_words(result.names, np.median(result.estimate.moment, axis=0), result.units, unit.name, unit.factor)
+def _who(result: Calibration, places: Int) -> str:
+    return "every channel" if len(places) == len(result.names) else ", ".join(result.names[i] for i in places)
 
 
-def _noise(result: Calibration) -> str:
-    at_rest = noisier_words(result.names, result.estimate.floor.std, result.units)
-    parts = [f"{words} {when}" for words, when in ((noisier(result), "in motion"), (at_rest, "at rest")) if words]
-    return f"{'; '.join(parts)}: loose, badly isolated, of another make, or faulty" if parts else ""
+def _noisy(result: Calibration, when: str, noise: Array, headline: str, unit: Unit) -> Iterator[Finding]:
+    if noisy := much_noisier(noise, result.units):
+        words = noisier_words(result.names, noise, result.units, unit.name, unit.factor)
+        words += f" {when}: loose, badly isolated, of another make, or faulty"
+        worst, beside = max(noisy, key=lambda one: noise[one[0]])
+        names = [result.names[i] for i, _ in noisy]
+        yield Finding(Role.WARNING, "noise", words, names, float(noise[worst]), None, beside, headline)
 
 
-def _axes(result: Calibration) -> str:
-    angle, scale = deviations(result.axes, result.nominal)
-    parts = [f"{result.names[i]} by {np.degrees(angle[i]):.1f} deg" for i in np.flatnonzero(angle > LARGE_ANGLE)]
-    parts += [f"{result.names[i]} by {scale[i] - 1:+.1%}" for i in np.flatnonzero(np.abs(scale - 1) > LARGE_SCALE)]
-    return f"axes off their nominal ones: {', '.join(parts)}" if parts else ""
+def _odd_axes(result: Calibration) -> Iterator[Finding]:
+    angle, scale, names = result.angle, result.factor - 1, result.names
+    turned, scaled = np.flatnonzero(angle > LARGE_ANGLE), np.flatnonzero(np.abs(scale) > LARGE_SCALE)
+    off = [f"{names[i]} by {np.degrees(angle[i]):.1f} deg" for i in turned]
+    if off := off + [f"{names[i]} by {scale[i]:+.1%}" for i in scaled]:
+        who = [names[i] for i in np.union1d(turned, scaled)]
+        yield Finding(Role.WARNING, "axes", f"axes off their nominal ones: {', '.join(off)}", who)
 
 
-def _biases(result: Calibration) -> str:
-    found, names, parts = result.estimate, result.names, []
+def _odd_biases(result: Calibration, unit: Unit) -> Iterator[Finding]:
+    found = result.estimate
     swing = np.ptp(found.curve, axis=0)
-    moving = [names[i] for i in np.flatnonzero(swing > LARGE_SWING)]
-    if moving:
-        parts.append(f"moved within the recording by up to {swing.max():.2g} rad/s ({_who(moving, len(names))})")
-    large = np.flatnonzero(np.abs(found.bias) > LARGE_BIAS)
-    parts += [f"{names[i]} has {found.bias[i]:.3f} rad/s" for i in large]
-    return f"biases: {'; '.join(parts)}; bias.fixed is the mean" if parts else ""
+    moving, large = np.flatnonzero(swing > LARGE_SWING), np.flatnonzero(np.abs(found.bias) > LARGE_BIAS)
+    most = f"{swing.max() * unit.factor:.2g} {unit.name}"
+    words = [f"moved within the recording by up to {most} ({_who(result, moving)})"] if len(moving) else []
+    if words := words + [f"{result.names[i]} has {unit.words(found.bias[i], 3)}" for i in large]:
+        who = [result.names[i] for i in np.union1d(moving, large)]
+        said = f"biases: {'; '.join(words)}; bias.fixed is the mean"
+        yield Finding(Role.WARNING, "bias", said, who, float(swing.max()), None, LARGE_SWING)

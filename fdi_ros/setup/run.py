@@ -13,7 +13,7 @@ config at hand leaves to do.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,17 @@ class Tried:
     @property
     def declared_words(self) -> str:
         """The same in words."""
-        return first_of([f"{name} at {at:.1f} s" for name, at in self.declared.items()], 3) or "nothing"
+        return _times_words(self.declared) or "nothing"
+
+    @property
+    def isolated_of(self) -> tuple[int, int]:
+        """Biases isolated, and tried, of all sizes."""
+        return sum(good for good, _ in self.isolated.values()), sum(of for _, of in self.isolated.values())
+
+
+def _times_words(declared: Mapping[str, float]) -> str:
+    """List channels and when they were declared, s."""
+    return first_of([f"{name} at {at:.1f} s" for name, at in declared.items()], 3)
 
 
 @dataclass(frozen=True)
@@ -99,14 +109,13 @@ class Proof:
             return ""
         if after.baseline is None:
             return f"it judges nothing: {after.note}"
-        if new := [name for name in after.declared if name not in before.declared]:
-            return f"it declares {first_of([f'{name} at {after.declared[name]:.1f} s' for name in new], 3)}"
+        if new := {name: at for name, at in after.declared.items() if name not in before.declared}:
+            return f"it declares {_times_words(new)}"
         if before.baseline.judged - after.baseline.judged > LESS_JUDGED:
             return f"{after.baseline.judged:.0%} of the samples are judged instead of {before.baseline.judged:.0%}"
-        was, now = (sum(good for good, _ in one.isolated.values()) for one in (before, after))
-        tried = [sum(of for _, of in one.isolated.values()) for one in (before, after)]
-        if tried[0] == tried[1] and was - now > CHANCE:
-            return f"{now} of {tried[1]} biases are isolated instead of {was}"
+        (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
+        if tried_before == tried and was - now > CHANCE:
+            return f"{now} of {tried} biases are isolated instead of {was}"
         return ""
 
 
@@ -195,14 +204,28 @@ class SetupResult(Settings):
     """The topics of the gyros."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of all channels."""
-        return self.mounting.geometry.channel_names
-
-    @property
     def remarks(self) -> dict[str, str]:
         """How the parameters were found, by parameter: for the parameter file."""
-        return _remarks(self)
+        calibrated = self.calibration is not None and not self.kept
+        rested = self.calibration is not None and self.calibration.estimate.rest_seconds > 0
+        noise = "at rest" if rested else "the lower envelope in motion"
+        guess = "measured" if calibrated else "a guess"
+        remarks = {
+            "sample_rate": "as recorded",
+            "imus.mounts": "see the page for what is known of them",
+            "imus.delays": "against the first: measured",
+            "geometry.axes": "mounts included: measured",
+            "noise.noise_std": f"{noise}: measured" if calibrated else "measured, roughly",
+            "noise.scale_std": guess,
+            "noise.timing_std": guess,
+            "noise.bias_walk": "measured",
+            "bias.fixed": "in this recording",
+            "bias.turn_on_std": "not shown by one recording",
+            "health.max_rate": "NOT KNOWN: put in the range of the data sheet",
+        }
+        if not source_of(self.config).units and not calibrated:
+            remarks["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
+        return remarks
 
     @property
     def text(self) -> str:
@@ -330,11 +353,11 @@ def _proved(part: _Part, learn: Callable[[Block], tuple[Settings, Settings]], **
 
 def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
     """Return the topics of the gyros, or refuse, with the topics that there are instead."""
-    chosen, lacking = candidates(reports), needs(reports)
-    if not lacking:
+    lacking = needs(reports)
+    if chosen := candidates(reports):
+        if lacking:
+            raise BagError(f"{bag} needs {lacking}; mend the driver")
         return chosen
-    if chosen:
-        raise BagError(f"{bag} needs {lacking}; mend the driver")
     words = [
         f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
         for report in reports
@@ -356,7 +379,8 @@ def _mounted(block: Block, start: Settings) -> Settings:
     if not source_of(start.config).units:
         return start
     mounts = find_mounts(prepare_channels(block, start.config, list(range(block.z.shape[1]))))
-    turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
+    rotations = [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]
+    turned = {"imus.mounts": np.ravel(rotations).tolist()}
     return replace(_if_built({**start.parameters, **turned}, start), mounts=mounts)
 
 
@@ -384,7 +408,7 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
             " does that: mend its driver, or leave its topic out"
         )
         return replace(before, refused=why, disagree=True)
-    lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
+    lost = [k for k, mount in enumerate(mounts) if mount.rotation is None and not mount.contradicts]
     found = _calibrated(block, before, reference, [3 * k + axis for k in lost for axis in range(3)])
     if not lost or found.calibration is not None:
         return found
@@ -406,27 +430,3 @@ def _calibrated(block: Block, before: Settings, reference: str, unknown: Sequenc
     if full is before:
         return replace(before, refused="no monitor can be built from what it gives")
     return replace(full, calibration=calibration)
-
-
-def _remarks(found: SetupResult) -> dict[str, str]:
-    """Say how the parameters were found, by parameter."""
-    calibrated = found.calibration is not None and not found.kept
-    rested = found.calibration is not None and found.calibration.seconds.rest > 0
-    noise = "at rest" if rested else "the lower envelope in motion"
-    guess = "measured" if calibrated else "a guess"
-    remarks = {
-        "sample_rate": "as recorded",
-        "imus.mounts": "see the page for what is known of them",
-        "imus.delays": "against the first: measured",
-        "geometry.axes": "mounts included: measured",
-        "noise.noise_std": f"{noise}: measured" if calibrated else "measured, roughly",
-        "noise.scale_std": guess,
-        "noise.timing_std": guess,
-        "noise.bias_walk": "measured",
-        "bias.fixed": "in this recording",
-        "bias.turn_on_std": "not shown by one recording",
-        "health.max_rate": "NOT KNOWN: put in the range of the data sheet",
-    }
-    if not source_of(found.config).units and not calibrated:
-        remarks["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
-    return remarks

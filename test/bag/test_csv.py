@@ -150,7 +150,7 @@ def test_what_is_read_does_not_depend_on_the_portions_and_a_second_table_is_left
     ("content", "words"),
     [
         ("", "has no line with the names of its columns"),
-        ("1.0,2.0,3.0,4.0\n" * 50, "has no column of times, it has 1.0, 2.0, 3.0, 4.0; columns.yaml says which"),
+        ("1.0,2.0,3.0,4.0\n" * 50, "has no names of columns: its first line holds numbers"),
         ("t,gyro_x [LSB],gyro_y,gyro_z\n", "column 'gyro_x [LSB]' has the unit 'lsb', expected one of"),
         ("t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50, "has columns of 2 IMUs at times that do not advance"),
         ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),

@@ -22,7 +22,8 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup import estimate
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.result import Calibration, deviations
+from fdi_ros.setup.findings import Role, lines_of
+from fdi_ros.setup.result import Calibration, calibration_findings
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -31,6 +32,10 @@ CONFIG = Path(__file__).parents[2] / "config"
 def made(seed: int, kind: str, units: int = 3) -> tuple[Vehicle, Calibration]:
     one = vehicle(seed, kind, units)
     return one, calibrate(one.block, one.config)
+
+
+def said(result: Calibration, role: Role) -> list[str]:
+    return lines_of(calibration_findings(result, "base_link"), role)
 
 
 def hand() -> Vehicle:
@@ -97,7 +102,7 @@ def test_vibration_is_no_noise_scale_or_timing_error(kind: str) -> None:
 def test_without_rest_the_common_part_of_the_biases_is_said_to_be_unknown() -> None:
     one, result = made(0, "flight alone")
     assert result.bias_std.min() > 0.005
-    assert "nowhere at rest" in result.weak[0]
+    assert "nowhere at rest" in said(result, Role.UNKNOWN)[0]
     # Between channels they are known all the same.
     apart = np.eye(9) - one.axes @ np.linalg.pinv(one.axes)
     assert np.abs(apart @ (result.estimate.bias - one.bias)).max() < 0.002
@@ -109,7 +114,7 @@ def test_an_axis_never_turned_is_named_and_stays_as_configured() -> None:
     rate = (one.block.z - bias) @ np.linalg.pinv(one.axes).T
     still = Block(one.block.stamp, one.block.z - np.outer(rate[:, 2], one.axes[:, 2]))
     result = calibrate(still, one.config)
-    (line,) = (line for line in result.weak if "rotation" in line or "turns" in line)
+    (line,) = (line for line in said(result, Role.UNKNOWN) if "rotation" in line or "turns" in line)
     assert line.startswith("scale factors along z: not measured (no turns about z")
     assert not result.measured.all()
     assert np.abs(result.axes - one.nominal.axes)[:, 2].max() < 0.015
@@ -126,10 +131,9 @@ def test_vibration_that_units_see_differently_teaches_no_scale_factor(response: 
         phase = rng.uniform(0.0, 6.0) + response * rng.uniform(-1.0, 1.0, 9)
         z += np.where(t[:, None] > 20.0, gain * np.sin(2.0 * np.pi * frequency * t[:, None] + phase), 0.0)
     result = calibrate(Block(one.block.stamp, z), one.config)
-    assert "scale factors: not measured (no turns" in " ".join(result.weak)
-    _, scale = deviations(result.axes, result.nominal)
-    assert (np.abs(scale - 1.0) < 3.0 * result.scale_error).all()
-    assert np.abs(scale - 1.0).max() < 0.02
+    assert "scale factors: not measured (no turns" in " ".join(said(result, Role.UNKNOWN))
+    assert (np.abs(result.factor - 1.0) < 3.0 * result.factor_error).all()
+    assert np.abs(result.factor - 1.0).max() < 0.02
 
 
 def test_bad_values_are_left_out_and_counted() -> None:
@@ -144,8 +148,8 @@ def test_bad_values_are_left_out_and_counted() -> None:
     assert np.abs(result.estimate.late - one.late).max() < 1e-3
     assert result.unusable["not_finite"].sum() > 100
     assert result.unusable["out_of_range"].sum() > 50
-    assert any("values not used" in line for line in result.warnings)
-    assert len(result.warnings) <= 5
+    assert any("values not used" in line for line in said(result, Role.WARNING))
+    assert len(said(result, Role.WARNING)) <= 6
 
 
 def test_a_channel_that_fails_is_named_with_its_times_and_left_out() -> None:
@@ -155,7 +159,7 @@ def test_a_channel_that_fails_is_named_with_its_times_and_left_out() -> None:
     result = calibrate(Block(one.block.stamp, z), one.config)
     span = next(span for span in result.faults if span.channels == (4,))
     assert abs(span.start - 5) < 1
-    assert "imu_2.y" in result.warnings[0]
+    assert "imu_2.y" in said(result, Role.WARNING)[0]
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 5
 
 
@@ -211,7 +215,7 @@ def test_a_noisy_channel_hides_no_rest() -> None:
     z[:, 8] += 0.05 * np.random.default_rng(8).standard_normal(len(z))
     result = calibrate(Block(one.block.stamp, z), one.config)
     np.testing.assert_allclose(result.estimate.floor.std[:8], NOISE, rtol=0.15)
-    assert result.seconds.rest > 10.0
+    assert result.estimate.rest_seconds > 10.0
 
 
 def test_an_error_state_that_calibration_does_not_estimate_is_taken_to_be_zero(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,7 @@ def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     first = (left @ right).T
     for mount, axes in zip(mounts, unit.axes.reshape(-1, 3, 3), strict=True):
         left, _, right = np.linalg.svd(axes.T)
-        assert mount.shown
+        assert mount.rotation is not None
         assert angle(mount.rotation, first @ left @ right) < 1.5
         assert mount.error < np.radians(1.5)
     # The same units as if mounted otherwise: the second along the axes of the first, 3 degrees off, the third any way.
@@ -79,7 +79,6 @@ def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     z[1000:1100, 4], z[2000:2200] = np.nan, 40.0
     found = find_mounts(ready(Block(unit.block.stamp, z)))
     np.testing.assert_array_equal(found[1].rotation, square)
-    assert found[1].square
     assert np.degrees(found[1].off) == pytest.approx(3.0, abs=0.2)
     assert "body x is its z, y is its x, z is its y" in found[1].words
 
@@ -101,14 +100,13 @@ def test_a_mount_that_is_not_shown_is_not_known() -> None:
         (silent, "in which every unit gives values"),
     ):
         mount = find_mounts(ready(Block(unit.block.stamp, z)))[1]
-        assert not mount.shown
+        assert mount.rotation is None
         assert words in mount.words
-        np.testing.assert_array_equal(mount.rotation, np.eye(3))
 
 
 def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_path: Path) -> None:
     file = tmp_path / "cone.yaml"
-    code, out, _ = fdi("setup", CONE, "--output", file, "--json", tmp_path / "cone.json")
+    code, out, _ = fdi("setup", CONE, "--output", file, "--json", tmp_path / "cone.json", "--degrees")
     assert code == 0
     assert "mounts: 1 of 1 against imu_1" in out
     assert re.search(r"^new +nothing", out, re.MULTILINE)
@@ -125,6 +123,7 @@ def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_
     assert f"<li class=good>{out.splitlines()[0]}</li>" in page
     for title in (
         "Not shown by this recording",
+        "Spectrum of the differences",
         "Warnings",
         "Proof",
         "What to do next",
@@ -134,9 +133,14 @@ def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_
     ):
         assert f"<h2>{title}</h2>" in page
     assert "geometry:" in page
+    assert re.match(r"USABLE: .* biases of 1.72 to 17.2 deg/s isolated on the last 15 s, kept aside", out)
+    assert "noise, deg/s" in page
     figures = json.loads((tmp_path / "cone.json").read_text())
     assert Config.from_parameters(figures["parameters"]) == config
     assert [mount["known"] for mount in figures["mounts"]] == [True, True]
+    # Lines, for people, are those of the table.
+    for role in ("found", "not_found", "warnings"):
+        assert figures[role] == [one["words"] for one in figures["findings"] if one["role"] == role]
     # Nothing that exists is overwritten, and nothing is left half done.
     assert "exists already; --force overwrites it" in refused("setup", CONE, "--output", file)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
@@ -182,6 +186,15 @@ def test_degrees_are_refused(
         assert words in refused(*verb)
     code, _, said = fdi("inspect", bag, "--output", made)
     assert (code, words in said, made.exists()) == (2, True, False)
+
+
+@pytest.mark.parametrize("factor", [1.0, np.degrees(1.0)])
+def test_half_a_second_of_a_long_flight_shows_degrees(factor: float, tmp_path: Path, fdi: Run) -> None:
+    t = 0.01 * np.arange(9000)
+    turn = np.where((t > 50.0) & (t < 51.0), 0.7, 0.3 * np.sin(t))
+    z = np.random.default_rng(2).normal(0.0, 0.005, (len(t), 6)) + np.tile([0.2, 0.5, 1.0], 2) * turn[:, None]
+    write_mcap(bag := tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(len(t)), factor * z))
+    assert fdi("inspect", bag).out.startswith("READY" if factor == 1.0 else "NEEDS rad/s: /imu_1/data_raw and")
 
 
 @pytest.mark.parametrize("of_one", [True, False])
@@ -278,7 +291,7 @@ def still(seconds: int) -> list[tuple[str, int, bytes]]:
 def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: Path, shown: str) -> None:
     topics = None
     if shown == "short":
-        messages, said = flight()[0], ["no calibration: the recording is 6.0 s long", "mounts: 1 of 1"]
+        messages, said = flight()[0], ["NOT CALIBRATED: the recording is 6.0 s long", "mounts: 1 of 1"]
     elif shown == "still":
         messages = still(12)
         said = [
@@ -300,7 +313,11 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
         # A name that would write a line of its own into the config, or clear the screen.
         messages += [("/gy\n\x1b[2Jros", at, data) for _, at, data in messages]
         topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
-        said = ["no calibration", "those in the config are an assumption (a cone)", r"/gy\n\x1b[2Jros"]
+        said = [
+            "DO NOT USE: the axes of the array",
+            "those in the config are an assumption (a cone)",
+            r"/gy\n\x1b[2Jros",
+        ]
     bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
     code, out, _ = fdi("setup", bag, "--output", file)
     assert code == {"still": 0, "short": 4}.get(shown, 3)
@@ -309,6 +326,8 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
     for words in said:
         assert words in out
         assert words in page
+    reason = out.splitlines()[0].partition(": ")[2]
+    assert (code != 3) or reason in out.partition("\nWarnings\n")[2]
     assert "can be told from all others" not in page
     pipeline = Pipeline.from_config(Config.from_file(file))
     assert pipeline.geometry.n == 6
