@@ -66,6 +66,8 @@ USUAL_WALK = 2e-5
 """rad/s/sqrt(s); of biases that show none."""
 WIDER = 1.5
 """Axes that are farther off than expected by so much are known less beforehand."""
+LEAST_BLOCKS = 5
+"""Of a window that tells its noise; also windows that tell whether it is coloured."""
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")
@@ -122,8 +124,6 @@ class Estimate:
     """(W,) windows at rest."""
     rate: Array
     """(B, 3) of the body, rad/s."""
-    misfit: float
-    """How many times the squares of what is left exceed what the noise explains; 1 at least."""
 
     @property
     def rest_seconds(self) -> float:
@@ -143,29 +143,11 @@ class Estimate:
         return float(np.sqrt(square)), float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * np.sqrt(square)))
 
 
-@dataclass
-class _Pass:
-    """One linearisation."""
-
-    blocks: Blocks
-    present: Mask
-    """(W, n)"""
-    used: Mask
-    """(B,) blocks with all channels that are present in their window."""
-    variance: Array
-    """(W, n) of a block, (rad/s)^2, coloured noise counted in."""
-    rate: Array
-    turn: Array
-    rest: Mask
-    floor: Floor
-    evidence: Evidence
-    careful: Evidence
-    """Of the states of motion, what vibration does not explain."""
-
-
 def estimate(data: Data, sensors: Sensors) -> Estimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
+    # Of the constants, the first are those that motion shows.
+    motion = 3 * n + units - 1
     late, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
     # Delays that are taken off the blocks, and by how much they were to be others.
     taken, moved = late, np.inf
@@ -173,19 +155,17 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
     colour = np.ones((2, n))
     blocks, prior_scale = make_blocks(data, taken[sensors.unit]), sensors.scale_std
     for number in range(PASSES):
-        one = _linearise(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
+        one = _Pass(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
         if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
             walk = find_walk(one.evidence)
         usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
         shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
-        motion = 3 * n + units - 1
         found = smooth(one.evidence, usual, (shown.constant[:motion], shown.constant_covariance[:motion, :motion]))
         scale = found.constant[: 3 * n].reshape(n, 3)
-        step = np.zeros(units)
-        step[1:] = np.clip(found.constant[3 * n : 3 * n + units - 1], -STEP_DELAY, STEP_DELAY)
+        step = np.append(0.0, np.clip(found.constant[3 * n : motion], -STEP_DELAY, STEP_DELAY))
         axes = axes + scale
-        late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), _curve(one, found, blocks)
-        colour = _colours(one, axes)
+        late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), one.curve_of(found)
+        colour = one.colours(axes)
         moved = float(np.abs(late - taken).max())
         if number > TRUSTING and walk is not None and moved < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
             break
@@ -199,16 +179,14 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         times = size / max(float(np.median(sensors.scale_std)), 1e-9)
         prior_scale = sensors.scale_std * (times if times > WIDER and number >= TRUSTING else 1.0)
     assert walk is not None
-    misfit = _misfit(one.careful, shown)
-    covariance = found.constant_covariance * misfit
+    covariance = found.constant_covariance * _misfit(one.careful, shown)
     # No less is known than before.
     known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(known, known)
-    late_std = np.zeros(units)
-    late_std[1:] = np.sqrt(np.diag(covariance)[3 * n : 3 * n + units - 1])
+    late_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
     # What interpolation has taken of white noise is given back to what is left once the motion is out.
     kept = np.sqrt(blocks.white)
-    moment = np.sqrt(of_the_moment(blocks.samples, one.present & _told(blocks), axes)) / kept
+    moment = np.sqrt(of_the_moment(blocks.samples, one.present & one.has_samples, axes)) / kept
     return Estimate(
         axes,
         covariance[: 3 * n, : 3 * n],
@@ -216,113 +194,217 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         late_std,
         found.mean,
         found.mean_covariance,
-        _curve(one, found, blocks),
-        _times(one.evidence, blocks),
+        one.curve_of(found),
+        one.times,
         walk,
         replace(one.floor, std=one.floor.std / kept, error=one.floor.error / kept),
         moment,
         blocks,
         one.rest,
         one.rate,
-        misfit,
     )
 
 
-def _linearise(
-    blocks: Blocks, sensors: Sensors, axes: Array, late: Array, biases: Array, colour: Array, known: bool, scale: Array
-) -> _Pass:
-    windows = blocks.windows
-    finite = np.isfinite(blocks.mean)
-    size = np.diff([*blocks.start, len(blocks.mean)])
-    present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * size[:, None]
-    used: Mask = np.asarray((finite | ~present[blocks.window]).all(axis=1))
-    y = np.where(finite & present[blocks.window], blocks.mean, 0.0)
-    count = np.add.reduceat(used, blocks.start)
-    mean = np.add.reduceat(y * used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]
-    apart = (y - mean[blocks.window]) * used[:, None]
-    covariance = _by_window(blocks, apart, apart) / np.maximum(count - 1, 1)[:, None, None]
-    enough = count >= 5
-    there = present & enough[:, None]
-    moment = of_the_moment(covariance, there, axes)
-    floor = find_floor(blocks.samples, blocks.count, there & _told(blocks), axes)
-    steady = np.where(there, moment, ABSENT)
-    bias = _spread(biases, windows)
-    gain = gains(steady, axes)
-    rate = np.einsum("bai,bi->ba", gain[blocks.window], y - bias[blocks.window])
-    rest = _find_rest(blocks, rate, used, gain, steady, floor, axes, known) if windows > 1 else np.zeros(1, dtype=bool)
-    variance = np.where(there, moment * np.where(rest[:, None], colour[0], colour[1]), ABSENT)
-    acceleration, inside = _turn(blocks, rate, used)
-    moving = ~rest[blocks.window]
-    used = used & (inside | ~moving) & enough[blocks.window]
-    return _Pass(
-        blocks,
-        there,
-        used,
-        variance,
-        rate,
-        acceleration,
-        rest,
-        floor,
-        *_evidence(blocks, sensors, axes, late, y, used, variance, rate, acceleration, rest, scale),
-    )
+class _Pass:
+    """One linearisation: rest, rate and noise of every window with the states so far, and what they say of the states.
 
+    Parameters
+    ----------
+    blocks, sensors
+        The recording, and what is known of the sensors beforehand.
+    axes, late
+        (n, 3), and (units,) s taken off the blocks.
+    biases
+        (K, n) of joined windows, rad/s.
+    colour
+        (2, n) variance of longer means over that of white noise, at rest and in motion.
+    known
+        Whether the biases are from a pass before.
+    scale
+        (n,) standard deviation of each component of the axes beforehand.
+    """
 
-def _told(blocks: Blocks) -> Mask:
-    """Channels (W, n) of whose single samples the windows tell."""
-    return np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
+    def __init__(
+        self, blocks: Blocks, sensors: Sensors, axes: Array, late: Array, biases: Array, colour: Array, known: bool,
+        scale: Array,
+    ) -> None:  # fmt: skip
+        self.blocks, self.axes = blocks, axes
+        self.size = np.diff([*blocks.start, len(blocks.mean)])
+        finite = np.isfinite(blocks.mean)
+        present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * self.size[:, None]
+        # Blocks (B,) with all channels that are present in their window.
+        self.used: Mask = np.asarray((finite | ~present[blocks.window]).all(axis=1))
+        y = np.where(finite & present[blocks.window], blocks.mean, 0.0)
+        count = np.add.reduceat(self.used, blocks.start)
+        mean = np.add.reduceat(y * self.used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]
+        apart = (y - mean[blocks.window]) * self.used[:, None]
+        covariance = self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
+        enough = count >= LEAST_BLOCKS
+        # (W, n); and those of whose single samples the windows tell.
+        self.present = present & enough[:, None]
+        self.has_samples = np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
+        moment = of_the_moment(covariance, self.present, axes)
+        self.floor = find_floor(blocks.samples, blocks.count, self.present & self.has_samples, axes)
+        steady = np.where(self.present, moment, ABSENT)
+        # Biases of every window, of those of joined ones.
+        bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[: blocks.windows]
+        gain = gains(steady, axes)
+        self.rate: Array = np.einsum("bai,bi->ba", gain[blocks.window], y - bias[blocks.window])
+        self.rest = np.zeros(blocks.windows, dtype=bool)
+        if blocks.windows > 1:
+            self.rest = self._find_rest(gain, steady, known)
+        # (W, n) of a block, (rad/s)^2, coloured noise counted in.
+        factor = np.where(self.rest[:, None], colour[0], colour[1])
+        self.variance: Array = np.where(self.present, moment * factor, ABSENT)
+        turn, inside = self._differentiate()
+        self.used = self.used & (inside | self.rest[blocks.window]) & enough[blocks.window]
+        each = -(-blocks.windows // MOST_STEPS)
+        self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
+        self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
+        self.evidence, self.careful = self._find_evidence(sensors, late, y, turn, scale)
 
+    @property
+    def times(self) -> Array:
+        """(K,) middle of the joined windows, s from the first."""
+        return np.asarray(self.blocks.time[0] + self.middle - self.middle[0])
 
-def _spread(curve: Array, windows: int) -> Array:
-    """Biases (W, n) of all windows from those of (K, n) of joined ones."""
-    each = -(-windows // len(curve))
-    return np.repeat(curve, each, axis=0)[:windows]
+    def curve_of(self, found: Smoothed) -> Array:
+        """Biases (K, n) over time, rad/s."""
+        trend = found.constant[-found.curve.shape[1] :]
+        return np.asarray(found.curve + np.outer(self.times - self.times.mean(), trend))
 
-
-def _by_window(blocks: Blocks, first: Array, second: Array) -> Array:
-    """Sum (W, l, r) products over the blocks of every window."""
-    found = np.empty((blocks.windows, first.shape[1], second.shape[1]))
-    for i, j in np.ndindex(found.shape[1:]):
-        found[:, i, j] = np.add.reduceat(first[:, i] * second[:, j], blocks.start)
-    return found
-
-
-def _turn(blocks: Blocks, rate: Array, used: Mask) -> tuple[Array, Mask]:
-    """Angular acceleration (B, 3), rad/s^2, and where it is known (B,)."""
-    turn, inside, t = np.zeros_like(rate), np.zeros(len(rate), dtype=bool), blocks.seconds
-    span = t[2:] - t[:-2]
-    inside[1:-1] = (span < 2.5 * blocks.length) & used[2:] & used[:-2]
-    turn[1:-1] = (rate[2:] - rate[:-2]) / span[:, None]
-    return turn * inside[:, None], inside
-
-
-def _find_rest(
-    blocks: Blocks, rate: Array, used: Mask, gain: Array, variance: Array, floor: Floor, axes: Array, known: bool
-) -> Mask:
-    """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
-    found = np.zeros(blocks.windows, dtype=bool)
-    noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
-    level = levels(blocks.samples, (variance < ABSENT) & _told(blocks), axes)
-    quiet = level < QUIET * np.average(level[floor.windows])
-    unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
-    ends = [*blocks.start[1:], len(rate)]
-    for w, (a, b) in enumerate(zip(blocks.start, ends, strict=True)):
-        there = used[a:b]
-        if b - a == REST_BLOCKS and quiet[w] and there.mean() >= PRESENT:
-            # A block that is missing shows no motion.
-            part = np.where(there[:, None], rate[a:b], rate[a:b][there].mean(axis=0))
-            found[w] = rests(part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
-    if not found.any():
+    def _by_window(self, first: Array, second: Array) -> Array:
+        """Sum (W, l, r) products over the blocks of every window."""
+        found = np.empty((self.blocks.windows, first.shape[1], second.shape[1]))
+        for i, j in np.ndindex(found.shape[1:]):
+            found[:, i, j] = np.add.reduceat(first[:, i] * second[:, j], self.blocks.start)
         return found
-    mean = np.add.reduceat(rate, blocks.start, axis=0) / BLOCKS_IN_WINDOW
-    middle = np.median(mean[found], axis=0)
-    limit = ALIKE * np.sqrt(noise / BLOCKS_IN_WINDOW + REST_STD**2)
-    found &= (np.abs(mean - middle) < np.maximum(limit, 0.0)).all(axis=1)
-    # Beside motion its beginning is hidden by the noise.
-    before, after = np.roll(found, 1), np.roll(found, -1)
-    before[0] = after[-1] = True
-    found &= before & after
-    seconds = float(found.sum()) * BLOCKS_IN_WINDOW * blocks.length
-    return found if seconds >= LEAST_REST else np.zeros_like(found)
+
+    def _differentiate(self) -> tuple[Array, Mask]:
+        """Angular acceleration (B, 3), rad/s^2, and where it is known (B,)."""
+        turn, inside, t = np.zeros_like(self.rate), np.zeros(len(self.rate), dtype=bool), self.blocks.seconds
+        span = t[2:] - t[:-2]
+        inside[1:-1] = (span < 2.5 * self.blocks.length) & self.used[2:] & self.used[:-2]
+        turn[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
+        return turn * inside[:, None], inside
+
+    def _find_rest(self, gain: Array, variance: Array, known: bool) -> Mask:
+        """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
+        blocks, rate, found = self.blocks, self.rate, np.zeros(self.blocks.windows, dtype=bool)
+        noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
+        level = levels(blocks.samples, self.present & self.has_samples, self.axes)
+        quiet = level < QUIET * np.average(level[self.floor.windows])
+        unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
+        for w in np.flatnonzero(quiet & (self.size == REST_BLOCKS)):
+            rows = slice(blocks.start[w], blocks.start[w] + REST_BLOCKS)
+            there = self.used[rows]
+            if there.mean() >= PRESENT:
+                # A block that is missing shows no motion.
+                part = np.where(there[:, None], rate[rows], rate[rows][there].mean(axis=0))
+                found[w] = rests(part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
+        if not found.any():
+            return found
+        mean = np.add.reduceat(rate, blocks.start, axis=0) / BLOCKS_IN_WINDOW
+        limit = ALIKE * np.sqrt(noise / BLOCKS_IN_WINDOW + REST_STD**2)
+        found &= (np.abs(mean - np.median(mean[found], axis=0)) < np.maximum(limit, 0.0)).all(axis=1)
+        # Beside motion its beginning is hidden by the noise.
+        before, after = np.roll(found, 1), np.roll(found, -1)
+        before[0] = after[-1] = True
+        found &= before & after
+        seconds = float(found.sum()) * BLOCKS_IN_WINDOW * blocks.length
+        return found if seconds >= LEAST_REST else np.zeros_like(found)
+
+    def _find_evidence(
+        self, sensors: Sensors, late: Array, y: Array, turn: Array, scale: Array
+    ) -> tuple[Evidence, Evidence]:
+        """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
+        blocks, axes, variance, rest, n = self.blocks, self.axes, self.variance, self.rest, len(self.axes)
+        coefficients, prior = coefficients_of(sensors, axes, scale)
+        moving = (~rest[blocks.window])[:, None]
+        base = np.hstack([np.ones((len(y), 1)), self.rate * moving, turn * moving]) * self.used[:, None]
+        # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
+        residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
+        moments, cross = self._by_window(base, base), self._by_window(base, residual)
+        # The noise power of rate and acceleration is subtracted.
+        count = np.add.reduceat(self.used, blocks.start) * ~rest
+        noise = count[:, None, None] * np.linalg.inv(np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes))
+        moments[:, 1:4, 1:4] -= noise
+        moments[:, 4:7, 4:7] -= noise / (2.0 * blocks.length**2)
+        values, vectors = np.linalg.eigh(moments)
+        moments = np.einsum("wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors)
+        a = information(variance, axes)
+        a[rest] = _at_rest(variance[rest], axes)
+        start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
+        prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
+        flat = coefficients.reshape(-1, n * BASE)
+
+        def summed(moments: Array, cross: Array) -> Evidence:
+            normal, right = np.zeros((len(self.groups), len(flat), len(flat))), np.zeros((len(self.groups), len(flat)))
+            for k, group in enumerate(self.groups):
+                # (n, n, 7, 7): sum of the products of A and s s'.
+                products = a[group].reshape(-1, n * n).T @ moments[group].reshape(-1, BASE * BASE)
+                products = products.reshape(n, n, BASE, BASE).transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE)
+                normal[k] = flat @ products @ flat.T
+                right[k] = flat @ (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(axis=0).reshape(-1)
+            # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
+            since = (self.middle - self.middle.mean())[:, None, None]
+            rates = since * normal[:, :n]
+            whole = np.block([[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]])
+            rights = np.hstack([right, since[:, 0] * right[:, :n]])
+            apart = np.diff(self.middle, append=self.middle[-1])
+            return Evidence.in_units(n, whole, rights, apart, prior, start)
+
+        kept = self._beyond_vibration(moments, count)
+        return summed(moments, cross), summed(kept @ moments, kept @ cross)
+
+    def _beyond_vibration(self, moments: Array, count: Int) -> Array:
+        """Find what (W, 7, 7) of the moments M (W, 7, 7) of the signals no vibration explains: M (M + K)^-1.
+
+        Vibration turns the whole body, and every unit sees it with a gain and a phase of its own: for as long as it
+        lasts, it looks like scale errors, misalignments and delays, and leaves no residual once these are fitted. With
+        e^2 the variance of a channel that rest does not show, and units that see vibration differently by `UNEQUAL` at
+        least, at most U = e^2 / UNEQUAL^2 of the mean square s^2 of a signal is vibration. The products with a channel
+        then are off by up to e sqrt(min(U, s^2)) each, alike in all windows: K = W count^2 min(U, s^2), in units of
+        e^2.
+        """
+        variance, moving = self.variance, ~self.rest
+        at_rest = np.median(variance[self.rest], axis=0) if self.rest.any() else np.zeros(len(self.axes))
+        there = (variance < ABSENT / 2) & moving[:, None]
+        beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
+        share = (beyond / variance).max(axis=1)[:, None]
+        most = np.zeros((len(moments), BASE))
+        most[:, 1:4] = (self.axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
+        # Half of it is in differences of two blocks at most.
+        most[:, 4:7] = 0.5 * most[:, 1:4].max(axis=1, keepdims=True) / self.blocks.length**2
+        square = np.einsum("wkk->wk", moments) / np.maximum(count, 1)[:, None]
+        off = moving.sum() * count[:, None] ** 2 * share * np.minimum(most, square)
+        # A signal that is not there has neither.
+        whole = moments + np.eye(BASE) * np.maximum(off, 1e-12)[:, :, None]
+        return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
+
+    def colours(self, axes: Array) -> Array:
+        """Variance (2, n) of longer means over that of white noise, 1 at least, at rest and in motion."""
+        blocks, n, found = self.blocks, len(axes), np.ones((2, len(axes)))
+        full = self.present.all(axis=1) & (self.size == BLOCKS_IN_WINDOW)
+        full &= np.logical_and.reduceat(self.used, blocks.start)
+        for regime, windows in enumerate((full & self.rest, full & ~self.rest)):
+            chosen = np.flatnonzero(windows)
+            if len(chosen) < LEAST_BLOCKS:
+                continue
+            rows = blocks.start[chosen][:, None] + np.arange(BLOCKS_IN_WINDOW)
+            t = np.einsum("wij,wbj->wbi", information(self.variance[chosen], axes), blocks.mean[rows])
+            means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
+            short, long = (part.var(axis=1, ddof=1).sum(axis=0) for part in (t, means))
+            found[regime] = np.maximum(SUBS * long / np.maximum(short, 1e-30), 1.0)
+        return found
+
+
+def _at_rest(variance: Array, axes: Array) -> Array:
+    """Work out A (..., n, n) where the rate is known to be zero but for `REST_STD`."""
+    weighted = axes / variance[..., :, None]
+    normal = axes.T @ weighted + np.eye(3) / REST_STD**2
+    solved = np.linalg.solve(normal, np.swapaxes(weighted, -1, -2))
+    return np.asarray(np.eye(len(axes)) / variance[..., :, None] - weighted @ solved)
 
 
 def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
@@ -348,111 +430,6 @@ def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array,
     return coefficients, np.asarray(layouts[0]["prior"][shown])
 
 
-def _evidence(
-    blocks: Blocks, sensors: Sensors, axes: Array, late: Array, y: Array, used: Mask, variance: Array, rate: Array,
-    turn: Array, rest: Mask, scale: Array,
-) -> tuple[Evidence, Evidence]:  # fmt: skip
-    n, windows = len(axes), blocks.windows
-    coefficients, prior = coefficients_of(sensors, axes, scale)
-    moving = (~rest[blocks.window])[:, None]
-    base = np.hstack([np.ones((len(y), 1)), rate * moving, turn * moving]) * used[:, None]
-    # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
-    left = y - (rate * moving) @ axes.T
-    moments, cross = _by_window(blocks, base, base), _by_window(blocks, base, left * used[:, None])
-    # What of rate and acceleration is noise is no signal.
-    count = np.add.reduceat(used, blocks.start) * ~rest
-    noise = np.linalg.inv(np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes))
-    moments[:, 1:4, 1:4] -= count[:, None, None] * noise
-    moments[:, 4:7, 4:7] -= count[:, None, None] * noise / (2.0 * blocks.length**2)
-    values, vectors = np.linalg.eigh(moments)
-    moments = np.einsum("wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors)
-    a = information(variance, axes)
-    a[rest] = _at_rest(variance[rest], axes)
-    each = -(-windows // MOST_STEPS)
-    groups = -(-windows // each)
-    middle = np.array([blocks.time[k * each : (k + 1) * each].mean() for k in range(groups)])
-    start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
-    prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
-    flat = coefficients.reshape(-1, n * BASE)
-
-    def summed(moments: Array, cross: Array) -> Evidence:
-        normal, right = np.zeros((groups, len(flat), len(flat))), np.zeros((groups, len(flat)))
-        for k in range(groups):
-            own = slice(k * each, (k + 1) * each)
-            # (n, n, 7, 7): sum of the products of A and s s'.
-            products = (a[own].reshape(-1, n * n).T @ moments[own].reshape(-1, BASE * BASE)).reshape(n, n, BASE, BASE)
-            normal[k] = flat @ products.transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE) @ flat.T
-            right[k] = flat @ (a[own] @ np.swapaxes(cross[own], 1, 2)).sum(axis=0).reshape(-1)
-        # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
-        since = (middle - middle.mean())[:, None, None]
-        rates = since * normal[:, :n]
-        whole = np.concatenate(
-            [
-                np.concatenate([normal, np.swapaxes(rates, 1, 2)], axis=2),
-                np.concatenate([rates, since**2 * normal[:, :n, :n]], axis=2),
-            ],
-            axis=1,
-        )
-        rights = np.hstack([right, since[:, 0] * right[:, :n]])
-        return Evidence.in_units(n, whole, rights, np.diff(middle, append=middle[-1]), prior, start)
-
-    kept = _beyond_vibration(moments, count, variance, rest, axes, blocks.length)
-    return summed(moments, cross), summed(kept @ moments, kept @ cross)
-
-
-def _beyond_vibration(moments: Array, count: Int, variance: Array, rest: Mask, axes: Array, length: float) -> Array:
-    """Find what (W, 7, 7) of the moments M (W, 7, 7) of the signals no vibration explains: M (M + K)^-1.
-
-    Vibration turns the whole body, and every unit sees it with a gain and a phase of its own: for as long as it lasts,
-    it looks like scale errors, misalignments and delays, and leaves no residual once these are fitted. With e^2 the
-    variance of a channel that rest does not show, and units that see vibration differently by `UNEQUAL` at least, at
-    most U = e^2 / UNEQUAL^2 of the mean square s^2 of a signal is vibration. The products with a channel then are off
-    by up to e sqrt(min(U, s^2)) each, alike in all windows: K = W count^2 min(U, s^2), in units of e^2.
-    """
-    moving = ~rest
-    at_rest = np.median(variance[rest], axis=0) if rest.any() else np.zeros(len(axes))
-    there = (variance < ABSENT / 2) & moving[:, None]
-    beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
-    share = (beyond / variance).max(axis=1)[:, None]
-    most = np.zeros((len(moments), BASE))
-    most[:, 1:4] = (axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
-    # Half of it is in differences of two blocks at most.
-    most[:, 4:7] = 0.5 * most[:, 1:4].max(axis=1, keepdims=True) / length**2
-    square = np.einsum("wkk->wk", moments) / np.maximum(count, 1)[:, None]
-    off = moving.sum() * count[:, None] ** 2 * share * np.minimum(most, square)
-    # A signal that is not there has neither.
-    whole = moments + np.eye(BASE) * np.maximum(off, 1e-12)[:, :, None]
-    return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
-
-
-def _at_rest(variance: Array, axes: Array) -> Array:
-    """Work out A (..., n, n) where the rate is known to be zero but for `REST_STD`."""
-    weighted = axes / variance[..., :, None]
-    normal = axes.T @ weighted + np.eye(3) / REST_STD**2
-    solved = np.linalg.solve(normal, np.swapaxes(weighted, -1, -2))
-    return np.asarray(np.eye(len(axes)) / variance[..., :, None] - weighted @ solved)
-
-
-def _colours(one: _Pass, axes: Array) -> Array:
-    """Variance (2, n) of longer means over that of white noise, 1 at least, at rest and in motion."""
-    blocks, n = one.blocks, len(axes)
-    size = np.diff([*blocks.start, len(blocks.mean)])
-    full = one.present.all(axis=1) & (size == BLOCKS_IN_WINDOW) & np.logical_and.reduceat(one.used, blocks.start)
-    found = np.ones((2, n))
-    for regime, windows in enumerate((full & one.rest, full & ~one.rest)):
-        chosen = np.flatnonzero(windows)
-        if len(chosen) < 5:
-            continue
-        rows = blocks.start[chosen][:, None] + np.arange(BLOCKS_IN_WINDOW)
-        t = np.einsum("wij,wbj->wbi", information(one.variance[chosen], axes), blocks.mean[rows])
-        means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
-        short = np.square(t - t.mean(axis=1, keepdims=True)).sum(axis=(0, 1)) / (BLOCKS_IN_WINDOW - 1)
-        parts = BLOCKS_IN_WINDOW // SUBS
-        long = SUBS * np.square(means - means.mean(axis=1, keepdims=True)).sum(axis=(0, 1)) / (parts - 1)
-        found[regime] = np.maximum(long / np.maximum(short, 1e-30), 1.0)
-    return found
-
-
 def _misfit(of: Evidence, found: Smoothed) -> float:
     """Scatter of what single windows say of the constants, over what the noise explains."""
     n = of.n
@@ -462,13 +439,3 @@ def _misfit(of: Evidence, found: Smoothed) -> float:
     shown = float(np.einsum("ki,ij,kj->", residual, covariance, residual))
     expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], covariance))
     return max(shown / max(expected, 1e-12), 1.0)
-
-
-def _curve(one: _Pass, found: Smoothed, blocks: Blocks) -> Array:
-    """Biases (K, n) over time, rad/s."""
-    times = _times(one.evidence, blocks)
-    return np.asarray(found.curve + np.outer(times - times.mean(), found.constant[-found.curve.shape[1] :]))
-
-
-def _times(of: Evidence, blocks: Blocks) -> Array:
-    return np.asarray(blocks.time[0] + np.concatenate([[0.0], np.cumsum(of.apart[:-1])]))

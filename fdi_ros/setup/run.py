@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -180,12 +180,20 @@ class Settings:
     """``{"section.field": value}`` of the config."""
     config: Config
     calibration: Calibration | None = None
-    refused: str = ""
-    """Why there is no calibration."""
-    disagree: bool = False
-    """It is because channels contradict each other."""
+    why: FdiError | None = None
+    """For which there is no calibration."""
     mounts: tuple[Mount, ...] = ()
     """Of each unit; empty: channels in one array, or mounts that were given."""
+
+    @property
+    def refused(self) -> str:
+        """Why there is no calibration."""
+        return str(self.why or "")
+
+    @property
+    def disagree(self) -> bool:
+        """Whether it is because channels contradict each other."""
+        return isinstance(self.why, DisagreementError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,23 +265,19 @@ def set_up(
     reports, damage = inspect(bag)
     chosen = _gyros(reports, bag)
     parameters: Parameters = {**starting_config(chosen, bag).parameters}
-    config = Config.from_parameters(parameters)
-    _check_reference(config, reference)
-    part = _Part.of(bag, config, start, end, proof)
-    together = np.isfinite(part.whole.z).all(axis=1).any()
-    if source_of(config).units and not together and (apart := clocks_apart(chosen, 0.0)):
+    begun = Settings(parameters=parameters, config=Config.from_parameters(parameters))
+    _check_reference(begun.config, reference)
+    block = read_block(bag, begun.config, start, end)
+    together = np.isfinite(block.z).all(axis=1).any()
+    if source_of(begun.config).units and not together and (apart := clocks_apart(chosen, 0.0)):
         raise BagError(f"{bag}: {apart}")
 
-    def learn(block: Block) -> tuple[Settings, Settings]:
-        before = _mounted(block, Settings(parameters=parameters, config=config))
-        found = _with_mounts(block, before, reference)
-        try:
-            Pipeline.from_config(found.config)
-        except FdiError as error:
-            raise BagError(f"no config can be made of {bag}: {error}") from error
-        return before, found
+    def learn(part: Block) -> tuple[Settings, Settings]:
+        before = _mounted(part, begun)
+        return before, _with_mounts(part, before, reference)
 
-    return _proved(part, learn, reports=reports, damage=damage, chosen=chosen)
+    found = _proved(_split(block, bag, start, end, proof), learn)
+    return replace(found, reports=reports, damage=damage, chosen=chosen)
 
 
 def recalibrate(
@@ -286,69 +290,57 @@ def recalibrate(
     FdiError
         If it cannot be read, lacks a topic, or its channels contradict each other.
     """
-    reports = refuse_degrees(bag, config)
-    if copies := copy_words(reports):
+    if copies := copy_words(refuse_degrees(bag, config)):
         raise CalibrationError(f"{bag}: {copies}; look at topics and remappings, or leave one out of the config")
-    part = _Part.of(bag, config, start, end, proof)
+    block = read_block(bag, config, start, end)
     names = build_geometry(config).channel_names
-    silent = [name for name, values in zip(names, part.whole.z.T, strict=True) if not np.isfinite(values).any()]
-    if silent:
+    if silent := [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]:
         words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
     given = Settings(parameters=dict(config.parameters()), config=config)
+    part = _split(block, bag, start, end, proof)
 
     def learn(block: Block) -> tuple[Settings, Settings]:
         found = _calibrated(block, given, reference)
-        if found.calibration is None and block is part.learned:
-            raise (DisagreementError if found.disagree else CalibrationError)(found.refused)
+        if found.why is not None and block is part.learned:
+            raise found.why
         return given, found
 
     return _proved(part, learn)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What settings are learned on, and proved on."""
+class _Split(NamedTuple):
+    """What settings are learned from before they are proved, and after; and the proof, as `prove` takes it."""
 
     learned: Block
-    """Before they are proved."""
     whole: Block
-    """And after."""
     proof: tuple[Path, float, float, str, bool]
 
-    @classmethod
-    def of(cls, bag: Path, config: Config, start: float, end: float, proof: Path | None) -> _Part:
-        """Read a recording, and divide it unless another one is for the proof."""
-        block = read_block(bag, config, start, end)
-        if proof is not None:
-            return cls(block, block, (proof, 0.0, math.inf, shown(proof.name), True))
-        since, kept = kept_from(block)
-        if not kept:
-            return cls(
-                block, block, (bag, start, end, "the same recording: too short to keep a part of it aside", False)
-            )
-        rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
-        return cls(block[:rows], block, (bag, start + since, end, f"the last {kept:.0f} s, kept aside", True))
+
+def _split(block: Block, bag: Path, start: float, end: float, proof: Path | None) -> _Split:
+    """Divide a recording unless another one is for the proof."""
+    if proof is not None:
+        return _Split(block, block, (proof, 0.0, math.inf, shown(proof.name), True))
+    since, kept = kept_from(block)
+    if not kept:
+        words = "the same recording: too short to keep a part of it aside"
+        return _Split(block, block, (bag, start, end, words, False))
+    rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
+    return _Split(block[:rows], block, (bag, start + since, end, f"the last {kept:.0f} s, kept aside", True))
 
 
-def _proved(part: _Part, learn: Callable[[Block], tuple[Settings, Settings]], **recorded: Any) -> SetupResult:
+def _proved(split: _Split, learn: Callable[[Block], tuple[Settings, Settings]]) -> SetupResult:
     """Prove what a part of a recording gives; then take what all of it gives, or the settings before."""
-    before, found = learn(part.learned)
-    proof = prove(*part.proof, before.config, found.config)
+    before, found = learn(split.learned)
+    proof = prove(*split.proof, before.config, found.config)
     kept = proof.worse if found.calibration is not None else ""
-    if part.whole is not part.learned:
-        whole_before, whole = learn(part.whole)
+    if split.whole is not split.learned:
+        whole_before, whole = learn(split.whole)
         if whole.calibration is not None or found.calibration is None:
             before, found = whole_before, whole
     if kept:
         found = replace(found, parameters=before.parameters, config=before.config)
-    return SetupResult(
-        **vars(found),
-        **recorded,
-        kept=kept,
-        mounting=assess(found.config),
-        proof=proof,
-    )
+    return SetupResult(**vars(found), kept=kept, mounting=assess(found.config), proof=proof)
 
 
 def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
@@ -360,10 +352,9 @@ def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
         return chosen
     words = [
         f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
-        for report in reports
+        for report in reports[:MOST_NAMED]
     ]
-    others = "; ".join(words[:MOST_NAMED]) or "none"
-    raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {others}")
+    raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {'; '.join(words) or 'none'}")
 
 
 def _check_reference(config: Config, reference: str) -> None:
@@ -380,8 +371,8 @@ def _mounted(block: Block, start: Settings) -> Settings:
         return start
     mounts = find_mounts(prepare_channels(block, start.config, list(range(block.z.shape[1]))))
     rotations = [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]
-    turned = {"imus.mounts": np.ravel(rotations).tolist()}
-    return replace(_if_built({**start.parameters, **turned}, start), mounts=mounts)
+    known = {**start.parameters, "imus.mounts": np.ravel(rotations).tolist()}
+    return replace(_if_built(known, start), mounts=mounts)
 
 
 def _if_built(known: Parameters, before: Settings) -> Settings:
@@ -399,15 +390,13 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
     names, mounts = before.config.imu_names, before.mounts
     if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
         # Where most are mirrored against the first, it is the first.
-        others = len(mounts) - 1 - len(odd)
-        who = (
-            " and ".join(odd) if len(odd) <= others else names[0] if len(mounts) > 2 else " or ".join([names[0], *odd])
+        if len(odd) > len(mounts) - 1 - len(odd):
+            odd = [names[0]] if len(mounts) > 2 else [f"{names[0]} or {odd[0]}"]
+        words = (
+            f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"
+            " swapped; no mount does that: mend its driver, or leave its topic out"
         )
-        why = (
-            f"{who} is mirrored: one axis is reversed (a left turn reads as a right one), or two are swapped; no mount"
-            " does that: mend its driver, or leave its topic out"
-        )
-        return replace(before, refused=why, disagree=True)
+        return replace(before, why=DisagreementError(words))
     lost = [k for k, mount in enumerate(mounts) if mount.rotation is None and not mount.contradicts]
     found = _calibrated(block, before, reference, [3 * k + axis for k in lost for axis in range(3)])
     if not lost or found.calibration is not None:
@@ -415,18 +404,18 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
     # Nothing may be declared because of mounts that nobody knows.
     careful = _if_built({**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before)
     who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
-    why = f"the recording does not show how {who} mounted against {names[0]}"
-    return replace(careful, refused=why)
+    why = CalibrationError(f"the recording does not show how {who} mounted against {names[0]}")
+    return replace(careful, why=why)
 
 
 def _calibrated(block: Block, before: Settings, reference: str, unknown: Sequence[int] = ()) -> Settings:
     try:
         calibration = calibrate(block, before.config, reference, unknown)
     except FdiError as error:
-        return replace(before, refused=str(error), disagree=isinstance(error, DisagreementError))
+        return replace(before, why=error)
     # The axes hold the mounts: beside them these would be read, and not be used.
     known = {name: value for name, value in before.parameters.items() if name not in REPLACED}
     full = _if_built({**known, **calibration.settings}, before)
     if full is before:
-        return replace(before, refused="no monitor can be built from what it gives")
+        return replace(before, why=CalibrationError("no monitor can be built from what it gives"))
     return replace(full, calibration=calibration)
