@@ -63,7 +63,7 @@ a noisy channel as noisy and does not declare it. `guaranteed` waits for ten bou
 }
 
 SHOWN = {
-    "reference": ("One fault",),
+    "reference": ("One fault, two_triad_cone",),
     "residual_search_2019": ("Protocol of 2019, sound", "Protocol of 2019, stands out"),
     "power": (*(f"One fault, {name}" for name in ("two_triad_cone", "cone_5")), "Delay"),
     "roc": ("Detection of 6",),
