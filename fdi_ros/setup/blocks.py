@@ -279,15 +279,7 @@ def portions(begin: Int) -> Iterator[tuple[int, int]]:
 
 
 class Resampled:
-    """Values at the instants of the samples, delays taken off.
-
-    Parameters
-    ----------
-    data
-        The recording.
-    late
-        (n,) s.
-    """
+    """Values of a recording at the instants of its samples, delays (n,), s, taken off."""
 
     def __init__(self, data: Data, late: Array) -> None:
         self.seconds = data.seconds
@@ -330,20 +322,9 @@ class Resampled:
 
 
 def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
-    """Find the polynomials through the six knots around instants.
+    """Find the polynomials through the six knots (K,) around instants x (N,), s; knots are usually so many s apart.
 
-    Parameters
-    ----------
-    knots
-        (K,) s, increasing.
-    x
-        (N,) s.
-    usual
-        Time from one knot to the next, s.
-
-    Returns
-    -------
-    First knot (N,) of each, -1 where x is beside a hole or outside; weights (N, `POINTS`) of the knots.
+    Returns the first knot (N,) of each, -1 where x is beside a hole or outside, and weights (N, `POINTS`) of the knots.
     """
     if len(knots) < POINTS:
         return np.full(len(x), -1), np.zeros((len(x), POINTS))

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import LEAST_NOISE
-from fdi_ros.errors import CalibrationError, DisagreementError
+from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.samples import Array, Block
+from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -60,16 +60,6 @@ REPLACED = ("imus.mounts", "geometry.cone_channels")
 """Parameters that say nothing any more beside geometry.axes."""
 
 
-@dataclass(frozen=True)
-class _Task:
-    """The recording, its channels in use, and the configuration of these."""
-
-    config: Config
-    active: list[int]
-    data: Data
-    sensors: Sensors
-
-
 def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:
     """Calibrate all channels that are not excluded.
 
@@ -91,51 +81,49 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
         If the recording is too short, or its channels contradict each other, naming which.
     """
     full = build_geometry(config)
-    active = [i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels]
-    nominal = full.subset(np.isin(np.arange(full.n), active))
-    chosen = [active.index(i) for i in _reference(config, full, active, reference)]
-    data = prepare_channels(block, config, active)
+    active = np.array([i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels])
+    nominal, source = full.subset(np.isin(np.arange(full.n), active)), source_of(config)
+    chosen = reference_channels(config, nominal, reference)
+    data = prepare_channels(block, config, active.tolist())
     _check_amount(data, nominal.channel_names)
     spiky = spikes(data.z, nominal.axes)
     data.z[spiky] = np.nan
-    units, lost = _units(nominal), [place for place, i in enumerate(active) if i in unknown]
-    if source_of(config).units:
+    lost = np.flatnonzero(np.isin(active, unknown)).tolist()
+    if source.units:
         check_agreement(data, nominal, lost)
-    sensors = _sensors(config, nominal, data, chosen, units)
+    sensors = _sensors(config, nominal, data, chosen)
     if lost:
         sensors.axes[lost] = _axes_against_others(data, sensors.axes, lost)
         sensors.scale_std[lost] = UNKNOWN_MOUNT
-    task = _Task(config, active, data, sensors)
     try:
         found = estimate(data, sensors)
-        changed = _settings(task, found)
-        tried = Config.from_parameters({**config.parameters(), **changed})
-        faults, spectrum = _watch(_aligned(block, data, found.late[sensors.unit], active), tried, active)
+        settings = _settings(config, active, data.step, found)
+        tried = Config.from_parameters({**config.parameters(), **settings})
+        faults, spectrum = _watch(_aligned(block, data, found.late, active), tried, active)
         if faults:
             _check_share(faults, data, nominal.channel_names)
-            task = replace(task, data=_left_out(data, faults))
-            found = estimate(task.data, sensors)
-            changed = _settings(task, found)
+            found = estimate(_left_out(data, faults), sensors)
+            settings = _settings(config, active, data.step, found)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
-    delays = [
-        Delay(tuple(unit), float(found.late[k]), float(found.late_std[k])) for k, unit in enumerate(units) if k and unit
-    ]
+    units = [np.flatnonzero(sensors.unit == k) for k in range(1, sensors.units)]
     return Calibration(
         names=nominal.channel_names,
         nominal=nominal.axes,
         estimate=found,
-        timing=_timing(task, found)[1],
-        delays=tuple(delays),
+        timing=float(_timing(config, active, found).max()),
+        delays=tuple(
+            Delay(tuple(unit.tolist()), float(found.late[unit[0]]), float(found.late_std[unit[0]])) for unit in units
+        ),
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
-        settings=changed,
+        settings=settings,
         spectrum=spectrum,
     )
 
 
-def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterator[Block]:
+def _aligned(block: Block, data: Data, late: Array, active: Int) -> Iterator[Block]:
     """Give the usable values, part by part, as the monitor will have them once the delays (n,), s, are taken off."""
     source, shifted = Resampled(data, late), np.abs(late) >= NOT_SHIFTED
     for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
@@ -171,47 +159,42 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
             )
 
 
-def _reference(config: Config, nominal: Geometry, active: list[int], name: str) -> list[int]:
-    """Return the numbers of the reference channels among all channels; none: all are alike."""
-    names, units = nominal.channel_names, source_of(config).units
+def reference_channels(config: Config, geometry: Geometry, name: str) -> list[int]:
+    """Return the places of the reference channels among those in use; none: all are alike.
+
+    Raises
+    ------
+    ConfigError
+        If these are no three channels in use that span space.
+    """
+    names, units = geometry.channel_names, source_of(config).units
+    if not name and units:
+        return []
     if not name:
-        if units:
-            return []
-        return next(list(one) for one in itertools.combinations(active, 3) if spans_space(nominal.axes[list(one)]))
-    wanted = [part.strip() for part in name.split(",")]
-    if units and len(wanted) == 1:
-        wanted = [f"{name}.{axis}" for axis in "xyz"]
-    unknown = [part for part in wanted if part not in names]
-    if unknown or len(wanted) != 3:
-        triads = f"one of {', '.join(units)}, or " if units else ""
-        raise CalibrationError(f"reference is {name!r}, expected {triads}three of: {', '.join(names)}")
-    chosen = [names.index(part) for part in wanted]
-    if len(set(chosen)) != 3 or not set(chosen) <= set(active) or not spans_space(nominal.axes[chosen]):
-        raise CalibrationError(f"reference {name}: expected three channels in use that span space")
+        return next(
+            list(one) for one in itertools.combinations(range(geometry.n), 3) if spans_space(geometry.axes[list(one)])
+        )
+    wanted = [f"{name}.{axis}" for axis in "xyz"] if name in units else [part.strip() for part in name.split(",")]
+    chosen = [names.index(part) for part in wanted if part in names]
+    if len(wanted) != 3 or len(set(chosen)) != 3 or not spans_space(geometry.axes[chosen]):
+        triads = f"one of: {', '.join(units)}; or " if units else ""
+        raise ConfigError(
+            f"--reference is {name!r}, expected {triads}three of: {', '.join(names)}, in use and not in one plane"
+        )
     return chosen
 
 
-def _units(nominal: Geometry) -> list[list[int]]:
-    """Channels of each unit; those that belong to none are of the first."""
-    named = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
-    units: list[list[int]] = [[] for _ in named]
-    for i, unit in enumerate(nominal.unit_of or [""] * nominal.n):
-        units[named.index(unit) if unit else 0].append(i)
-    return units
-
-
-def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], units: list[list[int]]) -> Sensors:
-    stamped, axes = source_of(config).stamped, nominal.axes.copy()
-    scale = np.full(nominal.n, SCALE_STD)
-    if not source_of(config).units:
+def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -> Sensors:
+    source, axes, scale = source_of(config), nominal.axes.copy(), np.full(nominal.n, SCALE_STD)
+    if not source.units:
         found = _axes_from_motion(data, axes, chosen)
         if np.abs(found - axes).max() > WRONG_AXES:
             axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
     scale[chosen] = REFERENCE_STD
-    unit = np.zeros(nominal.n, dtype=np.int64)
-    for k, channels in enumerate(units):
-        unit[channels] = k
-    delay = UNIT_DELAY if stamped else CHANNEL_DELAY
+    # Channels that belong to no unit are of the first.
+    units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
+    unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
+    delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
     return Sensors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
 
 
@@ -251,7 +234,7 @@ class _Residuals(Sink):
         self.spectrum.add(output.residual)
 
 
-def _watch(parts: Iterable[Block], config: Config, active: list[int]) -> tuple[tuple[Span, ...], Spectrum]:
+def _watch(parts: Iterable[Block], config: Config, active: Int) -> tuple[tuple[Span, ...], Spectrum]:
     """Find when the monitor itself, with the settings found, has something declared, and the spectrum of residuals."""
     # So that what was declared ends when it has gone.
     pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
@@ -303,9 +286,8 @@ def _check_share(faults: tuple[Span, ...], data: Data, names: tuple[str, ...]) -
 # Settings -------------------------------------------------------------------------------------------------------------
 
 
-def _settings(task: _Task, found: Estimate) -> dict[str, object]:
-    """Parameters to be changed; channels that are not in use keep what they have."""
-    config, active = task.config, task.active
+def _settings(config: Config, active: Int, step: float, found: Estimate) -> dict[str, object]:
+    """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
     all_axes = build_geometry(config).axes.copy()
     n = len(all_axes)
     all_axes[active] = found.axes
@@ -314,7 +296,7 @@ def _settings(task: _Task, found: Estimate) -> dict[str, object]:
     before = build_noise(config, n)
     std, scale, timing = before.noise_std.copy(), before.scale_std.copy(), before.timing_std.copy()
     std[active], scale[active] = np.maximum(_noise(found), LEAST_NOISE), found.disagreement()[0]
-    timing[active] = _timing(task, found)[0]
+    timing[active] = _timing(config, active, found)
     changed: dict[str, object] = {
         "geometry.preset": "axes",
         "geometry.axes": _rounded(all_axes.ravel(), 6),
@@ -332,16 +314,15 @@ def _settings(task: _Task, found: Estimate) -> dict[str, object]:
         changed["noise.bias_walk"] = _short(walk)
     source = source_of(config)
     if source.stamped:
-        late = found.late[task.sensors.unit]
         total = np.array(source.delays)
-        taken = np.abs(late) > np.maximum(LEAST_SKEW, SHOWN * found.late_std[task.sensors.unit])
-        for place, channel in enumerate(active):
-            if place == 0 or task.sensors.unit[place] != task.sensors.unit[place - 1]:
-                total[source.chip_of(channel)] += late[place] if taken[place] else 0.0
+        shown = np.abs(found.late) > np.maximum(LEAST_SKEW, SHOWN * found.late_std)
+        # Of all channels of a unit the first is taken.
+        units, first = np.unique([source.chip_of(int(channel)) for channel in active], return_index=True)
+        total[units] += np.where(shown, found.late, 0.0)[first]
         changed["imus.delays"] = _rounded(total - total[0], 6)
         if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
             changed["imus.timeout"] = float(f"{needed:.2g}")
-        if (narrow := _skew(task, late)) < config.imus.max_skew:
+        if (narrow := _skew(config, step, found.late)) < config.imus.max_skew:
             changed["imus.max_skew"] = narrow
     return changed
 
@@ -352,21 +333,18 @@ def _noise(found: Estimate) -> Array:
     return np.maximum(found.floor.std, np.median(moving, axis=0) / LOUDER) if len(moving) else found.floor.std
 
 
-def _timing(task: _Task, found: Estimate) -> tuple[Array, float]:
-    """Find what is not known of the sampling instants (n,), s, as configured where no motion shows it; and the most."""
-    before = build_noise(task.config, build_geometry(task.config).n).timing_std[task.active]
-    shown = found.late_std[task.sensors.unit] if source_of(task.config).stamped else np.zeros(len(before))
-    timing = np.full(len(before), float(np.sqrt(np.mean(shown**2))))
-    timing = np.where(timing < np.maximum(before, LEAST_SKEW), timing, before)
-    return timing, float(timing.max())
+def _timing(config: Config, active: Int, found: Estimate) -> Array:
+    """Find what is not known of the sampling instants (n,), s; as configured where no motion shows it."""
+    before = build_noise(config, build_geometry(config).n).timing_std[active]
+    error = float(np.sqrt(np.mean(found.late_std**2))) if source_of(config).stamped else 0.0
+    return np.where(error < np.maximum(before, LEAST_SKEW), error, before)
 
 
-def _skew(task: _Task, late: Array) -> float:
+def _skew(config: Config, step: float, late: Array) -> float:
     """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
-    configured, step = task.config.imus.max_skew, task.data.step
     offset = np.abs(late - np.round(late / step) * step)
-    hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= configured)]
-    return float(f"{hidden.min() / 2:.2g}") if len(hidden) else configured
+    hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= config.imus.max_skew)]
+    return float(f"{hidden.min() / 2:.2g}") if len(hidden) else config.imus.max_skew
 
 
 def _rounded(values: Array, digits: int) -> list[float]:

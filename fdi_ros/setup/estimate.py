@@ -101,9 +101,9 @@ class Estimate:
     axes_covariance: Array
     """(3 n, 3 n) of all of them."""
     late: Array
-    """(units,) by how much the stamps of each unit are late against those of the first, s."""
+    """(n,) by how much the stamps of each channel's unit are late against those of the first, s."""
     late_std: Array
-    """(units,) s."""
+    """(n,) s."""
     bias: Array
     """(n,) mean over the recording, rad/s."""
     bias_covariance: Array
@@ -190,8 +190,8 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
     return Estimate(
         axes,
         covariance[: 3 * n, : 3 * n],
-        late,
-        late_std,
+        late[sensors.unit],
+        late_std[sensors.unit],
         found.mean,
         found.mean_covariance,
         one.curve_of(found),

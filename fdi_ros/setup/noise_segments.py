@@ -21,16 +21,12 @@ SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
 FEWEST, PART = 3, 100
 """So many of the quietest segments, or one in so many, tell the noise at rest: of a long flight few are."""
-ALIKE = 1.5
-"""Noise this many times that of the quietest segments is as quiet."""
-ROUNDS = 10
-"""In which the quiet ones are found."""
-QUIET = 2.0
-"""More is that of motion: vibration."""
-SLOWER = 2.0
-"""Noise that is slower than a block may be so many times the other, and is no motion."""
+AS_QUIET, ROUNDS = 1.5, 10
+"""Noise this many times that of the quietest is as quiet; rounds in which the quiet ones are found."""
+QUIET = SLOWER = 2.0
+"""More noise is that of motion: vibration; noise that is slower than a block may be so many times the other."""
 LARGEST_BIAS = 0.1
-"""rad/s."""
+"""rad/s, that a gyro at rest has."""
 MOST = 4096
 """Segments that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 
@@ -100,9 +96,8 @@ class NoiseSegments:
 
         The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
         """
-        noise, block = (
-            np.array([getattr(one, name) for one in self.all_segments()]) for name in ("noise", "block_noise")
-        )
+        segments = self.all_segments()
+        noise, block = np.array([one.noise for one in segments]), np.array([one.block_noise for one in segments])
         # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
         for values in (noise, block):
             for column in values.T:
@@ -110,7 +105,7 @@ class NoiseSegments:
                     column[column == 0.0] = np.median(column[column > 0.0])
         quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
         for _ in range(ROUNDS):
-            alike = np.flatnonzero((noise <= ALIKE * np.median(noise[quiet], axis=0)).all(axis=1))
+            alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
             if len(alike) <= len(quiet):
                 break
             quiet = alike

@@ -23,7 +23,7 @@ import numpy as np
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.config.parameter_file import parameter_file
-from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
+from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -32,7 +32,7 @@ from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_o
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare_channels
-from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
+from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
 from fdi_ros.setup.fitness import candidates, clocks_apart, copy_words, needs, refuse_degrees
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
@@ -266,7 +266,7 @@ def set_up(
     chosen = _gyros(reports, bag)
     parameters: Parameters = {**starting_config(chosen, bag).parameters}
     begun = Settings(parameters=parameters, config=Config.from_parameters(parameters))
-    _check_reference(begun.config, reference)
+    reference_channels(begun.config, build_geometry(begun.config), reference)
     block = read_block(bag, begun.config, start, end)
     together = np.isfinite(block.z).all(axis=1).any()
     if source_of(begun.config).units and not together and (apart := clocks_apart(chosen, 0.0)):
@@ -355,14 +355,6 @@ def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
         for report in reports[:MOST_NAMED]
     ]
     raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {'; '.join(words) or 'none'}")
-
-
-def _check_reference(config: Config, reference: str) -> None:
-    names = build_geometry(config).channel_names
-    units = source_of(config).units
-    if reference and reference not in units and not {part.strip() for part in reference.split(",")} <= set(names):
-        expected = f"one of: {', '.join(units)}; or " if units else ""
-        raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
 
 
 def _mounted(block: Block, start: Settings) -> Settings:

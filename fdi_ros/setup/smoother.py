@@ -11,6 +11,7 @@ biases are eliminated (banded Cholesky), and the marginal likelihood of the walk
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -69,8 +70,7 @@ class Smoothed:
     """(n, n) of it."""
 
 
-@dataclass(frozen=True)
-class Walk:
+class Walk(NamedTuple):
     """How the biases walk, rad/s/sqrt(s)."""
 
     value: float
@@ -79,16 +79,11 @@ class Walk:
     """The largest that the recording does not rule out."""
 
 
-@dataclass(frozen=True)
-class _Eliminated:
+class _Eliminated(NamedTuple):
     """What is left for the constants once the biases are eliminated."""
 
-    from_mean: Array
-    """(K n, n) B^-1 of the mean of the biases."""
-    from_constants: Array
-    """(K n, m) B^-1 C."""
-    alone: Array
-    """(K n,) B^-1 h: the biases if all constants were zero."""
+    solved: Array
+    """(K n, n + m + 1): B^-1 of the mean of the biases; of C; and of h, the biases if all constants were zero."""
     information: Array
     """(m, m) on the constants."""
     side: Array
@@ -114,13 +109,13 @@ def _eliminate(of: Evidence, walk: float) -> _Eliminated:
     factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
     mean = np.tile(np.eye(n) / count, (count, 1))
     solved = cho_solve_banded((factor, True), np.column_stack([mean, border, h.ravel()]))
-    from_mean, from_constants, alone = solved[:, :n], solved[:, n:-1], solved[:, -1]
+    from_constants, alone = solved[:, n:-1], solved[:, -1]
     information = np.eye(border.shape[1]) + of.normal[:, n:, n:].sum(axis=0) - border.T @ from_constants
     information = 0.5 * (information + information.T)
     side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
     fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
     volume = 2.0 * np.log(factor[0]).sum() - n * np.log(stiffness).sum() + np.linalg.slogdet(information)[1]
-    return _Eliminated(from_mean, from_constants, alone, information, side, 0.5 * (fits - float(volume)))
+    return _Eliminated(solved, information, side, 0.5 * (fits - float(volume)))
 
 
 def find_walk(of: Evidence) -> Walk:
@@ -141,17 +136,10 @@ def find_walk(of: Evidence) -> Walk:
 
 
 def smooth(of: Evidence, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
-    """Estimate the states.
+    """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
 
-    Parameters
-    ----------
-    of
-        What the groups say of them.
-    walk
-        Of the biases, rad/s/sqrt(s).
-    known
-        The first constants (k,) and their covariance (k, k), where they are from elsewhere: nothing is learned of
-        them, and they count as uncertain as they are (Schmidt 1966).
+    Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
+    they count as uncertain as they are (Schmidt 1966).
     """
     n, found = of.n, _eliminate(of, walk)
     if known is None:
@@ -164,10 +152,10 @@ def smooth(of: Evidence, walk: float, known: tuple[Array, Array] | None = None) 
         by = -free @ found.information[k:, :k]
         constant = np.concatenate([first, free @ found.side[k:] + by @ first])
         covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
-    curve = (found.alone - found.from_constants @ constant).reshape(-1, n)
-    # The mean of the biases by the constants, and by itself.
-    each = found.from_constants.reshape(len(curve), n, -1).mean(axis=0)
-    alone = found.from_mean.reshape(len(curve), n, n).mean(axis=0)
+    curve = (found.solved[:, -1] - found.solved[:, n:-1] @ constant).reshape(-1, n)
+    # The mean of the biases by itself, and by the constants.
+    mean = found.solved.reshape(len(curve), n, -1).mean(axis=0)
+    alone, each = mean[:, :n], mean[:, n:-1]
     unit = of.prior[n:]
     return Smoothed(
         constant * unit,

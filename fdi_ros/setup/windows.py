@@ -18,6 +18,7 @@ import numpy as np
 
 from fdi_ros.errors import CalibrationError
 from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.setup.noise_segments import AS_QUIET, ROUNDS
 
 STEPS = 25
 LEAST_VARIANCE = 1e-18
@@ -26,8 +27,6 @@ LEAST_SHARE = 0.1
 """Of the usual variance of the channels of a window: less for one of them is a split that nothing decides."""
 QUIETEST = 0.05
 """Quantile of the windows that is about the quietest."""
-AS_QUIET = 1.5
-"""Windows of at most so many times the variance of the quietest are as quiet."""
 LEAST_WINDOWS = 4
 MEMORY = 2
 """Windows on both sides that the noise of the moment is averaged over."""
@@ -85,16 +84,9 @@ def _projector(axes: Array) -> Array:
 
 
 def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
-    """Variance (W, n) of every channel, averaged over neighbouring windows.
+    """Variance (W, n) of every channel that is there (W, n), averaged over neighbouring windows.
 
-    Parameters
-    ----------
-    covariance
-        (W, n, n) of the values in each window, (rad/s)^2.
-    there
-        (W, n) channels that are there; of others the variance says nothing.
-    axes
-        (n, 3).
+    Of covariances (W, n, n) of the values in each window, (rad/s)^2; of channels that are not there it says nothing.
     """
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
     total, weight = np.zeros_like(filled), np.zeros(len(filled))
@@ -152,7 +144,7 @@ def _quietest(level: Array, count: Int) -> Mask:
     quiet = np.zeros(len(level), dtype=bool)
     quiet[least] = True
     # The quietest of many are quiet by chance, too: the mean of all that are as quiet is not.
-    for _ in range(10 if known else 0):
+    for _ in range(ROUNDS if known else 0):
         pooled = np.average(level[quiet], weights=count[quiet])
         more = level < AS_QUIET * pooled
         if (more == quiet).all():
@@ -163,18 +155,9 @@ def _quietest(level: Array, count: Int) -> Mask:
 
 
 def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor:
-    """Find the lower envelope of the noise of single samples.
+    """Find the lower envelope of the noise of single samples, of the channels (W, n) that are there.
 
-    Parameters
-    ----------
-    covariance
-        (W, n, n) of single samples in every window, (rad/s)^2.
-    count
-        (W,) samples of each.
-    there
-        (W, n) channels that count.
-    axes
-        (n, 3).
+    Of covariances (W, n, n) of so many (W,) samples in every window, (rad/s)^2.
     """
     level, n = levels(covariance, there, axes), len(axes)
     sums, precision, weight = np.zeros(n), np.zeros(n), np.zeros(n)
