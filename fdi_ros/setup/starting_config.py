@@ -198,6 +198,11 @@ def _units(chosen: Sequence[TopicReport], rate: float) -> tuple[dict[str, Any], 
         " turns about all axes. With two parallel units a fault is detected and not isolated; turned against each"
         " other, or three of them, isolate it"
     }
+    if numbered:
+        parameters["decision.latch"] = False
+        remarks["decision.latch"] = (
+            "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+        )
     if timeout := _longer(chosen, _BRIDGED, 10.0):
         slowest = min(report.rate for report in chosen)
         parameters["imus.timeout"] = timeout

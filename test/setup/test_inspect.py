@@ -87,6 +87,11 @@ def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, re
     assert config.sample_rate == pytest.approx(100 if which == "flight" else 62.5)
     assert config.bias.startup_bias_duration == 3
     assert Pipeline.from_config(config).geometry.n == 3 * len(config.imus.topics)
+    assert config.decision.latch
+
+
+def test_after_a_fault_of_a_flight_log_the_next_one_can_be_named(root):
+    assert starting_config_of(root / "bags" / "copter_crash.tlog", "refused").parameters["decision.latch"] is False
 
 
 def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mostly_moves(tmp_path):
