@@ -11,7 +11,6 @@ import platform
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
@@ -23,7 +22,7 @@ import numpy as np
 
 from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
-from fdi_ros.compiling.notice import WORDS, compiling_seconds, is_compiling
+from fdi_ros.compiling.notice import WORDS, clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.verdict import Severity, with_first_line_coloured
 from fdi_ros.system.limits import LINE
@@ -59,7 +58,7 @@ class Progress:
         from tqdm import tqdm
 
         self._stream, self._what = stream, what
-        self._share, self._begun = 0.0, time.monotonic()
+        self._share, self._begun = 0.0, clock()
         self._ended = threading.Event()
         self._saying = None if quiet or stream.isatty() else threading.Thread(target=self._say, daemon=True)
         # None: tqdm asks the stream whether it is a terminal.
@@ -81,7 +80,9 @@ class Progress:
     def _say(self) -> None:
         """Say now and then how much is done, whatever keeps the rest waiting."""
         while not self._ended.wait(SAID_EVERY):
-            spent, share = time.monotonic() - self._begun, self._share
+            if is_compiling():
+                continue  # That has lines of its own.
+            spent, share = clock() - self._begun, self._share
             done = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
             with suppress(OSError, ValueError):
                 self._stream.write(f"fdi: {self._what}{done} after {spent:.0f} s\n")
