@@ -56,30 +56,29 @@ BIAS_HINT = "Best estimate over the recording, each minus its mean; what all hav
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> list[Finding]:
     """List everything: what the settings are from and are worth, what is not known, what to look at."""
-    result, mounting = found.calibration, found.mounting
-    calibrated = [] if result is None else calibration_findings(result, found.config.body_frame, unit)
-    seen = summary_line(
-        mounting.geometry,
-        mounting.noise,
-        mounting.false_alarm_probability,
-        unit.name,
-        unit.factor,
-        agree=not found.disagree,
-    )
-    return [
-        *_worth(found, unit),
-        *_inputs(found),
-        *calibrated,
-        Finding(Role.FOUND, "mounting", seen),
-        *_unknown(found, unit),
-        *_copies(found),
-        *topic_findings(found.chosen, unit),
-        *(
-            Finding(Role.WARNING, "mounting", line)
-            for line in pair_lines(mounting)
-            if "not" in line.split(":")[-1] or "never" in line
-        ),
-    ]
+    return list(_findings(found, unit))
+
+
+def _findings(found: SetupResult, unit: Unit) -> Iterator[Finding]:
+    result, mounting, units = found.calibration, found.mounting, source_of(found.config).units
+    g, rate = mounting.geometry, found.config.sample_rate
+    yield from _worth(found, unit)
+    where = f"{len(units)} units" if units else "one array"
+    yield Finding(Role.FOUND, "channels", f"{g.n} channels in {where} at {rate:.4g} Hz", value=rate)
+    if known := sum(mount.rotation is not None for mount in found.mounts[1:]):
+        words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
+        yield Finding(Role.FOUND, "mounts", words, value=known)
+    if result is not None:
+        yield from calibration_findings(result, found.config.body_frame, unit)
+    noise = (mounting.noise, mounting.false_alarm_probability, unit.name, unit.factor)
+    yield Finding(Role.FOUND, "mounting", summary_line(g, *noise, agree=not found.disagree))
+    yield from _unknown(found, unit)
+    if words := copy_words(found.reports):
+        yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
+    yield from topic_findings(found.chosen, unit)
+    limits = [line for line in pair_lines(mounting) if "not" in line.split(":")[-1] or "never" in line]
+    if limits:
+        yield Finding(Role.WARNING, "mounting", "; ".join(limits))
 
 
 def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
@@ -107,34 +106,17 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     elif found.kept:
         words = f"on {proof.source}, {found.kept}; the settings before are written"
         yield Finding(Role.WARNING, "proof", words, headline="NO BETTER THAN BEFORE")
+    else:
+        words, isolated, biases = "nothing is declared without a fault", *tried.isolated_of
+        if not found.mounting.losses[0].isolable:
+            words += "; a fault is detected, which channel it is not"
+        elif biases:
+            sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
+            words += f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
+        yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
     if found.calibration is None and not found.disagree and source_of(found.config).units:
         words = f"{found.refused}: axes, delays and noise in motion are not known"
         yield Finding(Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED")
-    words, isolated, biases = "nothing is declared without a fault", *tried.isolated_of
-    if not found.mounting.losses[0].isolable:
-        words += "; a fault is detected, which channel it is not"
-    elif biases:
-        sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
-        words += f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
-    yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
-
-
-def _inputs(found: SetupResult) -> Iterator[Finding]:
-    """Say what there is, and how it is mounted."""
-    rate, units = found.config.sample_rate, source_of(found.config).units
-    where = f"{len(units)} units" if units else "one array"
-    yield Finding(
-        Role.FOUND, "channels", f"{found.mounting.geometry.n} channels in {where} at {rate:.4g} Hz", value=rate
-    )
-    if known := sum(mount.rotation is not None for mount in found.mounts[1:]):
-        words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
-        yield Finding(Role.FOUND, "mounts", words, value=known)
-
-
-def _copies(found: SetupResult) -> Iterator[Finding]:
-    """Say which topics were left out, as they give the values of others."""
-    if words := copy_words(found.reports):
-        yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
 
 
 def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
@@ -298,26 +280,25 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
     """Plot what changes over the recording, and the spectrum of what channels differ by."""
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
-    found, factor = result.estimate, unit.factor
-    rests = _spans(found.blocks.time, found.rest)
-    usual = time_layout(300, yaxis={"type": "log", "title": {"text": f"noise, {unit.name}"}}, shapes=rests)
-    walk = time_layout(280, yaxis={"title": {"text": f"bias minus its mean, {unit.name}"}}, shapes=rests)
-    rate = time_layout(260, yaxis={"title": {"text": f"rate, {unit.name}"}}, shapes=rests)
-    times = found.blocks.time
-    floors = [
-        {**_curve(name, times[:1], factor * found.floor.std[i : i + 1], i), "mode": "markers", "showlegend": False}
-        for i, name in enumerate(result.names)
-    ]
-    curves = [_curve(name, times, factor * found.moment[:, i], i) for i, name in enumerate(result.names)]
-    walks = factor * (found.curve - found.bias)
-    biases = [_curve(name, found.times, walks[:, i], i) for i, name in enumerate(result.names)]
-    turns = [_curve(axis, found.blocks.seconds, factor * found.rate[:, a], a) for a, axis in enumerate("xyz")]
+    found, names = result.estimate, result.names
+    times, rests = found.blocks.time, _spans(found.blocks.time, found.rest)
+
+    def course(title: str, hint: str, what: str, curves: list[dict[str, object]], **axis: str) -> Section:
+        layout = time_layout(280, yaxis={"title": {"text": f"{what}, {unit.name}"}, **axis}, shapes=rests)
+        return Section(title, hint, "", [{"data": curves, "layout": layout}])
+
+    def curves(names: Sequence[str], x: Array, y: Array) -> list[dict[str, object]]:
+        return [_curve(name, x, y[:, i] * unit.factor, i) for i, name in enumerate(names)]
+
+    floors = curves(names, times[:1], found.floor.std[None])
+    noise = curves(names, times, found.moment) + [{**one, "mode": "markers", "showlegend": False} for one in floors]
     shaded = f"Shaded: at rest, {found.rest_seconds:.1f} s." if rests else "Nowhere at rest."
+    walks = curves(names, found.times, found.curve - found.bias)
     spectrum = result.spectrum.section(unit)
     return [
-        Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
-        Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
-        Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),
+        course("Motion", shaded, "rate", curves("xyz", found.blocks.seconds, found.rate)),
+        course("Noise over time", NOISE_HINT, "noise", noise, type="log"),
+        course("Biases over time", BIAS_HINT, "bias minus its mean", walks),
         *([] if spectrum is None else [spectrum]),
     ]
 

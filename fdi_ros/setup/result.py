@@ -33,7 +33,7 @@ LARGE_SWING = float(np.radians(0.03))
 """Change of a bias within a recording that is worth a look, rad/s."""
 LARGE_BIAS = 0.2
 """rad/s."""
-LARGE_ANGLE, LARGE_SCALE = np.radians(5.0), 0.05
+LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05
 """Axes that far from nominal are worth a look."""
 MANY = 0.01
 """Share of the samples that are missing or spikes, which is worth a look."""
@@ -288,57 +288,40 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
 
 
 def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
-    """List what to look at before the settings are trusted, grouped."""
+    """List what to look at before the settings are trusted: faults, values lost, and channels beyond a bound."""
+    found, names = result.estimate, result.names
     if result.faults:
         spans = [
-            f"{' or '.join(result.names[i] for i in one.channels)} from {one.start:.1f} s to {one.end:.1f} s"
+            f"{' or '.join(names[i] for i in one.channels)} from {one.start:.1f} s to {one.end:.1f} s"
             for one in result.faults
         ]
         words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
-        struck = [result.names[i] for i in sorted({i for span in result.faults for i in span.channels})]
-        yield Finding(Role.WARNING, "declared", words, struck, headline="USABLE, BUT LOOK")
-    samples, lost = result.estimate.blocks.count.sum(), []
-    for why, count in result.unusable.items():
-        if count.any() and (why not in ("missing", "spikes") or count.max() > MANY * samples):
-            why = "frozen" if why == "repeated" else why.replace("_", " ")
-            lost.append(f"{int(count.sum())} {why} ({_who(result, np.flatnonzero(count))})")
+        struck = sorted({i for span in result.faults for i in span.channels})
+        yield Finding(Role.WARNING, "declared", words, [names[i] for i in struck], headline="USABLE, BUT LOOK")
+    lost = [
+        f"{int(count.sum())} {'frozen' if why == 'repeated' else why.replace('_', ' ')}"
+        f" ({'every channel' if count.all() else ', '.join(names[i] for i in np.flatnonzero(count))})"
+        for why, count in result.unusable.items()
+        if count.max() > (MANY * found.blocks.count.sum() if why in ("missing", "spikes") else 0)
+    ]
     if lost:
         yield Finding(Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}")
-    yield from _noisy(result, "in motion", np.median(result.estimate.moment, axis=0), "USABLE, BUT LOOK", unit)
-    yield from _noisy(result, "at rest", result.estimate.floor.std, "", unit)
-    yield from _odd_axes(result)
-    yield from _odd_biases(result, unit)
-
-
-def _who(result: Calibration, places: Int) -> str:
-    return "every channel" if len(places) == len(result.names) else ", ".join(result.names[i] for i in places)
-
-
-def _noisy(result: Calibration, when: str, noise: Array, headline: str, unit: Unit) -> Iterator[Finding]:
-    if noisy := much_noisier(noise, result.units):
-        words = noisier_words(result.names, noise, result.units, unit.name, unit.factor)
-        words += f" {when}: loose, badly isolated, of another make, or faulty"
-        worst, beside = max(noisy, key=lambda one: noise[one[0]])
-        names = [result.names[i] for i, _ in noisy]
-        yield Finding(Role.WARNING, "noise", words, names, float(noise[worst]), None, beside, headline)
-
-
-def _odd_axes(result: Calibration) -> Iterator[Finding]:
-    angle, scale, names = result.angle, result.factor - 1, result.names
-    turned, scaled = np.flatnonzero(angle > LARGE_ANGLE), np.flatnonzero(np.abs(scale) > LARGE_SCALE)
-    off = [f"{names[i]} by {np.degrees(angle[i]):.1f} deg" for i in turned]
-    if off := off + [f"{names[i]} by {scale[i]:+.1%}" for i in scaled]:
-        who = [names[i] for i in np.union1d(turned, scaled)]
-        yield Finding(Role.WARNING, "axes", f"axes off their nominal ones: {', '.join(off)}", who)
-
-
-def _odd_biases(result: Calibration, unit: Unit) -> Iterator[Finding]:
-    found = result.estimate
-    swing = np.ptp(found.curve, axis=0)
-    moving, large = np.flatnonzero(swing > LARGE_SWING), np.flatnonzero(np.abs(found.bias) > LARGE_BIAS)
-    most = f"{swing.max() * unit.factor:.2g} {unit.name}"
-    words = [f"moved within the recording by up to {most} ({_who(result, moving)})"] if len(moving) else []
-    if words := words + [f"{result.names[i]} has {unit.words(found.bias[i], 3)}" for i in large]:
-        who = [result.names[i] for i in np.union1d(moving, large)]
-        said = f"biases: {'; '.join(words)}; bias.fixed is the mean"
-        yield Finding(Role.WARNING, "bias", said, who, float(swing.max()), None, LARGE_SWING)
+    moving = np.median(found.moment, axis=0)
+    for when, noise, headline in (("in motion", moving, "USABLE, BUT LOOK"), ("at rest", found.floor.std, "")):
+        if noisy := much_noisier(noise, result.units):
+            words = noisier_words(names, noise, result.units, unit.name, unit.factor)
+            words += f" {when}: loose, badly isolated, of another make, or faulty"
+            worst, beside = max(noisy, key=lambda one: noise[one[0]])
+            who = [names[i] for i, _ in noisy]
+            yield Finding(Role.WARNING, "noise", words, who, float(noise[worst]), None, beside, headline)
+    rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
+    for what, values, bound, form, factor in (
+        ("axes turned from their nominal ones", result.angle, LARGE_ANGLE, "{:.1f} deg", np.degrees(1.0)),
+        ("scale factors off their nominal ones", result.factor - 1.0, LARGE_SCALE, "{:+.1%}", 1.0),
+        ("biases moved within the recording", swing, LARGE_SWING, rate, unit.factor),
+        ("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
+    ):
+        if len(beyond := np.flatnonzero(np.abs(values) > bound)):
+            words = f"{what}: {', '.join(f'{names[i]} by {form.format(values[i] * factor)}' for i in beyond)}"
+            largest = float(values[np.abs(values).argmax()])
+            yield Finding(Role.WARNING, what, words, [names[i] for i in beyond], largest, None, bound)
