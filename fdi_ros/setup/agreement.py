@@ -220,8 +220,8 @@ LARGEST_SCALE = 3.0
 """Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
-SURELY = 3.0
-"""Standard errors from which a mount is not along axes."""
+SHOWN = 3.0
+"""Standard errors from which what is measured is shown: a delay, or a mount that is not along axes."""
 SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
@@ -322,7 +322,7 @@ def _against(first: Array, unit: Array) -> Mount:
     # Of all signed axes, a mirrored one is never the nearest.
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - found.rotation)))
     off = angle_of(nearest.T @ found.rotation)
-    if off > max(SQUARE, SURELY * doubt):
+    if off > max(SQUARE, SHOWN * doubt):
         words = f"turned by {np.degrees(angle_of(found.rotation)):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(found.rotation, 6), 0.0, error)
     error = max(error, doubt)

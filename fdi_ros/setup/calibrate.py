@@ -25,16 +25,16 @@ from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Kept, Sink, Walk
 from fdi_ros.report.spectrum import Spectrum
-from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, check_agreement
+from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement
 from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
 from fdi_ros.setup.estimate import SCALE_STD, Estimate, Sensors, estimate
-from fdi_ros.setup.result import SHOWN, Calibration, Delay, Span
+from fdi_ros.setup.result import Calibration, Delay, Span
 from fdi_ros.sources import source_of
 
 UNKNOWN_MOUNT = 0.58
 """Of each component of an axis that may point anywhere."""
 UNKNOWN_AXES = 0.1
-"""The same of an array whose axes are found from the motion alone."""
+"""The same of an array whose axes are found from the motion alone; those configured are not if they are off by more."""
 REFERENCE_STD = 1e-6
 """Of channels that are taken for as configured."""
 LEAST_DURATION = 10.0
@@ -188,7 +188,7 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -
     source, axes, scale = source_of(config), nominal.axes.copy(), np.full(nominal.n, SCALE_STD)
     if not source.units:
         found = _axes_from_motion(data, axes, chosen)
-        if np.abs(found - axes).max() > WRONG_AXES:
+        if np.abs(found - axes).max() > UNKNOWN_AXES:
             axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
     scale[chosen] = REFERENCE_STD
     # Channels that belong to no unit are of the first.
@@ -196,12 +196,6 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
     delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
     return Sensors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
-
-
-WRONG_AXES = 0.1
-"""Axes of an array that the motion shows to be off by more than this are not those configured."""
-LITTLE_ROTATION = 0.01
-"""rad/s; motion that shows nothing of axes."""
 
 
 def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
@@ -217,7 +211,7 @@ def _axes_against_others(data: Data, axes: Array, lost: list[int]) -> Array:
     """Axes of channels of unknown mount by the rate that the others show; about what does not turn as they were."""
     means, others = data.slow_rates(), [i for i in range(len(axes)) if i not in lost]
     rate = means[:, others] @ np.linalg.pinv(axes[others]).T
-    weak = max(len(means), 1) * LITTLE_ROTATION**2 * np.eye(3)
+    weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
     return np.asarray(np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T)
 
 

@@ -44,9 +44,9 @@ SCALE_STD = 0.008
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
-SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
-"""s, and share of the rate: what changes less has settled."""
-NEAR_DELAY = 1e-3
+SETTLED = 2e-5
+"""s of delays, and share of the rate of axes: what changes less has settled."""
+NEAR_DELAY = 50 * SETTLED
 """s; delays that move by less are no reason to look for the walk of the biases again."""
 LARGEST_DELAY = PARAMETERS["imus.delays"].high
 """s."""
@@ -167,9 +167,9 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), one.curve_of(found)
         colour = one.colours(axes)
         moved = float(np.abs(late - taken).max())
-        if number > TRUSTING and walk is not None and moved < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
+        if number > TRUSTING and walk is not None and moved < SETTLED and np.abs(scale).max() < SETTLED:
             break
-        if moved > SETTLED_DELAY:
+        if moved > SETTLED:
             taken = late
             blocks = make_blocks(data, taken[sensors.unit])
         # Where the axes are farther off than was supposed, they are not known as well either.

@@ -23,9 +23,10 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.setup.agreement import LEAST_ROTATION
 from fdi_ros.setup.findings import Finding, Role
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
-from fdi_ros.setup.noise_segments import LENGTH
+from fdi_ros.setup.noise_segments import LARGEST_BIAS, LENGTH
 from fdi_ros.sources import SOURCES, Source
 from fdi_ros.system.text import shown
 
@@ -170,13 +171,11 @@ QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)
 """Of the rates of a unit, that are compared with those of another."""
 FEWEST_QUANTILES = 2
 """That must show motion."""
-MOVING = 0.05
-"""rad/s; less may be noise."""
 FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
 """Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
 than so many times the factor of a degree."""
-STILL, NOISIEST, LARGEST_BIAS = 0.3, 0.02, 0.1
-"""Share of a recording that lies still; noise of a sample and mean value there, rad/s, that no gyro at rest has."""
+STILL, NOISIEST = 0.3, 0.02
+"""Share of a recording that lies still; noise of a sample there, rad/s, that no gyro at rest has."""
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
@@ -193,7 +192,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
     rates = [_rate_quantiles(one) for one in chosen]
     for k, fast in enumerate(rates):
         for j, slow in enumerate(rates):
-            moving = (slow > MOVING) & np.isfinite(fast + slow)
+            moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
             factors = fast[moving] / slow[moving]
             if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
                 factor = float(np.median(factors))

@@ -16,11 +16,10 @@ from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 from fdi_ros.report.spectrum import Spectrum
+from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.estimate import SCALE_STD, Estimate
 from fdi_ros.setup.findings import Finding, Role
 
-SHOWN = 3.0
-"""Standard errors from which a delay is shown."""
 UNMEASURED = SCALE_STD / 2
 """Uncertainty of the axes along a direction of the body from which they are not measured."""
 SHOWN_AXES = SCALE_STD / 4

@@ -32,7 +32,7 @@ from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_o
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare_channels
-from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
+from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
 from fdi_ros.setup.fitness import candidates, clocks_apart, copy_words, needs, refuse_degrees
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
@@ -49,9 +49,9 @@ CHANCE = 1
 """Biases fewer isolated are chance."""
 LESS_JUDGED = 0.02
 """Less in the share of samples judged is one at the edge of a gap."""
-KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
-"""Part of a recording that is kept aside, and its bounds, s."""
-LEAST_LEFT = 20.0
+KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0
+"""Part of a recording that is kept aside, and its bounds, s: all biases are to have room."""
+LEAST_LEFT = 2 * LEAST_DURATION
 """s that must be left to calibrate on."""
 
 

@@ -19,6 +19,8 @@ from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config
 from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
+from fdi_ros.setup.agreement import LEAST_WINDOWS, SQUARE, angle_of, find_turn
+from fdi_ros.setup.blocks import WINDOW
 from fdi_ros.setup.fitness import candidates, copy_words, needs
 from fdi_ros.setup.inspect import TopicReport, inspect
 from fdi_ros.sources import input_of
@@ -34,12 +36,6 @@ _TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 """s; that of health.stale_timeout is the same."""
 _BRIDGED = 4.4
 """Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
-_SLOW = 0.1
-"""Means over so many s show how units are turned: beyond vibration, and what units sampled apart differ by."""
-_ENOUGH = 30
-"""Means that it takes."""
-_TURNED = 10.0
-"""deg from which units are not mounted alike: no drawing is off by as much."""
 _EXPLAINED = 0.3
 """A rotation must bring the difference between two units down to this share: what a fault makes of it stays."""
 _SILENT = 3.0
@@ -104,7 +100,7 @@ def assumed_config(path: Path) -> tuple[Config, str]:
 
 def _turned_units(path: Path, config: Config) -> str:
     """Say which units measure the motion of the first one along other axes; empty: none that the motion shows."""
-    size = max(1, round(_SLOW * config.sample_rate))
+    size = max(1, round(WINDOW * config.sample_rate))
     means = [np.zeros((0, 3 * len(config.imus.topics)))]
     with Recording(path) as recording:
         for block in Samples(recording, config, means[0].shape[1]).blocks():
@@ -112,52 +108,50 @@ def _turned_units(path: Path, config: Config) -> str:
             means.append(block.z[: rows * size].reshape(rows, size, block.z.shape[1]).mean(axis=1))
     slow = np.concatenate(means)
     slow = slow[np.isfinite(slow).all(axis=1)]
-    if len(slow) < _ENOUGH:
+    if len(slow) < LEAST_WINDOWS:
         return ""
-    units = np.split(slow - np.median(slow, axis=0), len(config.imus.topics), axis=1)
+    first, *others = np.split(slow - np.median(slow, axis=0), len(config.imus.topics), axis=1)
     turned = []
-    for name, rate in zip(config.imus.names[1:], units[1:], strict=True):
-        # Kabsch: the rotation that maps this unit's rates best to the first unit's.
-        u, _, v = np.linalg.svd(units[0].T @ rate)
-        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
-        angle = math.degrees(math.acos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
-        apart, left = np.std(rate - units[0]), np.std(rate @ rotation.T - units[0])
-        if angle > _TURNED and left < _EXPLAINED * apart:
+    for name, rate in zip(config.imus.names[1:], others, strict=True):
+        rotation = find_turn(first, rate).rotation
+        explained = np.std(rate @ rotation.T - first) < _EXPLAINED * np.std(rate - first)
+        if explained and angle_of(rotation) > SQUARE:
+            angle = math.degrees(angle_of(rotation))
             turned.append(f"{name} is turned by {angle:.0f} deg against {config.imus.names[0]}")
     return ", ".join(turned)
+
+
+Known = dict[str, tuple[Any, str]]
+"""Values of parameters, and remarks on them, by ``section.field``."""
 
 
 def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     """Make a config to start from, of the topics of gyros in a recording."""
     kind = chosen[0].kind
     assert kind is not None
-    noise, source = _noise_setting(chosen)
-    rate = max(report.rate for report in chosen)
+    rate, largest = max(report.rate for report in chosen), max(report.largest for report in chosen)
     at_rest = rate * _REST >= MIN_LEARNED and all(_starts_at_rest(report) for report in chosen)
-    largest = max(report.largest for report in chosen)
-    parameters = {
-        "input": input_of(kind),
-        "sample_rate": float(f"{rate:.4g}"),
-        "noise.noise_std": noise,
-        "noise.scale_std": [0.01],
-        "noise.timing_std": [float(f"{0.05 / chosen[0].rate:.2g}")],
-        "bias.startup_bias_duration": _REST if at_rest else 0.0,
-        "detector.name": PARAMETERS["detector.name"].default,
-        "detector.false_alarms_per_hour": 0.001,
-        "health.max_rate": [_rounded_up(max(*PARAMETERS["health.max_rate"].default, 1.001 * largest))],
-    }
-    remarks = {
-        "noise.noise_std": source,
-        "noise.scale_std": "a guess, for scale factors and axes that are not calibrated",
-        "noise.timing_std": "a guess",
-        "bias.startup_bias_duration": f"the recording is {'' if at_rest else 'not '}at rest at the start",
-        "health.max_rate": "NOT KNOWN: put in what the data sheet says",
+    largest_rate = _rounded_up(max(*PARAMETERS["health.max_rate"].default, 1.001 * largest))
+    guess = "a guess, for scale factors and axes that are not calibrated"
+    known: Known = {
+        "input": (input_of(kind), ""),
+        "sample_rate": (float(f"{rate:.4g}"), ""),
+        "noise.noise_std": _noise_setting(chosen),
+        "noise.scale_std": ([0.01], guess),
+        "noise.timing_std": ([float(f"{0.05 / chosen[0].rate:.2g}")], "a guess"),
+        "bias.startup_bias_duration": (
+            _REST if at_rest else 0.0,
+            f"the recording is {'' if at_rest else 'not '}at rest at the start",
+        ),
+        "detector.name": (PARAMETERS["detector.name"].default, ""),
+        "detector.false_alarms_per_hour": (0.001, ""),
+        "health.max_rate": ([largest_rate], "NOT KNOWN: put in what the data sheet says"),
+        **(_units(chosen, rate) if kind.stamped else _array(chosen[0])),
     }
     if silent := _longer(chosen, _SILENT, 60.0):
-        parameters["health.stale_timeout"] = silent
-        remarks["health.stale_timeout"] = f"the default is {_TIMEOUT:g} s"
-    more, said = _units(chosen, rate) if kind.stamped else _array(chosen[0])
-    return StartingConfig(shown(bag.name), parameters | more, remarks | said)
+        known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
+    parameters = {name: value for name, (value, _) in known.items()}
+    return StartingConfig(shown(bag.name), parameters, {name: words for name, (_, words) in known.items() if words})
 
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
@@ -183,47 +177,43 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
     return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
 
 
-def _units(chosen: Sequence[TopicReport], rate: float) -> tuple[dict[str, Any], dict[str, str]]:
-    """Parameters of three-axis units, and remarks on them; rate in Hz."""
+def _units(chosen: Sequence[TopicReport], rate: float) -> Known:
+    """Parameters of three-axis units; rate in Hz."""
     topics = [report.topic.name for report in chosen]
     numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
-    parameters: dict[str, Any] = {
-        "imus.topics": topics,
-        "imus.names": [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)],
-        "imus.mounts": np.tile(np.eye(3).ravel(), len(chosen)).tolist(),
-        "imus.max_skew": _rounded_up(0.2 / rate),
-    }
-    remarks = {
-        "imus.mounts": "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from"
-        " turns about all axes. With two parallel units a fault is detected and not isolated; turned against each"
-        " other, or three of them, isolate it"
+    names = [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)]
+    known: Known = {
+        "imus.topics": (topics, ""),
+        "imus.names": (names, ""),
+        "imus.mounts": (
+            np.tile(np.eye(3).ravel(), len(chosen)).tolist(),
+            "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
+            " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
+            " three of them, isolate it",
+        ),
+        "imus.max_skew": (_rounded_up(0.2 / rate), ""),
     }
     if numbered:
-        parameters["decision.latch"] = False
-        remarks["decision.latch"] = (
-            "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
-        )
+        words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+        known["decision.latch"] = False, words
     if timeout := _longer(chosen, _BRIDGED, 10.0):
         slowest = min(report.rate for report in chosen)
-        parameters["imus.timeout"] = timeout
-        remarks["imus.timeout"] = (
-            f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s none would be aligned between two"
-        )
-    return parameters, remarks
+        words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s none would be aligned between two"
+        known["imus.timeout"] = timeout, words
+    return known
 
 
-def _array(report: TopicReport) -> tuple[dict[str, Any], dict[str, str]]:
-    """Parameters of an array of channels, and remarks on them."""
-    parameters = {
-        "channels.topic": report.topic.name,
-        "geometry.preset": "cone",
-        "geometry.cone_channels": report.channels,
+def _array(report: TopicReport) -> Known:
+    """Parameters of an array of channels."""
+    words = (
+        "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes, but"
+        " for those of three reference channels: these must be right"
+    )
+    return {
+        "channels.topic": (report.topic.name, ""),
+        "geometry.preset": ("cone", words),
+        "geometry.cone_channels": (report.channels, ""),
     }
-    remarks = {
-        "geometry.preset": "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns"
-        " about all axes, but for those of three reference channels: these must be right"
-    }
-    return parameters, remarks
 
 
 def _starts_at_rest(report: TopicReport) -> bool:
