@@ -21,7 +21,7 @@ import numpy as np
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import WINDOW, Data
 
 LEAST_ROTATION = 0.05
@@ -60,79 +60,61 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
         Naming the unit that turns by another factor or about other axes than most, the channel that does not follow,
         or all among which nothing decides.
     """
-    means, names = data.slow_rates(), nominal.channel_names
-    units = [list(unit) for unit in nominal.units if len(unit) == 3]
-    _check_scales(means, {names[unit[0]].rpartition(".")[0]: unit for unit in units})
-    moving = means
-    if len(means):
-        rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1)
-        moving = means[rate >= LEAST_ROTATION / 2]
-    if len(moving) < LEAST_WINDOWS:
+    means = data.slow_rates()
+    if len(means) < LEAST_WINDOWS:
         return
-    _check_axes(moving, nominal, [unit for unit in units if not {*unit} & {*unknown}])
-    if not unknown:
+    _check_units(means, nominal, unknown)
+    rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1)
+    moving = means[rate >= LEAST_ROTATION / 2]
+    if len(moving) >= LEAST_WINDOWS and not unknown:
         _check_response(moving, nominal)
 
 
-def _majority(agree: Mask) -> Int:
-    """Units that agree with one another by a table (u, u) of pairs: most of them, or the first ones."""
-    return np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-
-
-def _check_scales(means: Array, units: dict[str, list[int]]) -> None:
-    """Refuse units on quite different scales, such as deg/s; the mounts do not matter."""
-    if len(units) < 2 or len(means) < LEAST_WINDOWS:
-        return
-    names, whole = list(units), list(units.values())
-    turning = np.stack([np.linalg.norm(means[:, unit], axis=1) for unit in whole], axis=1)
-    moving = np.median(turning, axis=1) >= LEAST_ROTATION
+def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> None:
+    """Refuse a unit that turns by another factor than most, such as deg/s, or about other axes."""
+    units = [list(unit) for unit in nominal.units if len(unit) == 3 and spans_space(nominal.axes[list(unit)])]
+    turning = np.array([np.linalg.norm(means[:, unit], axis=1) for unit in units])
+    moving = np.median(turning, axis=0) >= LEAST_ROTATION if len(units) > 1 else np.zeros(len(means), dtype=bool)
     if moving.sum() < LEAST_WINDOWS:
         return
-    turning, means = np.maximum(turning[moving], 1e-9), means[moving]
-    ratio = np.median(turning[:, :, None] / turning[:, None, :], axis=0)
+    turning, means = np.maximum(turning[:, moving], 1e-9), means[moving]
+    ratio = np.median(turning[:, None] / turning[None], axis=2)
     # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
-    along = np.sqrt(np.maximum([np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in whole], 1e-18))
+    along = np.sqrt(np.maximum([np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in units], 1e-18))
     least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
-    most = _majority((least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE))
-    if 2 * len(most) <= len(names):
+    alike = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
+    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
+    # Of what is mounted nobody knows how, the axes say nothing.
+    known = [not {*unit} & {*unknown} for unit in units]
+    pairs = itertools.product(range(len(units)), repeat=2)
+    turn = [not (known[k] and known[j]) or _in_common(rates[k], rates[j]) > SHARED for k, j in pairs]
+    agree = alike & np.reshape(turn, alike.shape)
+    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+    if len(most) == len(units):
+        return
+    names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in units]
+    odd = next(k for k in range(len(units)) if k not in most)
+    others = " and ".join(names[k] for k in most)
+    mend = "or name its channels in excluded_channels"
+    if not alike[odd, most].all():
+        if 2 * len(most) > len(units):
+            words = f"{names[odd]} shows {np.median(ratio[odd, most]):.3g} times the rotation that {others} show"
+            raise DisagreementError(f"{words}: mend it {mend}")
         low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
         raise DisagreementError(
             f"{' and '.join(names)} do not show one rotation, and nothing decides which is right:"
             f" {names[high]} shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
         )
-    if len(most) < len(names):
-        odd = next(k for k in range(len(names)) if k not in most)
-        raise DisagreementError(
-            f"{names[odd]} shows {np.median(ratio[odd, most]):.3g} times the rotation that"
-            f" {' and '.join(names[k] for k in most)} show: mend it or name its channels in excluded_channels"
-        )
-
-
-def _check_axes(means: Array, nominal: Geometry, units: list[list[int]]) -> None:
-    """Refuse a unit that turns about other axes than the others, and say how its axes would agree."""
-    whole = [unit for unit in units if spans_space(nominal.axes[unit])]
-    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in whole]
-    if len(whole) < 2:
-        return
-    most = _majority(np.array([[_in_common(a, b) > SHARED for b in rates] for a in rates]))
-    if len(most) == len(whole):
-        return
-    names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in whole]
-    odd = next(k for k in range(len(whole)) if k not in most)
-    others = " and ".join(names[k] for k in most)
     doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
-    true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[whole[odd]].T
-    shares = [_in_common(means[:, whole[odd]], true @ signed.T) for signed in SIGNED_AXES]
-    best, share = SIGNED_AXES[int(np.argmax(shares))], max(shares)
-    if share < SAME:
+    true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
+    shares = [_in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES]
+    if max(shares) < SAME:
         raise DisagreementError(
-            f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): its mount in the config is"
+            f"{names[odd]} does not turn as {others} do ({max(*shares, 0.0):.0%} in common): its mount in the config is"
             f" wrong, it is not on the same body, or its clock is off by seconds{doubt}"
         )
-    raise DisagreementError(
-        f"{names[odd]} {_wrong_axes(best)}, against {others}{doubt}: mend its driver or mount, or name its channels in"
-        " excluded_channels"
-    )
+    wrong = _wrong_axes(SIGNED_AXES[int(np.argmax(shares))])
+    raise DisagreementError(f"{names[odd]} {wrong}, against {others}{doubt}: mend its driver or mount, {mend}")
 
 
 _REVERSED = (
@@ -216,8 +198,6 @@ LARGEST_ERROR = np.radians(2.0)
 """A mount less certain than this, in any direction, is not shown."""
 ROUNDING = 1e-9
 """Share of a rotation, about the axis that sees least of it, that is none."""
-LARGEST_SCALE = 3.0
-"""Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
 SHOWN = 3.0
@@ -299,10 +279,6 @@ def _against(first: Array, unit: Array) -> Mount:
     if most < LEAST_RATE:
         return Mount(f"NOT KNOWN: it does not turn ({most:.2g} rad/s rms)")
     power = max(float((first**2).sum()), 1e-30)
-    scale = math.sqrt(float((unit**2).sum()) / power)
-    if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
-        # Another unit of measurement hides the share that is in common, not the turn.
-        unit = unit / scale
     found = find_turn(first, unit)
     if math.isinf(found.uncertainty):
         return Mount("NOT KNOWN: it and the first unit never turn about two axes together")
