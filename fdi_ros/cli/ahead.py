@@ -23,7 +23,7 @@ from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.estimator.blocks import rests
-from fdi_ros.estimator.error_states import SIGNALS, Layout, find_signals
+from fdi_ros.estimator.error_states import SIGNALS, Layout, fill_signals
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -95,5 +95,5 @@ def warm_verbs() -> None:
         walk(b"")
         list(DataflashReader(io.BytesIO(b"\0"), Damage().add).portions(1))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
-    find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
+    fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
     Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))

@@ -21,7 +21,7 @@ DETECTORS = (
     *("max_residual", "rate_deviation", "mean_square_residual", "mean_abs_residual"),
 )
 """Names of the detectors, as the registry has them: the one that flies first."""
-KINDS = (
+FAULT_KINDS = (
     *("bias", "drift", "scale", "stuck", "dropout", "intermittent", "noise", "spike", "saturation", "sign", "delay"),
     *("oscillation", "triad_loss"),
 )
@@ -69,7 +69,11 @@ def add_part(parser: ArgumentParser) -> None:
 def add_fault(parser: ArgumentParser, meaning: str) -> None:
     """Take faults."""
     parser.add_argument(
-        "--fault", action="append", default=[], metavar="'KEY=VALUE ...'", help=f"{meaning}; kinds: {', '.join(KINDS)}"
+        "--fault",
+        action="append",
+        default=[],
+        metavar="'KEY=VALUE ...'",
+        help=f"{meaning}; kinds: {', '.join(FAULT_KINDS)}",
     )
 
 

@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.compiling.record import MAX_UNITS, Units
-from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Counters, Line, Sample, Unit
+from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Counters, DelayBuffer, Sample, Unit
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
@@ -534,7 +534,7 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
 
 @compiled
 def restamp(
-    line: Line,
+    line: DelayBuffer,
     n: int,
     units: int,
     members: NDArray[np.int64],
@@ -585,7 +585,7 @@ def restamp(
 
 
 @compiled
-def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
+def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
     """Values of some channels at a stamp, into ``out``; return bits of those that there are.
 
     By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.parity import invert
-from fdi_ros.core.records import BIAS_PORTIONS, Bias, Group, Portion, Sensors
+from fdi_ros.core.records import BIAS_PORTIONS, Bias, Portion, Sensors, ValueGroup
 from fdi_ros.model.samples import MAX_RATE, Array
 
 DEFAULT_DURATION = 2_000_000_000
@@ -111,7 +111,7 @@ def f_quantile(probability: float, above: int, below: int) -> float:
 
 
 @compiled
-def take_for_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
+def update_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
     """Take one sample into the average.
 
     Parameters
@@ -144,7 +144,7 @@ def take_for_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: i
     for i in range(sensors.n):
         if good >> i & 1:
             average.count[i] += 1
-            take_value(average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
+            add_value(average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
     return True
 
 
@@ -160,7 +160,7 @@ def begin(average: Bias, n: int, stamp: int) -> None:
 
 
 @compiled
-def take_value(group: Group, portion: Portion, i: int, value: float) -> None:
+def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None:
     """Take a value of channel i; with the last of a group its middle goes to the portion."""
     if group.count == 0:
         group.total = group.squares = 0.0

@@ -18,7 +18,7 @@ import numpy as np
 from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.bank import LARGEST_RATE
-from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, Line, Settings
+from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSettings
 from fdi_ros.model.samples import Array
 
 PERIOD = 1_000_000_000
@@ -40,7 +40,7 @@ LEAST_NOISE = 0.02
 
 
 @compiled
-def update_copies(copies: Copies, settings: Settings, line: Line, stamp: int) -> None:
+def update_copies(copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int) -> None:
     """Compare all pairs of units, once in `PERIOD`; ``copies.found`` is set where one is a copy and was none before."""
     if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
         return
@@ -57,7 +57,7 @@ def update_copies(copies: Copies, settings: Settings, line: Line, stamp: int) ->
 
 
 @compiled
-def is_copy(copies: Copies, settings: Settings, line: Line, a: int, b: int) -> bool:
+def is_copy(copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int) -> bool:
     """Whether one of two units gives what the other gives, or gave some samples ago."""
     first, second = first_of_three(settings.members[a]), first_of_three(settings.members[b])
     if first < 0 or second < 0:
@@ -74,9 +74,11 @@ def is_copy(copies: Copies, settings: Settings, line: Line, a: int, b: int) -> b
 
 
 @compiled
-def agrees(copies: Copies, settings: Settings, line: Line, source: int, target: int, lag: int, wanted: int) -> bool:
+def agrees(
+    copies: Copies, settings: PathSettings, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
+) -> bool:
     """Whether so many changes of the one unit are those of the other, some samples later."""
-    return find_changes(copies, line, source, target, lag, wanted) and is_explained(copies, settings, target, wanted)
+    return sum_changes(copies, line, source, target, lag, wanted) and is_explained(copies, settings, target, wanted)
 
 
 @compiled
@@ -89,7 +91,7 @@ def first_of_three(members: int) -> int:
 
 
 @compiled
-def find_changes(copies: Copies, line: Line, source: int, target: int, lag: int, wanted: int) -> bool:
+def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int) -> bool:
     """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
 
     Of the newest samples, until so many as wanted have changed; what is not received or out of range is no evidence.
@@ -117,7 +119,7 @@ def find_changes(copies: Copies, line: Line, source: int, target: int, lag: int,
             products[i, j] = 0.0
     newest, oldest = line.count - 1, max(line.count - RESTAMP_SAMPLES, 0)
     for k in range(newest, max(newest - 2 * wanted, oldest + lag + 1), -1):
-        if not (find_change(line, source, k - lag, change, 0) and find_change(line, target, k, change, 3)):
+        if not (fill_change(line, source, k - lag, change, 0) and fill_change(line, target, k, change, 3)):
             continue
         count += change[3] != 0.0 or change[4] != 0.0 or change[5] != 0.0
         for i in range(6):
@@ -129,7 +131,7 @@ def find_changes(copies: Copies, line: Line, source: int, target: int, lag: int,
 
 
 @compiled
-def find_change(line: Line, first: int, k: int, out: Array, place: int) -> bool:
+def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -> bool:
     """Second differences of three channels up to sample k, into three places of ``out``; return whether all are there.
 
     What is not finite or out of range is no evidence.
@@ -145,7 +147,7 @@ def find_change(line: Line, first: int, k: int, out: Array, place: int) -> bool:
 
 
 @compiled
-def is_explained(copies: Copies, settings: Settings, target: int, count: int) -> bool:
+def is_explained(copies: Copies, settings: PathSettings, target: int, count: int) -> bool:
     """Whether a linear map of the changes of one unit gives those of the other, ``count`` of them, and these are noise.
 
     The products of both are reduced by those of the first, one channel after the other: what is left is unexplained.
@@ -175,7 +177,7 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
     Of series of different lengths the last values are compared.
     """
     found = []
-    line, copies, settings = allocate(Line), allocate(Copies), allocate(Settings)
+    line, copies, settings = allocate(DelayBuffer), allocate(Copies), allocate(PathSettings)
     settings["members"][0, :2] = 0b111, 0b111000
     rows = line["rows"][0]
     for a, b in itertools.combinations(range(len(series)), 2):

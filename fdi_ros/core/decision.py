@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.health import INTERMITTENT_SHARE, add_stuck, find_intermittent, find_stuck
-from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, Settings
+from fdi_ros.core.health import INTERMITTENT_SHARE, add_stuck, intermittent_channels, update_stuck
+from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, PathSettings
 from fdi_ros.core.states import NON_FINITE_LASTING
 from fdi_ros.model.samples import MAX_RATE
 
@@ -32,7 +32,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     n, now, evidence = core.settings.n, core.now, core.now.evidence
     limits, health = core.settings.health, core.health
     evidence.judged = not math.isnan(now.verdict.statistic)
-    evidence.checked = subsets[now.fed_mask].detectable if evidence.judged else 0
+    evidence.checked = subsets[now.input_mask].detectable if evidence.judged else 0
     if core.settings.estimates:
         evidence.checked &= core.estimate.checked
     evidence.held = core.known.held
@@ -44,15 +44,15 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             evidence.repeats |= 1 << i
         if not now.verdict.suspects[i]:
             clear |= 1 << i
-        evidence.error[i] = now.z[i] - now.along[i]
-    evidence.intermittent = find_intermittent(health, n, INTERMITTENT_SHARE)
-    find_agreement(core)
+        evidence.error[i] = now.corrected[i] - now.along[i]
+    evidence.intermittent = intermittent_channels(health, n, INTERMITTENT_SHARE)
+    update_agreement(core)
     clear &= now.usable
-    return find_stuck(core, subsets[clear], clear, evidence.stamp)
+    return update_stuck(core, subsets[clear], clear, evidence.stamp)
 
 
 @compiled
-def find_agreement(core: Core) -> None:
+def update_agreement(core: Core) -> None:
     """Which channels agree with the others, where one that was declared may return."""
     core.now.evidence.agrees = 0
     if core.settings.decision.latch or not core.decision.faulty:
@@ -67,7 +67,7 @@ def find_agreement(core: Core) -> None:
 
 
 @compiled
-def find_suspects(core: Core, n: int, stuck: int) -> None:
+def fill_suspects(core: Core, n: int, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
     evidence, verdict = core.now.evidence, core.now.verdict
     evidence.certain = evidence.undecided = 0
@@ -81,7 +81,7 @@ def find_suspects(core: Core, n: int, stuck: int) -> None:
             evidence.certain = suspects
         else:
             evidence.undecided = suspects
-    find_drifted(core.settings, core.estimate, core.now)
+    update_drifted(core.settings, core.estimate, core.now)
     evidence.certain |= evidence.drifted
     add_stuck(core.settings, core.now, stuck)
     for i in range(n):
@@ -93,13 +93,13 @@ def find_suspects(core: Core, n: int, stuck: int) -> None:
 
 
 @compiled
-def find_drifted(settings: Settings, estimate: Estimate, now: Current) -> None:
+def update_drifted(settings: PathSettings, estimate: Estimate, now: Current) -> None:
     """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
     now.evidence.drifted = 0
     if settings.estimates and settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
-            if now.fed_mask >> i & 1 and bias > settings.max_drift:
+            if now.input_mask >> i & 1 and bias > settings.max_drift:
                 now.evidence.drifted |= 1 << i
                 now.verdict.suspects[i] = True
                 now.verdict.error[i] = estimate.bias[i]
@@ -116,7 +116,7 @@ def bits_of(flags: NDArray[np.uint8], n: int) -> int:
 
 
 @compiled
-def units_of(settings: Settings, channels: int) -> int:
+def units_of(settings: PathSettings, channels: int) -> int:
     """Set of all channels of the units that these are of."""
     members, mask = settings.members, 0
     for u in range(settings.units):
@@ -163,7 +163,7 @@ def decide(limits: DecisionSettings, decision: Decision, n: int, evidence: Evide
     follow_declared(limits, decision, n, evidence)
     returns, clears = 0, False
     if not limits.latch:
-        returns = find_returns(limits, decision, n, evidence.stamp)
+        returns = update_returns(limits, decision, n, evidence.stamp)
         clears = decision.ambiguous != 0 and evidence.stamp - decision.last_doubt >= limits.clean_time
     # A set of which a member is now known to be faulty is explained by it.
     if clears or decision.ambiguous & (faulty | broken):
@@ -265,7 +265,7 @@ def follow_declared(limits: DecisionSettings, decision: Decision, n: int, eviden
 
 
 @compiled
-def find_returns(limits: DecisionSettings, decision: Decision, n: int, stamp: int) -> int:
+def update_returns(limits: DecisionSettings, decision: Decision, n: int, stamp: int) -> int:
     """Bits of the declared channels that have agreed for the clean time.
 
     A small fault agrees sample by sample. So the mean is of the last one or two clean times: of what was before it is

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import Symmetric, Vector
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.health import stands
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
-from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Settings, Subset
+from fdi_ros.core.health import is_at_rest
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_weights, covariance_of, eliminate_rate
+from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, PathSettings, Subset
 from fdi_ros.core.rivals import cover_rivals
-from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
+from fdi_ros.core.subsets import fill_growth, fill_level, fill_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
 
@@ -30,17 +30,17 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     """
     settings, last, now = core.settings, core.last, core.now
     n = settings.n
-    now.fused = find_trusted(settings, core.health, now, subsets, doubtful)
+    now.fused = choose_fused(settings, core.health, now, subsets, doubtful)
     subset = subsets[now.fused]
-    find_rate(subset, n, now.fused, now.z, now.plain_rate)
+    fill_rate(subset, n, now.fused, now.corrected, now.plain_rate)
     last.valid = not math.isnan(now.plain_rate[0])
-    find_gain(settings, core.estimate, core.acceleration, now, subset)
+    update_gain(settings, core.estimate, core.acceleration, now, subset)
     for a in range(3):
         last.rate[a] = now.plain_rate[a]
     if last.valid and settings.estimates:
-        apply_gain(now.gain, n, now.z, last.rate)
-    find_residuals(settings, now, last)
-    find_lagging(core)
+        apply_gain(now.gain, n, now.corrected, last.rate)
+    update_residuals(settings, now, last)
+    update_lag(core)
     if last.valid:
         covariance_of(now.gain, n, now.variance, core.estimate.covariance, last.covariance)
         if doubtful & now.usable:
@@ -50,14 +50,14 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         for a in range(3):
             now.others_rate[a] = core.estimate.spread * core.acceleration.value[a]
         add_square(last.covariance, now.others_rate, 1.0 / 12.0)
-        find_common(core)
+        update_common_error(core)
     else:
         for k in range(6):
             last.covariance[k] = math.nan
 
 
 @compiled
-def find_lagging(core: Core) -> None:
+def update_lag(core: Core) -> None:
     """Find the instant that the rate is of, and by how much the rate has changed up to it where that has to wait.
 
     Where units are late the values are of an instant before the stamp. Those of the samples only ever go forwards: when
@@ -70,7 +70,7 @@ def find_lagging(core: Core) -> None:
 
 
 @compiled
-def find_trusted(settings: Settings, health: Health, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
+def choose_fused(settings: PathSettings, health: Health, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
     """Channels that are to be fused."""
     usable = now.usable
     # Methods that judge each sample by itself need no caution.
@@ -85,14 +85,14 @@ def find_trusted(settings: Settings, health: Health, now: Current, subsets: NDAr
             trusted = usable
         if doubtful & trusted and not settings.publish_under_doubt:
             now.withheld, trusted = True, 0
-    if now.all_repeat and not stands(settings, now):
+    if now.all_repeat and not is_at_rest(settings, now):
         # A vehicle that turns does not give the same bits twice: what is repeated is old.
         now.withheld, trusted = True, 0
     return trusted
 
 
 @compiled
-def find_residuals(settings: Settings, now: Current, last: OutputRow) -> None:
+def update_residuals(settings: PathSettings, now: Current, last: OutputRow) -> None:
     """Differences of the channels from the fused rate, and from that with weights as expected."""
     axes = settings.sensors.axes
     for i in range(settings.n):
@@ -100,13 +100,15 @@ def find_residuals(settings: Settings, now: Current, last: OutputRow) -> None:
         for a in range(3):
             along += axes[i, a] * last.rate[a]
             tested += axes[i, a] * now.plain_rate[a]
-        known = math.isfinite(now.z[i])
-        last.residual[i] = now.z[i] - along if known else math.nan
-        now.tested[i] = now.z[i] - tested if known else math.nan
+        known = math.isfinite(now.corrected[i])
+        last.residual[i] = now.corrected[i] - along if known else math.nan
+        now.tested[i] = now.corrected[i] - tested if known else math.nan
 
 
 @compiled
-def find_gain(settings: Settings, estimate: Estimate, acceleration: Acceleration, now: Current, subset: Subset) -> None:
+def update_gain(
+    settings: PathSettings, estimate: Estimate, acceleration: Acceleration, now: Current, subset: Subset
+) -> None:
     """Variance of every channel, and the gain of the channels fused."""
     n, sensors = settings.n, settings.sensors
     for i in range(n):
@@ -120,7 +122,7 @@ def find_gain(settings: Settings, estimate: Estimate, acceleration: Acceleration
         for a in range(3):
             now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
     if settings.estimates and subset.spans:
-        weigh_each(now.parity, n, now.fused, now.uncertainty)
+        compute_weights(now.parity, n, now.fused, now.uncertainty)
         eliminate_rate(now.parity, n, sensors.axes, UNKNOWN_RATE)
         for a in range(3):
             for i in range(n):
@@ -149,7 +151,7 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 
 @compiled
-def add_units(settings: Settings, now: Current, last: OutputRow, subsets: NDArray[Any], doubtful: int) -> None:
+def add_units(settings: PathSettings, now: Current, last: OutputRow, subsets: NDArray[Any], doubtful: int) -> None:
     """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
     whole = 0
     for u in range(settings.units):
@@ -157,14 +159,14 @@ def add_units(settings: Settings, now: Current, last: OutputRow, subsets: NDArra
     for u in range(settings.units if whole else 0):
         if is_doubted(settings, now, subsets, doubtful, u):
             rest = now.usable & ~settings.members[u]
-            find_rate(subsets[rest], settings.n, rest, now.z, now.others_rate)
+            fill_rate(subsets[rest], settings.n, rest, now.corrected, now.others_rate)
             for a in range(3):
                 now.others_rate[a] -= last.rate[a]
             add_square(last.covariance, now.others_rate, 1.0 / whole)
 
 
 @compiled
-def is_doubted(settings: Settings, now: Current, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
+def is_doubted(settings: PathSettings, now: Current, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
     """Whether a unit is in doubt as a whole, and there is a rate without it."""
     inside = now.usable & settings.members[unit]
     return inside != 0 and not inside & ~doubtful and subsets[now.usable & ~inside].spans != 0
@@ -181,7 +183,7 @@ def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
 
 
 @compiled
-def find_common(core: Core) -> None:
+def update_common_error(core: Core) -> None:
     """Split what is not known of the errors into what passes for rate, and what shows in the residuals.
 
     With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G) C (I - H G)'`` the roots of the
@@ -213,7 +215,7 @@ def find_common(core: Core) -> None:
 
 
 @compiled
-def find_level(core: Core, subsets: NDArray[Any]) -> None:
+def update_level(core: Core, subsets: NDArray[Any]) -> None:
     """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
 
     It is for the errors that this sample may have, in its own motion: that of the rate with weights as expected, by how
@@ -225,8 +227,8 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused
     core.wanted = now.fused if passes and not subset.has_level else 0
     n, sensors = core.settings.n, core.settings.sensors
-    find_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
-    find_level_of(subset, n, now.fused, now.growth, last.level)
+    fill_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
+    fill_level(subset, n, now.fused, now.growth, last.level)
     if not passes or not passes_test(subset, sensors.axes, sensors.noise_std, n, now.fused, now.growth, now.tested):
         for a in range(3):
             last.level[a] = math.inf

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.records import Core, Current, Health, HealthSettings, Settings, Subset
+from fdi_ros.core.records import Core, Current, Health, HealthSettings, PathSettings, Subset
 from fdi_ros.core.states import FINE, FROZEN, MISSING, NON_FINITE, NON_FINITE_LASTING, OUT_OF_RANGE, SILENT
-from fdi_ros.core.subsets import find_rate
+from fdi_ros.core.subsets import fill_rate
 
 NOT_BAD = -(1 << 62)
 """Instead of the stamp at which a run of non-finite values began."""
@@ -46,7 +46,7 @@ def check(
             health.bad_stamp[i] = NOT_BAD
     health.begun += 1
     follow_presence(health, n, stamp, received)
-    take_given(limits, health, n, stamp, z, received)
+    update_received(limits, health, n, stamp, z, received)
     for i in range(n):
         condition = health.condition[i]
         if condition == FINE and limits.frozen_time and stamp - health.run_stamp[i] >= limits.frozen_time:
@@ -60,7 +60,7 @@ def check(
 
 
 @compiled
-def take_given(
+def update_received(
     limits: HealthSettings, health: Health, n: int, stamp: int, z: NDArray[np.float64], received: NDArray[np.uint8]
 ) -> None:
     """Remember the values that were received; ``health.condition``: what each is by itself, or that there is none."""
@@ -108,9 +108,9 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
 
     What is not received has other reasons: a link that loses messages, a unit that is slower than the others.
     """
-    pace = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
-    health.gone[i] += pace * ((0.0 if finite else 1.0) - health.gone[i])
-    health.leaves[i] *= 1.0 - pace
+    adaptation_gain = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
+    health.gone[i] += adaptation_gain * ((0.0 if finite else 1.0) - health.gone[i])
+    health.leaves[i] *= 1.0 - adaptation_gain
     health.returning[i] = max(health.returning[i] - 1, 0) if finite else RETURNING
     if not finite and health.bad_stamp[i] == NOT_BAD:
         health.leaves[i] += 1.0
@@ -127,13 +127,13 @@ def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uin
 
     That is no fault of the channel: a link loses messages, a unit gives fewer of them.
     """
-    pace = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
+    adaptation_gain = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     for i in range(n):
         if health.begun == 1:
             # Nothing is known of it.
             health.absent[i], health.complete_stamp[i] = 1.0, stamp
-        health.absent[i] += pace * ((0.0 if received[i] else 1.0) - health.absent[i])
-        health.lapses[i] *= 1.0 - pace
+        health.absent[i] += adaptation_gain * ((0.0 if received[i] else 1.0) - health.absent[i])
+        health.lapses[i] *= 1.0 - adaptation_gain
         if not received[i] and health.received_stamp[i] == health.stamp:
             health.lapses[i] += 1.0
         if health.absent[i] > COMPLETE_SHARE:
@@ -144,7 +144,7 @@ def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uin
 
 
 @compiled
-def find_sparse(health: Health, n: int) -> int:
+def sparse_channels(health: Health, n: int) -> int:
     """Bits of the channels that were complete, and now go away again and again."""
     found = 0
     for i in range(n):
@@ -154,7 +154,7 @@ def find_sparse(health: Health, n: int) -> int:
 
 
 @compiled
-def find_intermittent(health: Health, n: int, share: float) -> int:
+def intermittent_channels(health: Health, n: int, share: float) -> int:
     """Bits of the channels of whose values at least a share comes and goes."""
     found = 0
     for i in range(n):
@@ -182,7 +182,7 @@ LEAST_SENSITIVITY = 1e-3
 
 
 @compiled
-def leave_one_out(settings: Settings, now: Current, subset: Subset) -> None:
+def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
     """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
 
     In ``now.prediction``, rad/s, from the rate in ``now.others_rate``; NaN where there is none.
@@ -192,14 +192,14 @@ def leave_one_out(settings: Settings, now: Current, subset: Subset) -> None:
         along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         share = subset.sensitivity[i]
         if share > LEAST_SENSITIVITY:
-            residual = now.fed[i] - along
+            residual = now.input[i] - along
             now.prediction[i] = along + residual - residual / share
         else:
             now.prediction[i] = along if share == 0 else math.nan
 
 
 @compiled
-def largest_step(settings: Settings, health: Health, now: Current) -> float:
+def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
     """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
     step = 0.0
     for i in range(settings.n):
@@ -209,11 +209,11 @@ def largest_step(settings: Settings, health: Health, now: Current) -> float:
 
 
 @compiled
-def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
+def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
     n, now, stuck = core.settings.n, core.now, 0
     # Of values as they came: what is newly known of the errors is no motion.
-    find_rate(subset, n, mask, now.fed, now.others_rate)
+    fill_rate(subset, n, mask, now.input, now.others_rate)
     leave_one_out(core.settings, now, subset)
     step = largest_step(core.settings, core.health, now)
     for i in range(n):
@@ -232,7 +232,7 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
 
 
 @compiled
-def add_stuck(settings: Settings, now: Current, evidence: int) -> None:
+def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
     """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
     verdict = now.verdict
     if evidence and not verdict.alarm:
@@ -241,14 +241,14 @@ def add_stuck(settings: Settings, now: Current, evidence: int) -> None:
         if evidence >> i & 1:
             verdict.suspects[i] = True
             if verdict.error[i] == 0:
-                verdict.error[i] = now.z[i] - now.along[i]
+                verdict.error[i] = now.corrected[i] - now.along[i]
 
 
 @compiled
 def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
     """Leave channels whose values seem to come and go out of the sample, where enough are left."""
     now, n = core.now, core.settings.n
-    now.evidence.flickers = find_intermittent(core.health, n, DOUBTED_SHARE) | find_sparse(core.health, n)
+    now.evidence.flickers = intermittent_channels(core.health, n, DOUBTED_SHARE) | sparse_channels(core.health, n)
     for i in range(n):
         rest = now.usable & ~(now.evidence.flickers & 1 << i)
         if subsets[rest].spare:
@@ -256,7 +256,7 @@ def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
 
 
 @compiled
-def find_repeated(core: Core) -> int:
+def update_repeated(core: Core) -> int:
     """Channels of the units that give all their values again while the others have measured motion.
 
     The values are old, and no evidence about any single channel.
@@ -282,7 +282,7 @@ def find_repeated(core: Core) -> int:
 
 
 @compiled
-def stands(settings: Settings, now: Current) -> bool:
+def is_at_rest(settings: PathSettings, now: Current) -> bool:
     """Whether the rate of the channels in use is that of a vehicle at rest."""
     square = now.rate[0] * now.rate[0] + now.rate[1] * now.rate[1] + now.rate[2] * now.rate[2]
     noise = 0.0
@@ -292,7 +292,7 @@ def stands(settings: Settings, now: Current) -> bool:
 
 
 @compiled
-def all_repeat(settings: Settings, health: Health, now: Current, stamp: int) -> bool:
+def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int) -> bool:
     """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
@@ -302,7 +302,7 @@ def all_repeat(settings: Settings, health: Health, now: Current, stamp: int) -> 
         noise = max(noise, settings.sensors.noise_std[i])
     # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
-    if not now.usable or (coarse and stands(settings, now)):
+    if not now.usable or (coarse and is_at_rest(settings, now)):
         return False
     fresh, least = 0, max(ALL_REPEAT, settings.health.stuck_time) if coarse else ALL_REPEAT
     for i in range(settings.n):

@@ -87,7 +87,7 @@ def list_channels(parity: Parity, n: int, mask: int) -> int:
 
 
 @compiled
-def weigh_each(parity: Parity, n: int, mask: int, variance: Array) -> None:
+def compute_weights(parity: Parity, n: int, mask: int, variance: Array) -> None:
     """W of independent errors of the given variances (n,), (rad/s)^2."""
     for i in range(n):
         for j in range(n):
@@ -97,7 +97,7 @@ def weigh_each(parity: Parity, n: int, mask: int, variance: Array) -> None:
 
 
 @compiled
-def weigh_together(parity: Parity, n: int, mask: int, covariance: Array) -> None:
+def compute_joint_weights(parity: Parity, n: int, mask: int, covariance: Array) -> None:
     """W of errors of the given covariance (n, n), (rad/s)^2."""
     count = list_channels(parity, n, mask)
     for p in range(count):
@@ -116,7 +116,7 @@ def weigh_together(parity: Parity, n: int, mask: int, covariance: Array) -> None
 
 
 @compiled
-def find_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
+def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out W H, and of ``H' W H + K`` the lower triangle."""
     for i in range(n):
         for a in range(3):
@@ -135,7 +135,7 @@ def find_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
 @compiled
 def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
-    find_normal(parity, n, axes, known)
+    update_normal(parity, n, axes, known)
     invert(parity.normal, 3, parity.inverse)
     for a in range(3):
         for i in range(n):

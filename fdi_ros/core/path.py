@@ -9,8 +9,8 @@
 constants of the detector for just the channels present are still to be prepared, which happens once for each set of
 channels.
 
-Each kind of input has a compiled `take` of its own (`fdi_ros.sources`), made of its reading and `take_stamped` or
-`take_arrived`. The samples that are complete then go through `work`.
+Each kind of input has a compiled `take` of its own (`fdi_ros.sources`), made of its reading and `receive_stamped` or
+`receive_arrived`. The samples that are complete then go through `process`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.alignment import enter, next_sample, restamp
 from fdi_ros.core.bank import judge_sample
-from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
+from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, update_bias
 from fdi_ros.core.copies import update_copies
-from fdi_ros.core.decision import CHECKED, at_least, decide, find_suspects, forget_kind, gather_evidence
-from fdi_ros.core.fusion import find_level, fuse
-from fdi_ros.core.health import all_repeat, check, find_repeated, leave_flickering
+from fdi_ros.core.decision import CHECKED, at_least, decide, fill_suspects, forget_kind, gather_evidence
+from fdi_ros.core.fusion import fuse, update_level
+from fdi_ros.core.health import all_repeat, check, leave_flickering, update_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
-from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, Sample, Settings
-from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, find_states, left_out, out_of_use, write_events
-from fdi_ros.core.subsets import differentiate_rate, find_rate
+from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, PathSettings, Sample
+from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, left_out, out_of_use, update_states, write_events
+from fdi_ros.core.subsets import differentiate_rate, fill_rate
 from fdi_ros.model.samples import Array, Bytes
 
 NOISY, NOISIER = 3.0, 1.4
@@ -80,7 +80,7 @@ def run(
     Returns
     -------
     The row at which work ended, N if all is done; the number of events; and whether something must be prepared. If it
-    is the detector, for ``now.fed_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
+    is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
     lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
     monitor, count = core[0], 0
@@ -113,13 +113,13 @@ def step(
 
     Returns
     -------
-    The number of events; `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.fed_mask``:
+    The number of events; `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.input_mask``:
     then the same sample is to be given again.
     """
     now = core.now
     if not now.waiting:
         prepare_sample(core, bank, memory, subsets, sample)
-    now.waiting = not now.learned_from and not judge_sample(bank, now.fed_mask, now.fed, core.known, now.verdict)
+    now.waiting = not now.learned_from and not judge_sample(bank, now.input_mask, now.input, core.known, now.verdict)
     return WAITING if now.waiting else conclude_sample(core, bank, memory, subsets, row, events, count)
 
 
@@ -147,7 +147,7 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     update_copies(core.copies, settings, core.line, stamp)
     now.learned_from = False
     if core.bias.learning:
-        learn_bias(core, bank, memory, stamp, now.moved, plain)
+        learn_bias(core, bank, memory, stamp, now.aligned, plain)
     if now.learned_from:
         return
     out = out_of_use(core)
@@ -155,16 +155,16 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     now.usable = now.in_use & fine
     leave_flickering(core, subsets)
     correct_values(core)
-    find_rate(subsets[now.in_use], settings.n, now.in_use, now.z, now.rate)
-    feed(core, out)
+    fill_rate(subsets[now.in_use], settings.n, now.in_use, now.corrected, now.rate)
+    fill_input(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, now.evidence.interrupted
-    core.known.beyond = now.fed_mask & ~now.usable
+    core.known.beyond = now.input_mask & ~now.usable
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
-    now.repeated = find_repeated(core) if settings.estimates else 0
+    now.repeated = update_repeated(core) if settings.estimates else 0
     core.known.repeated = now.repeated != 0
     now.all_repeat = settings.estimates and all_repeat(core.settings, core.health, now, stamp)
     if now.all_repeat:
-        now.fed_mask = 0
+        now.input_mask = 0
     if settings.needs_acceleration:
         differentiate_rate(core.acceleration, stamp, now.rate)
         for a in range(3):
@@ -173,7 +173,7 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
 
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
-    """Values of one instant, into ``now.moved``; return bits of those there are and in range, and of those well."""
+    """Values of one instant, into ``now.aligned``; return bits of those there are and in range, and of those well."""
     settings, n, late = core.settings, core.settings.n, core.estimate.late
     delivered = inside = plain = fine = 0
     for i in range(n):
@@ -184,10 +184,19 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(
-        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, inside, core.now.moved
+        core.line,
+        n,
+        settings.units,
+        settings.members,
+        late,
+        sample.stamp,
+        sample.z,
+        delivered,
+        inside,
+        core.now.aligned,
     )
     for i in range(n):
-        if delivered >> i & 1 and abs(core.now.moved[i]) < settings.health.max_rate[i]:
+        if delivered >> i & 1 and abs(core.now.aligned[i]) < settings.health.max_rate[i]:
             plain |= 1 << i
     return plain, fine
 
@@ -196,7 +205,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z: Array, plain: int) -> None:
     """Take a sample for the bias, if it is still being learned; whether it was taken is in ``now.learned_from``."""
     settings, bias = core.settings, core.bias
-    core.now.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, left_out(core))
+    core.now.learned_from = update_bias(bias, settings.sensors, stamp, z, plain, left_out(core))
     if settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
         begin_in_motion(bias, settings.n)
     if not bias.learning:
@@ -206,14 +215,14 @@ def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z:
 
 @compiled
 def correct_values(core: Core) -> None:
-    """Values less what was known of their errors at the last sample, in ``now.z``."""
+    """Values less what was known of their errors at the last sample, in ``now.corrected``."""
     for i in range(core.settings.n):
-        core.now.z[i] = core.now.moved[i] - core.bias.value[i] - core.correction[i]
+        core.now.corrected[i] = core.now.aligned[i] - core.bias.value[i] - core.correction[i]
 
 
 @compiled
-def take_estimate(core: Core, bank: Bank) -> None:
-    """Take over what the detector has found of the errors of the sensors, and correct ``now.z`` anew by it."""
+def apply_estimate(core: Core, bank: Bank) -> None:
+    """Take over what the detector has found of the errors of the sensors, and correct ``now.corrected`` anew by it."""
     n, estimate = core.settings.n, bank.sample.estimate
     core.estimate.known, core.estimate.checked = estimate.known, estimate.checked
     core.estimate.behind, core.estimate.spread = estimate.behind, estimate.spread
@@ -224,16 +233,16 @@ def take_estimate(core: Core, bank: Bank) -> None:
         core.estimate.bias[i], core.estimate.bias_std[i] = estimate.bias[i], estimate.bias_std[i]
         for j in range(n):
             core.estimate.covariance[i, j] = estimate.covariance[i, j]
-        if math.isfinite(core.now.fed[i]):
-            core.now.z[i] = estimate.corrected[i]
+        if math.isfinite(core.now.input[i]):
+            core.now.corrected[i] = estimate.corrected[i]
             if core.now.usable >> i & 1:
-                core.correction[i] = core.now.moved[i] - core.bias.value[i] - core.now.z[i]
+                core.correction[i] = core.now.aligned[i] - core.bias.value[i] - core.now.corrected[i]
     for u in range(core.settings.units):
         core.estimate.late[u] = estimate.late[u]
 
 
 @compiled
-def find_noisy(settings: Settings, now: Current) -> None:
+def update_noisy(settings: PathSettings, now: Current) -> None:
     """Find channels that are much noisier than expected, and than all others but those they cannot be told from."""
     n, noise, sensors = settings.n, now.verdict.noise, settings.sensors
     now.noisy = 0
@@ -266,7 +275,7 @@ def begin_bias(core: Core, n: int) -> None:
 
 
 @compiled
-def feed(core: Core, out: int) -> None:
+def fill_input(core: Core, out: int) -> None:
     """Find the rate along each axis, and choose what the detector sees.
 
     It sees usable values, and those out of range that no manoeuvre explains.
@@ -274,15 +283,15 @@ def feed(core: Core, out: int) -> None:
     the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
     """
     now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
-    now.fed_mask = now.usable
+    now.input_mask = now.usable
     for i in range(core.settings.n):
         now.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
-        now.fed[i] = now.moved[i] - core.bias.value[i]
-        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(now.moved[i]):
+        now.input[i] = now.aligned[i] - core.bias.value[i]
+        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(now.aligned[i]):
             limit = core.settings.health.max_rate[i]
             if abs(now.along[i]) < RAIL_MARGIN * limit:
-                now.fed[i] = min(max(now.fed[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
-                now.fed_mask |= 1 << i
+                now.input[i] = min(max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
+                now.input_mask |= 1 << i
             else:
                 core.saturated, core.saturated_stamp = True, now.evidence.stamp
 
@@ -304,10 +313,10 @@ def conclude_sample(
         skip_sample(core, n)
         return write_events(core, subsets[alive(core)], row, True, events, count)
     if core.settings.estimates:
-        take_estimate(core, bank)
-        find_noisy(core.settings, now)
+        apply_estimate(core, bank)
+        update_noisy(core.settings, now)
     stuck = gather_evidence(core, subsets)
-    find_suspects(core, n, stuck)
+    fill_suspects(core, n, stuck)
     before = core.decision.ambiguous
     changed = decide(core.settings.decision, core.decision, n, now.evidence)
     # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too
@@ -321,10 +330,10 @@ def conclude_sample(
         forget(bank, memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
-    find_states(core, checked, 0 if changed else core.decision.suspicion, False)
+    update_states(core, checked, 0 if changed else core.decision.suspicion, False)
     verdict = now.verdict
     last.statistic, last.threshold, last.alarm = verdict.statistic, verdict.threshold, verdict.alarm
-    find_level(core, subsets)
+    update_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
 
 
@@ -335,7 +344,7 @@ def skip_sample(core: Core, n: int) -> None:
     forget_kind(core.decision, core.settings.decision, n, CHECKED)
     for i in range(n):
         core.reference[i] = last.residual[i] = math.nan
-    find_states(core, 0, 0, True)
+    update_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
     for a in range(3):
         last.rate[a], last.level[a] = math.nan, math.inf
@@ -358,7 +367,7 @@ STEP_BACK = 100_000_000
 
 
 @compiled
-def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) -> int:
+def receive_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) -> int:
     """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
 
     What is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
@@ -393,7 +402,7 @@ def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) 
 
 
 @compiled
-def take_arrived(live: Live, code: int, stamp: int) -> int:
+def receive_arrived(live: Live, code: int, stamp: int) -> int:
     """Take what was read of a message of all channels, their values into `live.sample.z`; return `MALFORMED` or `MORE`.
 
     Parameters
@@ -426,7 +435,7 @@ def take_arrived(live: Live, code: int, stamp: int) -> int:
 
 
 @compiled
-def work(
+def process(
     core: NDArray[Any],
     bank: NDArray[Any],
     memory: Bytes,
@@ -462,15 +471,15 @@ def work(
     if count < 0:
         return SUPPLY | MORE
     monitor.events = count
-    told = WORKED | HAS_EVENTS if count > 0 else WORKED
+    flags = WORKED | HAS_EVENTS if count > 0 else WORKED
     if main.last.valid:
         fill_imu(fused, monitor.fused_at, main.last.instant - sample.shift, main.last.rate, main.last.covariance)
-        told |= HAS_RATE
+        flags |= HAS_RATE
     else:
         monitor.without_rate += 1
     if main.wanted or main.copies.found:
-        told |= SUPPLY
+        flags |= SUPPLY
     fill_integrity(integrity, monitor.integrity_at, main.last, main.settings.n)
     monitor.shift = sample.shift
     monitor.ready = next_sample(aligner[0], sample)
-    return told | MORE if monitor.ready else told
+    return flags | MORE if monitor.ready else flags

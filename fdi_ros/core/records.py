@@ -3,7 +3,7 @@
 
 """Every record of the sample path, in the order of a sample; `Core` is what one monitor has and remembers.
 
-What the settings give stands in records of their own (`Settings`, `HealthSettings`, `DecisionSettings`), and so does
+What the settings give stands in records of their own (`PathSettings`, `HealthSettings`, `DecisionSettings`). So does
 what is only of the sample on its way (`Current`); most of the rest is memory. Methods have records of their own.
 """
 
@@ -291,7 +291,7 @@ class Health:
 
 
 @record
-class Row:
+class BufferedSample:
     """One sample as it was aligned."""
 
     stamp: Whole  # ns
@@ -301,12 +301,12 @@ class Row:
 
 
 @record
-class Line:
+class DelayBuffer:
     """The last samples."""
 
     count: Whole
     step: Whole  # usual, ns
-    rows: Annotated[list[Row], RESTAMP_SAMPLES]
+    rows: Annotated[list[BufferedSample], RESTAMP_SAMPLES]
 
 
 @record
@@ -324,7 +324,7 @@ class Copies:
 
 
 @record
-class Group:
+class ValueGroup:
     """Values of one channel that are taken together."""
 
     count: Whole
@@ -364,7 +364,7 @@ class Bias:
     start: Whole  # stamp of its first sample, ns
     rows: Whole  # samples in it
     count: Counts  # values of each channel
-    groups: Annotated[list[Group], MAX_CHANNELS]  # of each channel, not ended
+    groups: Annotated[list[ValueGroup], MAX_CHANNELS]  # of each channel, not ended
     portions: Annotated[list[Portion], BIAS_PORTIONS]
     outcome: Small  # where the bias comes from; or why the last average was refused
     average: Channels  # of the last average, rad/s
@@ -527,7 +527,7 @@ class EventRow:
 
 
 @record
-class Settings:
+class PathSettings:
     """What the samples do not change; some of it a change of the detector does."""
 
     n: Whole  # channels
@@ -557,10 +557,10 @@ class Current:
     noisy: Mask  # channels much noisier than expected, and than the others
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
-    moved: Channels  # values of the instant that it stands for, rad/s
-    z: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
-    fed: Channels  # what the detector sees, rad/s, of the channels in fed_mask
-    fed_mask: Mask
+    aligned: Channels  # values of the instant that it stands for, rad/s
+    corrected: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
+    input: Channels  # what the detector sees, rad/s, of the channels in input_mask
+    input_mask: Mask
     plain: Mask  # delivered and in range
     in_use: Mask  # of these, those in use
     usable: Mask  # of these, those that are well by themselves
@@ -569,7 +569,7 @@ class Current:
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
-    others_rate: Vector  # of the channels by which motion is measured in `find_stuck`, rad/s; and room
+    others_rate: Vector  # of the channels by which motion is measured in `update_stuck`, rad/s; and room
     prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
     uncertainty: Channels  # `variance` and the variance of what is not known of the errors, (rad/s)^2
@@ -589,10 +589,10 @@ class Current:
 class Core:
     """What one monitor has beside its detector, its table of sets and its inputs."""
 
-    settings: Settings
+    settings: PathSettings
     health: Health
     bias: Bias
-    line: Line
+    line: DelayBuffer
     copies: Copies
     known: Circumstances  # what is known beside the values, for the detector
     unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s

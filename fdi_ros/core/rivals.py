@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_each
+from fdi_ros.core.parity import UNKNOWN_RATE, compute_weights, eliminate_rate
 from fdi_ros.core.records import Core, Parity
 from fdi_ros.model.samples import Array
 
@@ -32,8 +32,8 @@ shows them, or they look alike and one is enough."""
 def cover_rivals(core: Core) -> None:
     """Raise ``core.last.level`` to what holds if a name or the set is wrong; the covariance of the sample is known."""
     now, decision, n = core.now, core.decision, core.settings.n
-    weigh(core, now.fused)
-    chi = chi_of(now.parity, n, now.fused, now.z)
+    update_parity(core, now.fused)
+    chi = chi_of(now.parity, n, now.fused, now.corrected)
     for i in range(n):
         if decision.faulty >> i & 1 and now.plain >> i & 1:
             cover(core, 1 << i, chi)
@@ -43,9 +43,9 @@ def cover_rivals(core: Core) -> None:
 
 
 @compiled
-def weigh(core: Core, mask: int) -> None:
+def update_parity(core: Core, mask: int) -> None:
     """Work out the parity of the channels in mask."""
-    weigh_each(core.now.parity, core.settings.n, mask, core.now.uncertainty)
+    compute_weights(core.now.parity, core.settings.n, mask, core.now.uncertainty)
     eliminate_rate(core.now.parity, core.settings.n, core.settings.sensors.axes, UNKNOWN_RATE)
 
 
@@ -68,16 +68,16 @@ def cover(core: Core, out: int, chi: float) -> None:
     """
     n, now, parity, prior = core.settings.n, core.now, core.now.parity, core.settings.prior
     mask, count, free = now.fused | out, 0, -1.0
-    weigh(core, mask)
+    update_parity(core, mask)
     for i in range(n):
         count += now.fused >> i & 1
         free += out >> i & 1
         now.rival[i] = 0.0
         for j in range(n):
             if mask >> j & 1:
-                now.rival[i] += parity.information[i, j] * now.z[j]
+                now.rival[i] += parity.information[i, j] * now.corrected[j]
     # Each channel of a set takes a degree of freedom out of chi.
-    base = 0.5 * (chi - chi_of(parity, n, mask, now.z)) + free - math.log(core.settings.risk / (count * count))
+    base = 0.5 * (chi - chi_of(parity, n, mask, now.corrected)) + free - math.log(core.settings.risk / (count * count))
     for i in range(n):
         a, u = parity.information[i, i], now.rival[i]
         if now.fused >> i & 1 and a * now.uncertainty[i] > APART:
@@ -102,7 +102,7 @@ def cover_one(core: Core, i: int, j: int, f: tuple[float, float], p: tuple[float
         g, h, rate = now.parity.gain[a, i], now.parity.gain[a, j], 0.0
         for k in range(core.settings.n):
             if now.parity.gain[a, k] != 0.0:
-                rate += now.parity.gain[a, k] * now.z[k]
+                rate += now.parity.gain[a, k] * now.corrected[k]
         off = abs(last.rate[a] - rate + g * f[0] + h * f[1])
         variance = now.parity.inverse[a, a] + g * g * p[0] + h * h * p[1] + 2.0 * g * h * p[2]
         last.level[a] = max(last.level[a], off + math.sqrt(2.0 * odds * variance))

@@ -124,7 +124,7 @@ def alive(core: Core) -> int:
 
 
 @compiled
-def find_states(core: Core, checked: int, suspicion: int, learning: bool) -> None:
+def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> None:
     """State of every channel; checked: bits of the channels whose fault would have been declared."""
     for i in range(core.settings.n):
         bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
@@ -146,7 +146,7 @@ def find_states(core: Core, checked: int, suspicion: int, learning: bool) -> Non
 
 
 @compiled
-def find_reasons(core: Core, subset: Subset) -> None:
+def update_reasons(core: Core, subset: Subset) -> None:
     """Why each channel is in its state; subset: the channels alive."""
     for i in range(core.settings.n):
         state, condition = core.last.state[i], core.health.condition[i]
@@ -183,7 +183,7 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
     """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
     last = core.last
     core.group = core.decision.ambiguous
-    find_reasons(core, subset)
+    update_reasons(core, subset)
     for i in range(core.settings.n):
         after, reason = last.state[i], core.reason[i]
         if after != core.state[i]:

@@ -113,7 +113,7 @@ def prepare_capability(subsets: NDArray[Any], geometry: Geometry, can_run: list[
 
 
 @compiled
-def find_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
+def fill_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
     """Least-squares rate (3,) of the channels in mask, rad/s; NaN where they do not span space."""
     for a in range(3):
         total = 0.0
@@ -124,7 +124,7 @@ def find_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
 
 
 @compiled
-def find_growth(n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array) -> None:
+def fill_growth(n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array) -> None:
     """How many times noise_std^2 the square of each channel's error in a sample is.
 
     How the biases that remain hang together is not known: an axis with gains G is off by G b with a standard deviation
@@ -147,7 +147,7 @@ def find_growth(n: int, noise_std: Array, variance: Array, remaining: Array, gro
 
 
 @compiled
-def find_level_of(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
+def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
     """Protection level (3,) of the channels in mask, rad/s, from the growth of their errors (n,).
 
     For fixed shares of the risk the level is the largest of functions that are concave in the variances and of degree

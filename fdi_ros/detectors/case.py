@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, record
-from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
-from fdi_ros.estimator.error_states import ErrorStates, copy_states, find_signals, project, subtract_errors
+from fdi_ros.estimator.error_states import ErrorStates, copy_states, fill_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import (
     LEAST_SHARE,
     LONG_TIME,
@@ -32,7 +32,7 @@ from fdi_ros.estimator.estimator import (
     Estimator,
     Total,
     total_before,
-    weigh,
+    update_weights,
 )
 from fdi_ros.estimator.noise import (
     BLOCK,
@@ -42,10 +42,10 @@ from fdi_ros.estimator.noise import (
     MOTION,
     SAMPLE,
     SCALES,
-    find_unknown,
-    take_block_steps,
-    take_long_steps,
-    take_sample_steps,
+    update_block_noise,
+    update_long_noise,
+    update_sample_noise,
+    update_unknown,
 )
 from fdi_ros.estimator.shared_noise import update_shared
 from fdi_ros.model.samples import Array
@@ -82,16 +82,16 @@ class Scale:
 
 
 @compiled
-def add_evidence(params: Constants, est: Estimator, scale: Scale, at: int, first_sample: int) -> None:
+def add_evidence(params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int) -> None:
     """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
     first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
     scale.first[scale.newest] = first_sample
     scale.kept = min(scale.kept + 1, KEPT)
     scale.total = 0.0
     for i in range(params.sensors.n):
-        if not est.judged >> i & 1:
+        if not kf.judged >> i & 1:
             continue
-        y, cap = scale.series[scale.newest, i], est.noise.cap[at, i]
+        y, cap = scale.series[scale.newest, i], kf.noise.cap[at, i]
         for side in range(2):
             sums, total, size = scale.sums[side, i], 0.0, SMALLEST
             factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
@@ -127,7 +127,7 @@ def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> fl
 
 
 @compiled
-def look_back(params: Constants, est: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
+def look_back(params: Constants, kf: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
     """Find since when channel i is off, and the evidence for it against the noise of that same time.
 
     Returns
@@ -143,10 +143,10 @@ def look_back(params: Constants, est: Estimator, scale: Scale, i: int, sign: flo
             best, since = t, k + 1
     if since < 2:
         return since, 0.0
-    mean, trust = best / math.sqrt(since), est.noise.degrees[i]
+    mean, trust = best / math.sqrt(since), kf.noise.degrees[i]
     squares, count = 0.0, 0
     for j in range(params.sensors.n):
-        if est.judged >> j & 1:
+        if kf.judged >> j & 1:
             count += 1
             for k in range(since - 1):
                 step = value_at(scale, k, j) - value_at(scale, k + 1, j)
@@ -229,32 +229,32 @@ class State:
 
 
 @compiled
-def take_values(params: Constants, state: State, learns: bool) -> None:
+def update_from_sample(params: Constants, state: State, learns: bool) -> None:
     """Take the statistics of a sample into the noise and the sums."""
-    est, scale = state.estimator, state.scales[SAMPLE]
-    noise = est.noise
+    kf, scale = state.estimator, state.scales[SAMPLE]
+    noise = kf.noise
     noise.seen[SAMPLE] += 1.0
     scale.newest = (scale.newest + 1) % KEPT
     for i in range(params.sensors.n):
         scale.series[scale.newest, i] = 0.0
-        if est.judged >> i & 1:
+        if kf.judged >> i & 1:
             slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
-            scale.series[scale.newest, i] = est.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
-    update_shared(params, est)
-    take_sample_steps(noise, params.sensors.n, est.judged, est.statistic, est.inflation, learns, est.samples % 2)
-    add_evidence(params, est, scale, SAMPLE, est.samples)
+            scale.series[scale.newest, i] = kf.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
+    update_shared(params, kf)
+    update_sample_noise(noise, params.sensors.n, kf.judged, kf.statistic, kf.inflation, learns, kf.samples % 2)
+    add_evidence(params, kf, scale, SAMPLE, kf.samples)
 
 
 @compiled
-def take_block_values(params: Constants, state: State, learns: bool) -> None:
+def update_from_block(params: Constants, state: State, learns: bool) -> None:
     """Take the innovations of a block into the noise and the sums of the longer time scales."""
-    est, noise, n = state.estimator, state.estimator.noise, params.sensors.n
-    mask, information = est.masks[1] & est.judged, est.block_parity.information
+    kf, noise, n = state.estimator, state.estimator.noise, params.sensors.n
+    mask, information = kf.masks[1] & kf.judged, kf.block_parity.information
     for k in range(1, SCALES):
         scale = state.scales[k]
         for i in range(n):
             if mask >> i & 1:
-                scale.values[i] += est.block_values[i]
+                scale.values[i] += kf.block_values[i]
                 scale.information[i] += information[i, i]
         scale.filled += 1
         if scale.filled < PER_BLOCK[k]:
@@ -267,14 +267,14 @@ def take_block_values(params: Constants, state: State, learns: bool) -> None:
                 known |= 1 << i
                 scale.values[i] /= math.sqrt(scale.information[i])
         if k == BLOCK:
-            take_block_steps(noise, n, known, scale.values, params.expected, learns)
+            update_block_noise(noise, n, known, scale.values, params.expected, learns)
         else:
-            take_long_steps(noise, k, n, known, scale.values, learns)
+            update_long_noise(noise, k, n, known, scale.values, learns)
         for i in range(n):
             scale.series[scale.newest, i] = scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
             scale.values[i] = scale.information[i] = 0.0
         scale.filled = 0
-        add_evidence(params, est, scale, k, est.samples - (PER_BLOCK[k] + 1) * params.length + 1)
+        add_evidence(params, kf, scale, k, kf.samples - (PER_BLOCK[k] + 1) * params.length + 1)
 
 
 @compiled
@@ -289,7 +289,7 @@ def mean_of(params: Constants, state: State) -> float:
 
 
 @compiled
-def find_scores(params: Constants, state: State, scores: Array) -> None:
+def fill_scores(params: Constants, state: State, scores: Array) -> None:
     """Logarithm of one plus the largest sum of each channel that is judged, NaN of others; scores (n,) takes them."""
     for i in range(params.sensors.n):
         largest = 0.0
@@ -305,7 +305,7 @@ def find_scores(params: Constants, state: State, scores: Array) -> None:
 def forget_evidence(params: Constants, state: State) -> None:
     """Begin all sums anew, and end the case; the states and the noise stay."""
     state.case.open = False
-    state.case.isolated = state.case.suspects = state.estimator.aside = state.estimator.doubted = 0
+    state.case.isolated = state.case.suspects = state.estimator.excluded_from_rate = state.estimator.under_test = 0
     for k in range(SCALES):
         scale = state.scales[k]
         scale.kept = scale.filled = 0
@@ -317,9 +317,9 @@ def forget_evidence(params: Constants, state: State) -> None:
 
 
 @compiled
-def find_case(params: Constants, state: State) -> None:
+def look_for_case(params: Constants, state: State) -> None:
     """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
-    est, case, best, found = state.estimator, state.case, math.log(params.limit), False
+    kf, case, best, found = state.estimator, state.case, math.log(params.limit), False
     for at in range(SCALES):
         scale, largest, channel, sign = state.scales[at], 0.0, -1, 1.0
         for i in range(params.sensors.n):
@@ -329,8 +329,8 @@ def find_case(params: Constants, state: State) -> None:
                         largest, channel, sign = scale.sums[side, i, s], i, 1.0 - 2.0 * side
         if channel < 0 or largest < params.limit:
             continue
-        since, evidence = look_back(params, est, scale, channel, sign)
-        evidence = min(evidence, since * math.log(est.noise.cap[at, channel]))
+        since, evidence = look_back(params, kf, scale, channel, sign)
+        evidence = min(evidence, since * math.log(kf.noise.cap[at, channel]))
         samples = max(PER_BLOCK[at] * params.length, 1)
         if since >= 2 and since * samples >= params.least and evidence >= best:
             best, found = evidence, True
@@ -340,138 +340,140 @@ def find_case(params: Constants, state: State) -> None:
 
 
 @compiled
-def find_drift(params: Constants, state: State) -> None:
+def look_for_drift(params: Constants, state: State) -> None:
     """Open a case where the rate of change of a bias is none of those that biases have.
 
     What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the square of a normal value.
     """
-    est, case, layout, worst = state.estimator, state.case, params.layout, 0.0
-    if case.moved > 0.0 and est.seconds - case.moved_at < LONGEST_DRIFT:
+    kf, case, layout, worst = state.estimator, state.case, params.layout, 0.0
+    if case.moved > 0.0 and kf.seconds - case.moved_at < LONGEST_DRIFT:
         return
     for r in range(layout.n, layout.count):
         if 0 <= layout.feeds[r] < layout.n:
             prior = layout.prior[r] * layout.prior[r]
-            learned = max(prior - est.states.p[r, r], LEAST_SHARE * prior)
-            worst = max(worst, est.states.x[r] * est.states.x[r] / learned)
+            learned = max(prior - kf.states.p[r, r], LEAST_SHARE * prior)
+            worst = max(worst, kf.states.x[r] * kf.states.x[r] / learned)
     if worst < 2.0 * math.log(params.limit):
         return
     for k in range(DRIFT_TIMES):
         seconds = LONGEST_DRIFT / (1 << k)
-        if not case.open and est.seconds > seconds:
-            case.onset = est.samples - int(seconds / params.period)
+        if not case.open and kf.seconds > seconds:
+            case.onset = kf.samples - int(seconds / params.period)
             open_case(params, state)
 
 
 @compiled
-def find_change_in_hole(params: Constants, state: State) -> None:
+def look_for_change_in_hole(params: Constants, state: State) -> None:
     """Open a case where a bias is another than before a hole in the stream, by more than it may have moved meanwhile.
 
     At first after a hole slow noise is unknown, and the states follow what the sums do not see. What they have learned
     of the biases since has the covariance that is lost, D = P0 - P: ``(A (x - x0))_i^2 / (A D A)_ii`` is the square of
     a normal value. A leaves out what a rate explains: that part of the biases is not learned in motion.
     """
-    est, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
-    information = est.parity.information
+    kf, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
+    information = kf.parity.information
     before = case.before
-    if case.open or not is_after_hole(params, est) or not predict_from(params, est, est.hole_at, before):
+    if case.open or not is_after_hole(params, kf) or not predict_from(params, kf, kf.hole_at, before):
         return
     for i in range(n):
         change = prior = posterior = 0.0
         for j in range(n):
-            change += information[i, j] * (est.states.x[j] - before.x[j])
+            change += information[i, j] * (kf.states.x[j] - before.x[j])
             for k in range(n):
                 share = information[i, j] * information[i, k]
                 prior += share * before.p[j, k]
-                posterior += share * est.states.p[j, k]
-        if est.judged >> i & 1:
+                posterior += share * kf.states.p[j, k]
+        if kf.judged >> i & 1:
             worst = max(worst, change * change / max(prior - posterior, LEAST_SHARE * prior))
     if worst >= 2.0 * math.log(params.limit):
-        case.onset = est.hole_sample + 1
+        case.onset = kf.hole_sample + 1
         open_case(params, state)
 
 
 @compiled
 def open_case(params: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
-    est, case = state.estimator, state.case
+    kf, case = state.estimator, state.case
     case.onset = max(case.onset, 1)
     case.open, case.candidate, case.isolated = True, 0, 0
-    copy_states(params.layout, est.states, case.before)
-    since = (est.samples - case.onset) * params.period
-    before = est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
-    if case.onset == est.hole_sample + 1:
-        before = est.hole_at
-    predict_from(params, est, before, est.states)
+    copy_states(params.layout, kf.states, case.before)
+    since = (kf.samples - case.onset) * params.period
+    before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
+    if case.onset == kf.hole_sample + 1:
+        before = kf.hole_at
+    predict_from(params, kf, before, kf.states)
     name_channels(params, state)
     if case.open and case.inference.log_odds < STANDS * math.log(params.limit):
-        copy_states(params.layout, case.before, est.states)
+        copy_states(params.layout, case.before, kf.states)
         case.open = False
-        est.aside = 0
-        weigh(params, est)
-        case.retry = est.samples + 1 + (est.samples - case.onset) // 4
+        kf.excluded_from_rate = 0
+        update_weights(params, kf)
+        case.retry = kf.samples + 1 + (kf.samples - case.onset) // 4
 
 
 @compiled
 def set_mean(params: Constants, state: State, size: int) -> None:
     """Set the mean of the last so many samples to be explained, and its covariance."""
-    est, case, n, layout = state.estimator, state.case, params.sensors.n, params.layout
-    total, inference, noise = case.total, case.inference, est.noise
-    total_before(est, est.samples - size + 1, total, n)
-    size = est.samples - total.sample
+    kf, case, n, layout = state.estimator, state.case, params.sensors.n, params.layout
+    total, inference, noise = case.total, case.inference, kf.noise
+    total_before(kf, kf.samples - size + 1, total, n)
+    size = kf.samples - total.sample
     inference.mask = 0
     for i in range(n):
-        count = est.total.count[i] - total.count[i]
-        if est.mask >> i & 1 and count > 0.9 * size:
+        count = kf.total.count[i] - total.count[i]
+        if kf.mask >> i & 1 and count > 0.9 * size:
             inference.mask |= 1 << i
-            inference.y[i] = (est.total.values[i] - total.values[i]) / count
-    inference.judged = inference.mask & est.judged
+            inference.y[i] = (kf.total.values[i] - total.values[i]) / count
+    inference.judged = inference.mask & kf.judged
     speed = 0.0
     # At rest what passes for a rate is the fault itself, and no motion.
     moves = 1.0 if noise.regime == MOTION else 0.0
     for a in range(3):
-        inference.rate[a] = moves * (est.total.rate[a] - total.rate[a]) / size
+        inference.rate[a] = moves * (kf.total.rate[a] - total.rate[a]) / size
         speed += inference.rate[a] * inference.rate[a]
     # A turn that ends as it began leaves no trace of a delay in the mean.
     part = min(1.0, 3.0 * params.length / size)
     for i in range(n):
-        turn = 0.0
+        change = 0.0
         for a in range(3):
-            turn += params.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
-        inference.turn[i] = moves * turn / (size * params.period)
-    signals = est.block_at.signals
-    find_signals(layout, inference.rate, inference.turn, signals)
-    subtract_errors(layout, est.states, signals, inference.y, inference.y)
-    project(layout, est.states, est.block_at)
+            change += params.sensors.axes[i, a] * (kf.rate[a] - total.instant[a])
+        inference.angular_acceleration[i] = moves * change / (size * params.period)
+    signals = kf.block_at.signals
+    fill_signals(layout, inference.rate, inference.angular_acceleration, signals)
+    subtract_errors(layout, kf.states, signals, inference.y, inference.y)
+    project(layout, kf.states, kf.block_at)
     for i in range(n):
         for j in range(n):
-            inference.covariance[i, j] = est.block_at.covariance[i, j]
+            inference.covariance[i, j] = kf.block_at.covariance[i, j]
         v, over = noise.now.sample[i], noise.longest[i]
         if size >= params.length:
             v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
         else:
             v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / params.length)
-        inference.covariance[i, i] += v / size + est.peak_extra[i] * part + params.bent * params.bent * speed
+        inference.covariance[i, i] += (
+            v / size + kf.peak_extra[i] * part + params.nonlinearity * params.nonlinearity * speed
+        )
         place = layout.delays[params.unit[i]]
         if place >= 0:
-            swing = moves * est.peak_turn[i] * part
-            inference.covariance[i, i] += est.states.p[place, place] * swing * swing
-    add_line(est, inference, n, size, size >= params.length)
+            swing = moves * kf.peak_turn[i] * part
+            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
+    add_line(kf, inference, n, size, size >= params.length)
 
 
 @compiled
-def add_line(est: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
+def add_line(kf: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
     """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
     for i in range(n):
         for j in range(n):
-            slow = math.sqrt(est.noise.longest[i] * est.noise.longest[j]) if lasts else 1.0
-            inference.covariance[i, j] += est.shared.line[i, j] * slow / size
+            slow = math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
+            inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
 
 
 @compiled
 def infer(params: Constants, inference: Inference) -> None:
     """Explain the mean."""
     n = params.sensors.n
-    weigh_together(inference.parity, n, inference.mask, inference.covariance)
+    compute_joint_weights(inference.parity, n, inference.mask, inference.covariance)
     eliminate_rate(inference.parity, n, params.sensors.axes, UNKNOWN_RATE)
     explain(inference, n, params.sensors.axes, params.members, params.units, params.confidence)
 
@@ -483,8 +485,8 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
     The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
     its own way in every block, however large it is in each.
     """
-    est, case, scale = state.estimator, state.case, state.scales[BLOCK]
-    information, n = est.block_information, params.sensors.n
+    kf, case, scale = state.estimator, state.case, state.scales[BLOCK]
+    information, n = kf.block_information, params.sensors.n
     first = second = -1
     for i in range(n):
         if named >> i & 1:
@@ -494,7 +496,7 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
     both = correlation(information, first, second) if second >= 0 else 0.0
     free = max(1.0 - both * both, 1e-3)
     for j in range(n):
-        if named >> j & 1 or not est.judged >> j & 1 or not information[j, j] > 0.0:
+        if named >> j & 1 or not kf.judged >> j & 1 or not information[j, j] > 0.0:
             continue
         # Regression on the one or two that are named.
         on_first = correlation(information, j, first)
@@ -521,9 +523,9 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
 @compiled
 def name_channels(params: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
-    est, case, n = state.estimator, state.case, params.sensors.n
+    kf, case, n = state.estimator, state.case, params.sensors.n
     inference = case.inference
-    size = est.samples - case.onset + 1
+    size = kf.samples - case.onset + 1
     if size * params.period > LONG_TIME:
         # A drift is largest at last.
         size = size // 2 + 1
@@ -537,19 +539,19 @@ def name_channels(params: Constants, state: State) -> None:
     std = 0.0 if case.isolated else moved_by(inference, n)
     if std > 0.0 and let_biases_move(params, state, std):
         return
-    case.next = est.samples + max(size // RENAME, 1)
+    case.next = kf.samples + max(size // RENAME, 1)
     if inference.common and shows_others(params, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
     case.suspects = inference.union
     if inference.common != case.candidate:
-        case.candidate, case.since = inference.common, est.samples
+        case.candidate, case.since = inference.common, kf.samples
     single, free = inference.common & (inference.common - 1) == 0, -3
     for i in range(n):
         free += inference.mask >> i & 1
     settled = (SETTLED if free > FEW_CHECKS else SETTLED_AMONG_FEW) if single else SETTLED_TOGETHER
     if single and inference.log_odds >= CLEAR:
         settled = 0.0
-    if inference.common and (est.samples - case.since) * params.period >= settled:
+    if inference.common and (kf.samples - case.since) * params.period >= settled:
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0
@@ -562,8 +564,8 @@ def moved_by(inference: Inference, n: int) -> float:
 
     So it is where no hypothesis of a few channels leaves noise, and the best of them much of what is to be explained.
     """
-    left = 2.0 * (inference.total - inference.fit_of_best)
-    if inference.fitted or left < UNEXPLAINED_SHARE * 2.0 * inference.total:
+    residual = 2.0 * (inference.total - inference.fit_of_best)
+    if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:
         return 0.0
     trace, free = 0.0, -3.0
     for i in range(n):
@@ -577,17 +579,17 @@ def moved_by(inference: Inference, n: int) -> float:
 @compiled
 def let_biases_move(params: Constants, state: State, std: float) -> bool:
     """Go on with biases that have all moved by so much, rad/s, if that is not too far; return whether it is done."""
-    est, case, n = state.estimator, state.case, params.sensors.n
-    lately = case.moved * math.exp(-(est.seconds - case.moved_at) / WARMS) + std
+    kf, case, n = state.estimator, state.case, params.sensors.n
+    lately = case.moved * math.exp(-(kf.seconds - case.moved_at) / WARMS) + std
     if lately > LARGEST_MOVE or std > LARGEST_STEP:
         return False
-    case.moved, case.moved_at, case.moved_since = lately, est.seconds, case.onset
-    copy_biases(est.states, n, case.reference)
-    move_biases(params, est, std, 0.5 * LARGEST_MOVE / WARMS)
-    est.noise.lived[est.noise.regime] = 0.0
-    find_unknown(est.noise, n, 0.0)
+    case.moved, case.moved_at, case.moved_since = lately, kf.seconds, case.onset
+    copy_biases(kf.states, n, case.reference)
+    move_biases(params, kf, std, 0.5 * LARGEST_MOVE / WARMS)
+    kf.noise.lived[kf.noise.regime] = 0.0
+    update_unknown(kf.noise, n, 0.0)
     forget_evidence(params, state)
-    weigh(params, est)
+    update_weights(params, kf)
     return True
 
 
@@ -601,18 +603,18 @@ def copy_biases(states: ErrorStates, n: int, out: Array) -> None:
 @compiled
 def goes_too_far(params: Constants, state: State) -> bool:
     """Whether a bias goes farther or faster since all have moved than they may: what passed for a move is a fault."""
-    est, case, feeds = state.estimator, state.case, params.layout.feeds
-    if case.moved == 0.0 or est.seconds - case.moved_at > WARMS:
+    kf, case, feeds = state.estimator, state.case, params.layout.feeds
+    if case.moved == 0.0 or kf.seconds - case.moved_at > WARMS:
         return False
     for r in range(params.layout.count):
-        far = r < params.sensors.n and abs(est.states.x[r] - case.reference[r]) > LARGEST_MOVE
-        if far or (0 <= feeds[r] < params.sensors.n and abs(est.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
+        far = r < params.sensors.n and abs(kf.states.x[r] - case.reference[r]) > LARGEST_MOVE
+        if far or (0 <= feeds[r] < params.sensors.n and abs(kf.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
             return True
     return False
 
 
 @compiled
-def take_move_back(params: Constants, state: State) -> None:
+def undo_move(params: Constants, state: State) -> None:
     """Open a case where all biases seemed to move; for a while no move is believed."""
     state.case.onset, state.case.moved, state.case.moved_at = state.case.moved_since, RUINED, state.estimator.seconds
     open_case(params, state)
@@ -621,22 +623,22 @@ def take_move_back(params: Constants, state: State) -> None:
 @compiled
 def leave_aside(params: Constants, state: State) -> None:
     """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
-    est, case = state.estimator, state.case
-    est.doubted = case.suspects | case.isolated
-    est.aside = 0
-    for wanted in (est.doubted, case.isolated, case.inference.likeliest):
-        if est.aside == 0 and params.spans[est.mask & ~wanted]:
-            est.aside = wanted
-    weigh(params, est)
+    kf, case = state.estimator, state.case
+    kf.under_test = case.suspects | case.isolated
+    kf.excluded_from_rate = 0
+    for wanted in (kf.under_test, case.isolated, case.inference.likeliest):
+        if kf.excluded_from_rate == 0 and params.spans[kf.mask & ~wanted]:
+            kf.excluded_from_rate = wanted
+    update_weights(params, kf)
 
 
 @compiled
 def follow_case(params: Constants, state: State) -> None:
     """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
-    est, case = state.estimator, state.case
-    if est.samples < case.next:
+    kf, case = state.estimator, state.case
+    if kf.samples < case.next:
         return
     name_channels(params, state)
-    if case.open and case.inference.log_odds < ENDS and (est.samples - case.onset) * params.period > 1.0:
+    if case.open and case.inference.log_odds < ENDS and (kf.samples - case.onset) * params.period > 1.0:
         forget_evidence(params, state)
-        weigh(params, est)
+        update_weights(params, kf)

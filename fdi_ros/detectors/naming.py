@@ -73,7 +73,7 @@ class Inference:
     y: Channels  # values less what is known of their errors, rad/s
     covariance: Square  # M, (rad/s)^2
     rate: Vector  # mean body rate, rad/s
-    turn: Channels  # angular acceleration along each channel, lately largest, rad/s^2
+    angular_acceleration: Channels  # angular acceleration along each channel, lately largest, rad/s^2
     parity: Parity
     u: Channels  # A y, s/rad
     total: Real  # y' A y / 2
@@ -218,7 +218,7 @@ def add_units(inference: Inference, n: int, axes: Array, members: NDArray[np.int
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
-                along = inference.turn[i]
+                along = inference.angular_acceleration[i]
                 if way == 0:
                     along = (
                         axes[i, 0] * inference.rate[0] + axes[i, 1] * inference.rate[1] + axes[i, 2] * inference.rate[2]
@@ -230,7 +230,7 @@ def add_units(inference: Inference, n: int, axes: Array, members: NDArray[np.int
 
 
 @compiled
-def find_spread(inference: Inference, n: int, total: float) -> None:
+def update_spread(inference: Inference, n: int, total: float) -> None:
     """Mean square of the errors over all hypotheses, whose shares of ``total`` are in ``inference.odds``."""
     for i in range(n):
         for j in range(n):
@@ -254,7 +254,7 @@ def largest_of(inference: Inference) -> int:
 
 
 @compiled
-def find_best(inference: Inference, n: int) -> None:
+def update_best(inference: Inference, n: int) -> None:
     """Note the likeliest hypothesis, and whether what it leaves is noise."""
     best, free = largest_of(inference), -3
     for i in range(n):
@@ -279,12 +279,12 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
     Where all of them contain a channel, it is faulty; but where some of them say that a unit measures motion wrongly,
     its gyros may all be healthy.
     """
-    find_best(inference, n)
+    update_best(inference, n)
     top, total = inference.log_odds, 0.0
     for k in range(inference.count):
         inference.odds[k] = math.exp(max(inference.odds[k] - top, -700.0))
         total += inference.odds[k]
-    find_spread(inference, n, total)
+    update_spread(inference, n, total)
     mass, union, common, enough = 0.0, 0, -1, 1.0 - SET_MARGIN * (1.0 - confidence)
     some_whole = False
     for _ in range(inference.count):

@@ -5,9 +5,9 @@
 
 The sums are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of variance one, if what is
 known of the sensors holds. Once the mean of the sums reaches the run length asked for, it is tested whether the
-evidence stands against the scatter of that same time (`find_case`). If it does, the states go back to what they were
-before the onset, and the mean since then is to be explained (`fdi_ros.detectors.naming`): only if a hypothesis stands
-against all that is not known of the sensors is there a case. It lasts until the evidence has gone, or until its
+evidence stands against the scatter of that same time (`look_for_case`). If it does, the states go back to what they
+were before the onset, and the mean since then is to be explained (`fdi_ros.detectors.naming`): only if a hypothesis
+stands against all that is not known of the sensors is there a case. It lasts until the evidence has gone, or until its
 channels are left out.
 """
 
@@ -24,33 +24,33 @@ from fdi_ros.core.subsets import all_sets, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
-    find_case,
-    find_change_in_hole,
-    find_drift,
-    find_scores,
+    fill_scores,
     follow_case,
     forget_evidence,
     goes_too_far,
+    look_for_case,
+    look_for_change_in_hole,
+    look_for_drift,
     mean_of,
-    take_block_values,
-    take_move_back,
-    take_values,
+    undo_move,
+    update_from_block,
+    update_from_sample,
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
     REST_STD,
-    find_behind,
-    find_rest,
-    find_turning,
-    foresee,
     inflate_delays,
     judge_block,
     keep_snapshot,
     learn,
     pass_hole,
+    predict_innovation_covariance,
     transfer_delays,
+    update_angular_acceleration,
+    update_rest,
+    update_time_offsets,
 )
-from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_signals, predict, prepare_layout, project
+from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, fill_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     LONG_TIME,
@@ -61,10 +61,10 @@ from fdi_ros.estimator.estimator import (
     add_sample,
     correct_sample,
     drop_block,
-    find_statistics,
     forget_motion,
+    update_statistics,
+    update_weights,
     watch_for_motion,
-    weigh,
 )
 from fdi_ros.estimator.noise import (
     BURST,
@@ -73,11 +73,11 @@ from fdi_ros.estimator.noise import (
     THREE_SIGMA,
     begin_noise,
     change_regime,
-    find_unknown,
-    meet_rate,
-    take_block_of_samples,
+    update_largest_rate,
+    update_sample_variance,
+    update_unknown,
 )
-from fdi_ros.estimator.shared_noise import begin_shared, find_level, find_shape, keep_line
+from fdi_ros.estimator.shared_noise import begin_shared, update_line, update_shape, update_shared_level
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import MAX_RATE
@@ -104,90 +104,92 @@ SHORT = 1.0 - 1e-9
 @compiled
 def begin(params: Constants, state: State, sample: SampleInput) -> None:
     """Begin with what is known beforehand."""
-    est, n = state.estimator, params.sensors.n
+    kf, n = state.estimator, params.sensors.n
     state.begun = True
     if not state.restored:
-        begin_states(params.layout, est.states, sample.bias_std)
-    begin_noise(est.noise, n, params.expected)
-    begin_shared(est.shared, n, params.expected)
-    find_signals(params.layout, est.zero, est.turn, est.at.signals)
-    project(params.layout, est.states, est.at)
+        begin_states(params.layout, kf.states, sample.bias_std)
+    begin_noise(kf.noise, n, params.expected)
+    begin_shared(kf.shared, n, params.expected)
+    fill_signals(params.layout, kf.zero, kf.angular_acceleration, kf.at.signals)
+    project(params.layout, kf.states, kf.at)
 
 
 @compiled
 def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
     """Let the time since the last sample pass, s; after a hole all evidence begins anew."""
-    est = state.estimator
+    kf = state.estimator
     if not state.begun:
         begin(params, state, sample)
         state.stamp = sample.stamp
     seconds = 1e-9 * (sample.stamp - state.stamp)
     state.stamp = sample.stamp
-    est.seconds += seconds
-    if sample.interrupted and est.samples > 0:
-        forget_motion(est, params.sensors.n)
+    kf.seconds += seconds
+    if sample.interrupted and kf.samples > 0:
+        forget_motion(kf, params.sensors.n)
         forget_evidence(params, state)
-        pass_hole(params, est, seconds)
+        pass_hole(params, kf, seconds)
         if seconds > PAUSE:
-            est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
-            find_unknown(est.noise, params.sensors.n, 0.0)
-        est.mask = 0
+            kf.noise.lived[REST] = kf.noise.lived[MOTION] = 0.0
+            update_unknown(kf.noise, params.sensors.n, 0.0)
+        kf.mask = 0
     return seconds
 
 
 @compiled
-def take_mask(params: Constants, state: State, sample: SampleInput) -> None:
+def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
     """Take over which channels are present. Once those named are out of use, a new search begins without them."""
-    est, case = state.estimator, state.case
+    kf, case = state.estimator, state.case
     blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(params, state)
-        est.mask = 0
-    if sample.mask != est.mask or sample.beyond != est.beyond:
-        est.mask, est.beyond = sample.mask, sample.beyond
-        weigh(params, est)
+        kf.mask = 0
+    if sample.mask != kf.mask or sample.beyond != kf.beyond:
+        kf.mask, kf.beyond = sample.mask, sample.beyond
+        update_weights(params, kf)
 
 
 @compiled
-def take_block(params: Constants, state: State) -> None:
+def process_block(params: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
-    est, case, n = state.estimator, state.case, params.sensors.n
-    noise, learns = est.noise, not case.open
-    meet_rate(noise, est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2)
-    find_unknown(noise, n, est.span)
-    take_block_of_samples(noise, n, est.masks[0], params.length, est.all_blocks, params.pace, params.expected, learns)
-    find_level(params, est)
-    predict(params.layout, est.states, est.seconds - est.learned_at)
-    est.learned_at = est.seconds
-    if est.blocks < 3:
+    kf, case, n = state.estimator, state.case, params.sensors.n
+    noise, learns = kf.noise, not case.open
+    update_largest_rate(noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2)
+    update_unknown(noise, n, kf.span)
+    update_sample_variance(
+        noise, n, kf.masks[0], params.length, kf.all_blocks, params.adaptation_gain, params.expected, learns
+    )
+    update_shared_level(params, kf)
+    predict(params.layout, kf.states, kf.seconds - kf.learned_at)
+    kf.learned_at = kf.seconds
+    if kf.blocks < 3:
         return
-    est.unseen = False
-    find_turning(params, est)
-    weight = judge_block(params, est)
-    take_block_values(params, state, learns)
-    find_rest(params, est)
-    if est.rest and noise.regime == MOTION and learns:
+    kf.unseen = False
+    update_angular_acceleration(params, kf)
+    weight = judge_block(params, kf)
+    update_from_block(params, state, learns)
+    update_rest(params, kf)
+    if kf.rest and noise.regime == MOTION and learns:
         change_regime(noise, n, REST, False)
     suspicious = mean_of(params, state) > math.sqrt(params.limit)
-    est.held = est.held + est.span if suspicious else 0.0
+    kf.held = kf.held + kf.span if suspicious else 0.0
     if learns and not suspicious:
         # Of a case that was refused.
-        est.doubted = 0
-        keep_line(params, est)
-    if case.open or est.held == 0.0 or est.held > LONG_TIME:
-        learn(params, est, weight)
-    if learns and not suspicious and est.seconds - est.snapshot_at >= SNAPSHOT_TIME:
-        est.snapshot_at = est.seconds
-        keep_snapshot(params, est)
-    if params.units > 1 and learns and est.seconds - est.taken_off_at > 1.0:
-        est.taken_off_at = est.seconds
-        if transfer_delays(params, est):
+        kf.under_test = 0
+        update_line(params, kf)
+    if case.open or kf.held == 0.0 or kf.held > LONG_TIME:
+        learn(params, kf, weight)
+    if learns and not suspicious and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
+        kf.snapshot_at = kf.seconds
+        keep_snapshot(params, kf)
+    if params.units > 1 and learns and kf.seconds - kf.taken_off_at > 1.0:
+        kf.taken_off_at = kf.seconds
+        if transfer_delays(params, kf):
             # What was measured before is of other instants.
             forget_evidence(params, state)
-    foresee(params, est)
-    if not case.open and est.all_blocks % STRIDE == 0 and est.samples >= case.retry:
-        find_drift(params, state)
-        find_change_in_hole(params, state)
+    predict_innovation_covariance(params, kf)
+    if not case.open and kf.all_blocks % STRIDE == 0 and kf.samples >= case.retry:
+        look_for_drift(params, state)
+        look_for_change_in_hole(params, state)
 
 
 @compiled
@@ -196,82 +198,82 @@ def forget_suspicion(params: Constants, state: State) -> None:
 
     Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
     """
-    est, case = state.estimator, state.case
-    inflate_delays(params, est, state.declared | (case.isolated | case.suspects if case.open else 0))
+    kf, case = state.estimator, state.case
+    inflate_delays(params, kf, state.declared | (case.isolated | case.suspects if case.open else 0))
     state.cleared, state.declared = False, 0
     forget_evidence(params, state)
-    forget_motion(est, params.sensors.n)
-    est.mask = 0
+    forget_motion(kf, params.sensors.n)
+    kf.mask = 0
 
 
 @compiled
-def is_blind(est: Estimator) -> bool:
+def is_blind(kf: Estimator) -> bool:
     """Whether it is not known how far off the states make a sample: since a hole the motion is another."""
-    return est.unseen and est.noise.regime == MOTION
+    return kf.unseen and kf.noise.regime == MOTION
 
 
 @compiled
-def weigh_sample(params: Constants, state: State, sample: SampleInput) -> None:
+def process_sample(params: Constants, state: State, sample: SampleInput) -> None:
     """Take a sample into estimator and evidence."""
-    est = state.estimator
+    kf = state.estimator
     for i in range(params.sensors.n):
         sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
-    if est.seconds - est.used_at > max(HOLE, SLOW * params.period):
-        drop_block(est, params.sensors.n)
-    est.used_at = est.seconds
-    est.samples += 1
-    find_behind(params, est)
-    correct_sample(params, est, sample.z)
-    watch_for_motion(params, est)
-    find_statistics(params, est)
-    if not is_blind(est):
-        take_values(params, state, not state.case.open)
+    if kf.seconds - kf.used_at > max(HOLE, SLOW * params.period):
+        drop_block(kf, params.sensors.n)
+    kf.used_at = kf.seconds
+    kf.samples += 1
+    update_time_offsets(params, kf)
+    correct_sample(params, kf, sample.z)
+    watch_for_motion(params, kf)
+    update_statistics(params, kf)
+    if not is_blind(kf):
+        update_from_sample(params, state, not state.case.open)
 
 
 @compiled
-def find_outliers(params: Constants, state: State, verdict: SampleVerdict) -> None:
+def fill_outliers(params: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
-    est, largest, far = state.estimator, 0.0, 0.0
+    kf, largest, far = state.estimator, 0.0, 0.0
     for i in range(params.sensors.n):
-        burst = max(1.0, BURST * est.noise.quick[i], est.shared.level[i] / est.noise.now.sample[i])
-        largest = max(largest, abs(est.statistic[i]) / math.sqrt(burst))
-        far = max(far, est.distance[i])
+        burst = max(1.0, BURST * kf.noise.quick[i], kf.shared.level[i] / kf.noise.now.sample[i])
+        largest = max(largest, abs(kf.statistic[i]) / math.sqrt(burst))
+        far = max(far, kf.distance[i])
     for i in range(params.sensors.n):
         if largest > OUTLIER:
             # Of all statistics with equal weights that of the culprit is the largest (Cauchy and Schwarz).
-            verdict.outliers[i] = est.distance[i] > ALIKE * far
+            verdict.outliers[i] = kf.distance[i] > ALIKE * far
         elif state.case.open:
-            verdict.outliers[i] = est.aside >> i & 1
+            verdict.outliers[i] = kf.excluded_from_rate >> i & 1
 
 
 @compiled
 def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
-    est, case, n = state.estimator, state.case, params.sensors.n
+    kf, case, n = state.estimator, state.case, params.sensors.n
     unsure = case.open and case.isolated == 0
     # What the channels disagree by now beyond all that is known, as in a shock that they measure at other instants.
-    odd = 1.0 if case.open else est.odd
-    find_scores(params, state, verdict.scores)
+    odd = 1.0 if case.open else kf.odd
+    fill_scores(params, state, verdict.scores)
     for i in range(n):
-        variance = est.shared.level[i] * odd
+        variance = kf.shared.level[i] * odd
         verdict.noise[i] = math.sqrt(variance / params.expected[i])
-        sample.estimate.corrected[i], sample.estimate.variance[i] = est.corrected[i], variance
-        sample.estimate.bias[i] = est.states.x[i]
-        sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
+        sample.estimate.corrected[i], sample.estimate.variance[i] = kf.corrected[i], variance
+        sample.estimate.bias[i] = kf.states.x[i]
+        sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         for j in range(n):
             # While it is open which channels are faulty, each may be off by what it is if it is one of them.
             doubt = case.inference.spread[i, j] if unsure else 0.0
-            sample.estimate.covariance[i, j] = est.at.covariance[i, j] + doubt
-        if unsure and est.mask >> i & 1:
+            sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
+        if unsure and kf.mask >> i & 1:
             # And where no hypothesis says why it is off, by what it differs from the others now.
-            left = est.innovation[i]
-            if left * left > THREE_SIGMA * (sample.estimate.covariance[i, i] + variance):
-                sample.estimate.covariance[i, i] += left * left
-    sample.estimate.behind, sample.estimate.spread = est.behind, est.spread
-    sample.estimate.checked = 0 if is_blind(est) else est.checked
+            innovation = kf.innovation[i]
+            if innovation * innovation > THREE_SIGMA * (sample.estimate.covariance[i, i] + variance):
+                sample.estimate.covariance[i, i] += innovation * innovation
+    sample.estimate.behind, sample.estimate.spread = kf.behind, kf.spread
+    sample.estimate.checked = 0 if is_blind(kf) else kf.checked
     for u in range(params.units):
-        sample.estimate.late[u] = est.late[u]
-    suspects = (case.isolated if case.isolated else case.suspects) & est.mask
+        sample.estimate.late[u] = kf.late[u]
+    suspects = (case.isolated if case.isolated else case.suspects) & kf.mask
     if case.open and suspects:
         verdict.alarm, verdict.isolated = True, case.isolated != 0
         for i in range(n):
@@ -286,40 +288,40 @@ def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: 
 @callback(Constants, State, SampleInput, SampleVerdict)
 def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
-    est, case = state.estimator, state.case
+    kf, case = state.estimator, state.case
     verdict.threshold = math.log(1.0 + params.limit)
     seconds = pass_time(params, state, sample)
     if state.cleared:
         forget_suspicion(params, state)
-    take_mask(params, state, sample)
-    if not params.spans[est.mask] or est.judged == 0:
+    update_mask(params, state, sample)
+    if not params.spans[kf.mask] or kf.judged == 0:
         verdict.statistic = verdict.threshold = math.nan
         return
     if sample.held:
-        if est.aside:
-            est.mask = 0
+        if kf.excluded_from_rate:
+            kf.mask = 0
         forget_evidence(params, state)
-        forget_motion(est, params.sensors.n)
+        forget_motion(kf, params.sensors.n)
         verdict.statistic = 0.0
         return
     if sample.repeated:
         verdict.statistic = min(math.log(1.0 + mean_of(params, state)), SHORT * verdict.threshold)
         return
-    find_shape(params, est)
-    weigh_sample(params, state, sample)
-    if add_sample(params, est, sample.z, seconds):
-        take_block(params, state)
+    update_shape(params, kf)
+    process_sample(params, state, sample)
+    if add_sample(params, kf, sample.z, seconds):
+        process_block(params, state)
         # Its covariance is that of now.
-        correct_sample(params, est, sample.z)
+        correct_sample(params, kf, sample.z)
     mean = mean_of(params, state)
     verdict.statistic = math.log(1.0 + mean)
-    find_outliers(params, state, verdict)
+    fill_outliers(params, state, verdict)
     if case.open:
         follow_case(params, state)
-    elif est.filled == 0 and goes_too_far(params, state):
-        take_move_back(params, state)
-    elif mean >= params.limit and est.samples >= case.retry:
-        find_case(params, state)
+    elif kf.filled == 0 and goes_too_far(params, state):
+        undo_move(params, state)
+    elif mean >= params.limit and kf.samples >= case.retry:
+        look_for_case(params, state)
     sample.estimate.known = True
     fill_verdict(params, state, sample, verdict)
 
@@ -434,9 +436,9 @@ class Sequential(Detector):
         params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
         params["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
         params["period"] = 1.0 / self.sample_rate
-        params["pace"] = 1.0 / max(0.5 * self.sample_rate / params["length"], 8.0)
+        params["adaptation_gain"] = 1.0 / max(0.5 * self.sample_rate / params["length"], 8.0)
         params["expected"][:n] = noise.noise_std**2
-        params["timing"][:n], params["bent"] = np.maximum(noise.timing_std, LEAST_TIMING), BENT
+        params["timing"][:n], params["nonlinearity"] = np.maximum(noise.timing_std, LEAST_TIMING), BENT
         params["rest_std"] = REST_STD
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
@@ -22,7 +22,7 @@ from fdi_ros.estimator.error_states import (
     TURN,
     ErrorStates,
     copy_states,
-    find_signals,
+    fill_signals,
     predict,
     project,
     subtract_errors,
@@ -35,8 +35,8 @@ from fdi_ros.estimator.estimator import (
     TIERS,
     Constants,
     Estimator,
+    update_weights,
     usual_chi,
-    weigh,
 )
 from fdi_ros.estimator.noise import MOTION, REST, THREE_SIGMA
 from fdi_ros.estimator.shared_noise import UNEQUAL
@@ -92,44 +92,44 @@ know what they can learn of the biases."""
 
 
 @compiled
-def keep_snapshot(params: Constants, est: Estimator) -> None:
+def keep_snapshot(params: Constants, kf: Estimator) -> None:
     """Keep the states, so that they can be had again from before a fault."""
     tier = 0
     while tier < TIERS:
-        snapshot = est.snapshots[tier * SNAPSHOTS + est.taken[tier] % SNAPSHOTS]
-        snapshot.seconds = est.seconds
-        copy_states(params.layout, est.states, snapshot.states)
+        snapshot = kf.snapshots[tier * SNAPSHOTS + kf.taken[tier] % SNAPSHOTS]
+        snapshot.seconds = kf.seconds
+        copy_states(params.layout, kf.states, snapshot.states)
         for u in range(params.units):
-            snapshot.late[u] = est.late[u]
-        est.taken[tier] += 1
-        if est.taken[tier] % SNAPSHOTS != 1:
+            snapshot.late[u] = kf.late[u]
+        kf.taken[tier] += 1
+        if kf.taken[tier] % SNAPSHOTS != 1:
             return
         tier += 1
 
 
 @compiled
-def pass_hole(params: Constants, est: Estimator, seconds: float) -> None:
+def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
     """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off.
 
     The states kept from before it stay, as little sure of the biases: what changed in the hole is compared with them.
     """
-    if not is_after_hole(params, est):
-        est.hole_at, est.hole_sample = est.seconds - seconds, est.samples
-    move_biases(params, est, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
+    if not is_after_hole(params, kf):
+        kf.hole_at, kf.hole_sample = kf.seconds - seconds, kf.samples
+    move_biases(params, kf, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
 
 
 @compiled
-def is_after_hole(params: Constants, est: Estimator) -> bool:
+def is_after_hole(params: Constants, kf: Estimator) -> bool:
     """Whether there was a hole in the stream lately."""
-    return est.hole_sample > 0 and (est.samples - est.hole_sample) * params.period < AFTER_HOLE
+    return kf.hole_sample > 0 and (kf.samples - kf.hole_sample) * params.period < AFTER_HOLE
 
 
 @compiled
-def move_biases(params: Constants, est: Estimator, std: float, rate_std: float) -> None:
+def move_biases(params: Constants, kf: Estimator, std: float, rate_std: float) -> None:
     """Let all biases be others by so much, rad/s, and their rates of change, rad/s^2; now and in all states kept."""
-    add_to_biases(params, est.states, std, rate_std)
+    add_to_biases(params, kf.states, std, rate_std)
     for k in range(TIERS * SNAPSHOTS):
-        add_to_biases(params, est.snapshots[k].states, std, rate_std)
+        add_to_biases(params, kf.snapshots[k].states, std, rate_std)
 
 
 @compiled
@@ -143,38 +143,38 @@ def add_to_biases(params: Constants, states: ErrorStates, std: float, rate_std: 
 
 
 @compiled
-def inflate_delays(params: Constants, est: Estimator, units: int) -> None:
+def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
     """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
     for u in range(1, params.units):
         if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
-            est.states.p[place, place] += params.layout.prior[place] * params.layout.prior[place]
-            forget_snapshots(est)
+            kf.states.p[place, place] += params.layout.prior[place] * params.layout.prior[place]
+            forget_snapshots(kf)
 
 
 @compiled
-def forget_snapshots(est: Estimator) -> None:
+def forget_snapshots(kf: Estimator) -> None:
     """Forget all states before now: they were surer than what is known now."""
     for tier in range(TIERS):
-        est.taken[tier] = 0
+        kf.taken[tier] = 0
 
 
 @compiled
-def predict_from(params: Constants, est: Estimator, seconds: float, states: ErrorStates) -> bool:
+def predict_from(params: Constants, kf: Estimator, seconds: float, states: ErrorStates) -> bool:
     """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
     best, latest = -1, 0.0
     for tier in range(TIERS):
-        for k in range(min(est.taken[tier], SNAPSHOTS)):
-            snapshot = est.snapshots[tier * SNAPSHOTS + k]
+        for k in range(min(kf.taken[tier], SNAPSHOTS)):
+            snapshot = kf.snapshots[tier * SNAPSHOTS + k]
             if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
                 best, latest = tier * SNAPSHOTS + k, snapshot.seconds
     if best < 0:
         return False
-    snapshot = est.snapshots[best]
+    snapshot = kf.snapshots[best]
     copy_states(params.layout, snapshot.states, states)
     for u in range(1, params.units):
-        states.x[params.layout.delays[u]] += snapshot.late[u] - est.late[u]
-    predict(params.layout, states, est.seconds - latest)
+        states.x[params.layout.delays[u]] += snapshot.late[u] - kf.late[u]
+    predict(params.layout, states, kf.seconds - latest)
     return True
 
 
@@ -190,143 +190,143 @@ LONGEST_DELAY = 0.06
 
 
 @compiled
-def find_acceleration(params: Constants, est: Estimator) -> float:
-    """Angular acceleration in the middle of the block before, into ``est.acceleration``; return its variance by noise.
+def update_acceleration(params: Constants, kf: Estimator) -> float:
+    """Angular acceleration in the middle of the block before, into ``kf.acceleration``; return its variance by noise.
 
     It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
     blocks are too slow for, that of those, unless samples between them are missing.
     """
-    ahead, behind = est.times[0] - est.times[1], est.times[1] - est.times[2]
-    span, whole = est.ended[1] - est.ended[2], est.times[0] - est.times[2]
+    ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
+    span, whole = kf.ended[1] - kf.ended[2], kf.times[0] - kf.times[2]
     # Second-order differences of means whose samples may be apart by more than others.
     first, last = behind / (ahead * whole), ahead / (behind * whole)
     worst = single = apart = 0.0
     for a in range(3):
         total = alone = 0.0
         for i in range(params.sensors.n):
-            square = est.fused.gain[a, i] * est.fused.gain[a, i]
-            total += square * est.noise.now.block[i]
-            alone += square * est.noise.now.sample[i]
+            square = kf.fused.gain[a, i] * kf.fused.gain[a, i]
+            total += square * kf.noise.now.block[i]
+            alone += square * kf.noise.now.sample[i]
         worst, single = max(worst, total), max(single, alone)
-        est.acceleration[a] = first * (est.rates[0, a] - est.rates[1, a]) + last * (est.rates[1, a] - est.rates[2, a])
-        between = (est.ends[1, a] - est.ends[2, a]) / span
-        apart += (between - est.acceleration[a]) * (between - est.acceleration[a])
+        kf.acceleration[a] = first * (kf.rates[0, a] - kf.rates[1, a]) + last * (kf.rates[1, a] - kf.rates[2, a])
+        between = (kf.ends[1, a] - kf.ends[2, a]) / span
+        apart += (between - kf.acceleration[a]) * (between - kf.acceleration[a])
     single *= 2.0 / (span * span)
-    est.shaken = 0.0
+    kf.shaken = 0.0
     noise = (first * first + last * last + (last - first) * (last - first)) * worst / params.length
     if apart <= TURNING * single or span > 2.0 * params.length * params.period:
         return noise
     # Of vibration that blocks are too slow for nobody knows what it is: what channels see of it is no delay.
-    est.shaken = apart
+    kf.shaken = apart
     return noise
 
 
 @compiled
-def find_turning(params: Constants, est: Estimator) -> None:
+def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     """Angular acceleration along each channel in the block before, and what of it is not linear.
 
     The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
     not linear in the rate.
     """
-    n, states = params.sensors.n, est.states
-    ahead, behind = est.times[0] - est.times[1], est.times[1] - est.times[2]
-    noise, square = find_acceleration(params, est), 0.0
+    n, states = params.sensors.n, kf.states
+    ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
+    noise, square = update_acceleration(params, kf), 0.0
     for a in range(3):
-        square += est.acceleration[a] * est.acceleration[a]
+        square += kf.acceleration[a] * kf.acceleration[a]
     # At rest a rate that none of the channels agree on is a fault, and no motion.
-    turning = square > TURNING * noise + est.shaken and est.noise.regime == MOTION
-    est.turning, est.turn_noise = turning, noise
-    speed = est.rates[1, 0] ** 2 + est.rates[1, 1] ** 2 + est.rates[1, 2] ** 2
-    if est.noise.regime == REST:
+    turning = square > TURNING * noise + kf.shaken and kf.noise.regime == MOTION
+    kf.turning, kf.turn_noise = turning, noise
+    speed = kf.rates[1, 0] ** 2 + kf.rates[1, 1] ** 2 + kf.rates[1, 2] ** 2
+    if kf.noise.regime == REST:
         for i in range(n):
-            est.turn[i] = est.extra[i] = 0.0
+            kf.angular_acceleration[i] = kf.extra[i] = 0.0
         return
     for i in range(n):
         along = jerk = lately = 0.0
         for a in range(3):
             h = params.sensors.axes[i, a]
-            along += h * est.acceleration[a]
-            after, before = (est.rates[0, a] - est.rates[1, a]) / ahead, (est.rates[1, a] - est.rates[2, a]) / behind
+            along += h * kf.acceleration[a]
+            after, before = (kf.rates[0, a] - kf.rates[1, a]) / ahead, (kf.rates[1, a] - kf.rates[2, a]) / behind
             lately += h * after
             jerk += h * 2.0 * (after - before) / (ahead + behind)
-        est.turn[i] = along if turning else 0.0
+        kf.angular_acceleration[i] = along if turning else 0.0
         swift = params.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
-        est.extra[i] = swift * swift + params.bent * params.bent * speed
+        kf.extra[i] = swift * swift + params.nonlinearity * params.nonlinearity * speed
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
-            est.extra[i] += second * (noise + est.shaken) + ((0.5 * second * jerk) ** 2 if turning else 0.0)
+            kf.extra[i] += second * (noise + kf.shaken) + ((0.5 * second * jerk) ** 2 if turning else 0.0)
 
 
 @compiled
-def judge_block(params: Constants, est: Estimator) -> float:
+def judge_block(params: Constants, kf: Estimator) -> float:
     """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable.
 
     Its means are put to its middle, and the share of noise in the statistics of blocks is noted.
     """
-    n, noise, layout = params.sensors.n, est.noise, params.layout
+    n, noise, layout = params.sensors.n, kf.noise, params.layout
     for a in range(3):
-        est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
-    find_signals(layout, est.signal_rate, est.turn, est.block_at.signals)
-    project(layout, est.states, est.block_at)
-    mask = est.masks[1]
+        kf.signal_rate[a] = kf.rates[1, a] if noise.regime == MOTION else 0.0
+    fill_signals(layout, kf.signal_rate, kf.angular_acceleration, kf.block_at.signals)
+    project(layout, kf.states, kf.block_at)
+    mask = kf.masks[1]
     for i in range(n):
         # Of a unit that is slower than the others the samples lie otherwise in the block.
-        est.means[1, i] -= est.turn[i] * est.middles[1, i]
+        kf.means[1, i] -= kf.angular_acceleration[i] * kf.middles[1, i]
         for j in range(n):
-            est.matrix[i, j] = est.block_at.covariance[i, j]
-        est.matrix[i, i] += noise.now.block[i] * noise.longest[i] / params.length + est.extra[i]
-    weigh_together(est.block_parity, n, mask, est.matrix)
-    eliminate_rate(est.block_parity, n, params.sensors.axes, UNKNOWN_RATE)
-    subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+            kf.matrix[i, j] = kf.block_at.covariance[i, j]
+        kf.matrix[i, i] += noise.now.block[i] * noise.longest[i] / params.length + kf.extra[i]
+    compute_joint_weights(kf.block_parity, n, mask, kf.matrix)
+    eliminate_rate(kf.block_parity, n, params.sensors.axes, UNKNOWN_RATE)
+    subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
     chi, free = 0.0, -3.0
     for i in range(n):
         total = share = 0.0
-        information = est.block_parity.information
+        information = kf.block_parity.information
         if mask >> i & 1:
             for j in range(n):
                 if mask >> j & 1:
-                    total += information[i, j] * est.block_innovation[j]
+                    total += information[i, j] * kf.block_innovation[j]
                     variance = noise.now.block[j] * noise.longest[j] / params.length
                     share += information[i, j] * information[i, j] * variance
-            chi += total * est.block_innovation[i]
+            chi += total * kf.block_innovation[i]
             free += 1.0
         for j in range(n):
-            est.block_information[i, j] = information[i, j]
-        est.block_values[i] = total
+            kf.block_information[i, j] = information[i, j]
+        kf.block_values[i] = total
         noise.share[i] = max(share / information[i, i], LEAST_SHARE) if information[i, i] > 0.0 else 1.0
     return min(1.0, usual_chi(free) / max(chi, 1e-9))
 
 
 @compiled
-def find_rest(params: Constants, est: Estimator) -> None:
+def update_rest(params: Constants, kf: Estimator) -> None:
     """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
     for a in range(3):
-        est.rest_rates[est.rest_count % REST_BLOCKS, a] = est.rates[1, a]
-    newest = est.rest_count % REST_BLOCKS
-    est.rest_count += 1
-    est.rest = False
-    if est.rest_count < REST_BLOCKS:
+        kf.rest_rates[kf.rest_count % REST_BLOCKS, a] = kf.rates[1, a]
+    newest = kf.rest_count % REST_BLOCKS
+    kf.rest_count += 1
+    kf.rest = False
+    if kf.rest_count < REST_BLOCKS:
         return
     n = params.sensors.n
     for a in range(3):
         variance = known = 0.0
         for i in range(n):
-            gain, part = est.fused.gain[a, i], 0.0
+            gain, part = kf.fused.gain[a, i], 0.0
             if gain != 0.0:
-                variance += gain * gain * est.noise.now.block[i] / params.length
+                variance += gain * gain * kf.noise.now.block[i] / params.length
                 for j in range(n):
-                    part += est.fused.gain[a, j] * est.at.covariance[i, j]
+                    part += kf.fused.gain[a, j] * kf.at.covariance[i, j]
                 known += gain * part
-        est.rest_noise[a] = variance
+        kf.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
-        est.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
-    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_bias_variance, params.rest_std * params.rest_std)
-    if est.noise.lived[REST] > LIVED:
+        kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
+    kf.rest = rests(kf.rest_rates, newest, kf.rest_noise, kf.rest_bias_variance, params.rest_std * params.rest_std)
+    if kf.noise.lived[REST] > LIVED:
         # A hover in vibration may turn as little: it is known by its noise.
         for i in range(n):
-            if est.masks[1] >> i & 1 and est.noise.now.block[i] > QUIET * est.noise.kept[REST].block[i]:
-                est.rest = est.rest and est.noise.regime == REST
+            if kf.masks[1] >> i & 1 and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]:
+                kf.rest = kf.rest and kf.noise.regime == REST
 
 
 @compiled
@@ -349,119 +349,119 @@ def unlearnable(error: float, inside: float, square: float) -> float:
 
 
 @compiled
-def find_unlearnable(params: Constants, est: Estimator) -> None:
-    """Variance that each state of the motion keeps at least, into ``est.taught``; biases have no motion in them."""
-    layout, noise, at, n = params.layout, est.noise, est.block_at, params.sensors.n
+def update_least_variances(params: Constants, kf: Estimator) -> None:
+    """Variance that each state of the motion keeps at least, into ``kf.taught``; biases have no motion in them."""
+    layout, noise, at, n = params.layout, kf.noise, kf.block_at, params.sensors.n
     for r in range(layout.count):
-        est.taught[r] = 0.0
-    if est.rest:
+        kf.taught[r] = 0.0
+    if kf.rest:
         return
     quick = 0.0
     for a in range(3):
-        inside = est.shared.vibration[a]
+        inside = kf.shared.vibration[a]
         quick = max(quick, inside)
         for i in range(n):
             along = params.sensors.axes[i, a] * params.sensors.axes[i, a] / (UNEQUAL * UNEQUAL * params.length)
             inside = max(inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i])
             quick = max(quick, along * noise.now.block[i] * noise.longest[i])
         # A peak of vibration is no motion.
-        est.usual_rate[a] += (est.signal_rate[a] * est.signal_rate[a] - est.usual_rate[a]) / REST_BLOCKS
+        kf.usual_rate[a] += (kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]) / REST_BLOCKS
         for i in range(n):
             error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
-            est.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, est.usual_rate[a])
+            kf.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, kf.usual_rate[a])
     for i in range(n):
-        place, turn = layout.place[i, TURN], at.signals[i, TURN]
+        place, angular_acceleration = layout.place[i, TURN], at.signals[i, TURN]
         if place >= 0:
             # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be
             # learned in the first seconds of motion.
             error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / params.length
-            least = unlearnable(error, 0.5 * quick / (est.span * est.span), turn * turn)
+            least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), angular_acceleration * angular_acceleration)
             # A unit learns from that of its axes which turns most.
-            est.taught[place] = least if est.taught[place] == 0.0 else min(est.taught[place], least)
+            kf.taught[place] = least if kf.taught[place] == 0.0 else min(kf.taught[place], least)
 
 
 @compiled
-def learn(params: Constants, est: Estimator, weight: float) -> None:
+def learn(params: Constants, kf: Estimator, weight: float) -> None:
     """Correct the states by the block before.
 
     At rest the rate is known to be zero. The estimated one would be the noise of the values themselves, and is no
     signal there.
     """
     n, layout = params.sensors.n, params.layout
-    kept = est.masks[1] & ~est.doubted
-    if est.rest:
+    kept = kf.masks[1] & ~kf.under_test
+    if kf.rest:
         for i in range(n):
             for j in range(n):
-                est.matrix[i, j] -= est.block_at.covariance[i, j]
+                kf.matrix[i, j] -= kf.block_at.covariance[i, j]
             for k in range(ONE + 1, SIGNALS):
-                est.block_at.signals[i, k] = 0.0
-        project(layout, est.states, est.block_at)
+                kf.block_at.signals[i, k] = 0.0
+        project(layout, kf.states, kf.block_at)
         for i in range(n):
             for j in range(n):
-                est.matrix[i, j] += est.block_at.covariance[i, j]
-        subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
-    if est.rest or kept != est.masks[1]:
-        weigh_together(est.block_parity, n, kept, est.matrix)
-        known = 1.0 / (params.rest_std * params.rest_std) if est.rest else UNKNOWN_RATE
-        eliminate_rate(est.block_parity, n, params.sensors.axes, known)
-    find_unlearnable(params, est)
-    update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight, est.taught)
+                kf.matrix[i, j] += kf.block_at.covariance[i, j]
+        subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
+    if kf.rest or kept != kf.masks[1]:
+        compute_joint_weights(kf.block_parity, n, kept, kf.matrix)
+        known = 1.0 / (params.rest_std * params.rest_std) if kf.rest else UNKNOWN_RATE
+        eliminate_rate(kf.block_parity, n, params.sensors.axes, known)
+    update_least_variances(params, kf)
+    update(layout, kf.states, kf.block_at, kf.block_parity.information, kf.block_innovation, weight, kf.taught)
 
 
 @compiled
-def foresee(params: Constants, est: Estimator) -> None:
+def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
-    n, layout, square, ahead = params.sensors.n, params.layout, 0.0, est.times[0] - est.times[1]
+    n, layout, square, ahead = params.sensors.n, params.layout, 0.0, kf.times[0] - kf.times[1]
     for a in range(3):
-        change = (est.rates[0, a] - est.rates[1, a]) / ahead
+        change = (kf.rates[0, a] - kf.rates[1, a]) / ahead
         square += change * change
-    moves = est.noise.regime == MOTION
-    begins = est.turning or (moves and square > 4.0 * TURNING * est.turn_noise)
+    moves = kf.noise.regime == MOTION
+    begins = kf.turning or (moves and square > 4.0 * TURNING * kf.turn_noise)
     for i in range(n):
         quick = 0.0
         for a in range(3):
-            quick += params.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / ahead
+            quick += params.sensors.axes[i, a] * (kf.rates[0, a] - kf.rates[1, a]) / ahead
         if not begins:
             quick = 0.0
-        if abs(est.turn[i]) > abs(quick):
-            quick = est.turn[i]
-        est.peak_turn[i] = quick if abs(quick) > PEAK * abs(est.peak_turn[i]) else PEAK * est.peak_turn[i]
-        est.peak_extra[i] = max(PEAK * est.peak_extra[i], est.extra[i])
+        if abs(kf.angular_acceleration[i]) > abs(quick):
+            quick = kf.angular_acceleration[i]
+        kf.peak_turn[i] = quick if abs(quick) > PEAK * abs(kf.peak_turn[i]) else PEAK * kf.peak_turn[i]
+        kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
     for a in range(3):
-        est.signal_rate[a] = est.rates[0, a] if moves else 0.0
-    find_signals(layout, est.signal_rate, est.peak_turn, est.at.signals)
-    project(layout, est.states, est.at)
+        kf.signal_rate[a] = kf.rates[0, a] if moves else 0.0
+    fill_signals(layout, kf.signal_rate, kf.peak_turn, kf.at.signals)
+    project(layout, kf.states, kf.at)
     for i in range(n):
-        est.at.covariance[i, i] += est.peak_extra[i]
-    est.speed_squared = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
-    weigh(params, est)
+        kf.at.covariance[i, i] += kf.peak_extra[i]
+    kf.speed_squared = kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
+    update_weights(params, kf)
 
 
 @compiled
-def find_behind(params: Constants, est: Estimator) -> None:
+def update_time_offsets(params: Constants, kf: Estimator) -> None:
     """Find by how much values lie before the stamp, if the earliest unit is in time, and how far units are apart.
 
     `restamp` brings all units to the instant of the latest, the states what is left to that of the first unit.
     """
     latest = earliest = least = most = 0.0
     for u in range(1, params.units):
-        late = est.late[u]
-        left = late + est.states.x[params.layout.delays[u]]
+        late = kf.late[u]
+        remaining = late + kf.states.x[params.layout.delays[u]]
         latest, earliest = max(latest, late), min(earliest, late)
-        most, least = max(most, left), min(least, left)
-    est.behind, est.spread = latest - earliest, most - least
+        most, least = max(most, remaining), min(least, remaining)
+    kf.behind, kf.spread = latest - earliest, most - least
 
 
 @compiled
-def transfer_delays(params: Constants, est: Estimator) -> bool:
+def transfer_delays(params: Constants, kf: Estimator) -> bool:
     """Move delays that are sure from their states to ``late``, which `restamp` makes up for; return whether any was."""
     changed = False
     for u in range(1, params.units):
         place = params.layout.delays[u]
-        delay, variance = est.states.x[place], est.states.p[place, place]
+        delay, variance = kf.states.x[place], kf.states.p[place, place]
         if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
-            step = min(max(delay, -LONGEST_DELAY - est.late[u]), LONGEST_DELAY - est.late[u])
-            est.late[u] += step
-            est.states.x[place] -= step
+            step = min(max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u])
+            kf.late[u] += step
+            kf.states.x[place] -= step
             changed = changed or step != 0.0
     return changed

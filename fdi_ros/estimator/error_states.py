@@ -4,7 +4,7 @@
 """What the sensors do wrong: bias, scale, misalignment, delay, and how these change, as one error state.
 
 Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each kind of error is one `StateKind` of the
-table `KINDS`: its states enter a channel by a signal each (`find_signals`), so that ``y = C x + H w + e`` with row i of
+table `ERROR_KINDS`: its states enter a channel by a signal each (`fill_signals`): ``y = C x + H w + e`` with row i of
 C the signals of channel i at the places of its states. Some have no signal: they are the rate of change of others.
 
 To add a kind of error (an error by acceleration, by temperature): the recipe in docs/architecture.md.
@@ -49,7 +49,7 @@ class StateKind(NamedTuple):
     """Name of the kind whose rate of change this is."""
 
 
-KINDS = (
+ERROR_KINDS = (
     StateKind("bias", "rad/s", False, (ONE,), "bias_std", "bias_walk"),
     StateKind("scale", "", False, (RATE_X, RATE_Y, RATE_Z), "scale_std", "scale_walk"),
     StateKind("delay", "s", True, (TURN,), "delay_std", "delay_walk"),
@@ -59,7 +59,7 @@ KINDS = (
 """Biases stand first; a new kind stands last."""
 BIAS_RATE_STD = 5e-6
 """rad/s^2: 6 mrad/s in the 20 min in which a sensor warms up."""
-MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.signals), 1) for kind in KINDS)
+MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.signals), 1) for kind in ERROR_KINDS)
 
 States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]
 Places = Annotated[NDArray[np.int64], "i8", (MAX_STATES,)]
@@ -104,7 +104,7 @@ class Projection:
 def places_of(name: str, n: int, units: int) -> list[list[int]]:
     """States of a kind: of each channel, or of each unit but the first, one list."""
     at = 0
-    for kind in KINDS:
+    for kind in ERROR_KINDS:
         owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.signals), 1)
         if kind.name == name:
             return [[at + owner * each + k for k in range(each)] for owner in range(owners)]
@@ -124,12 +124,12 @@ def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int
     units
         Number of units.
     std
-        Priors and walks by the names in `KINDS`, scalar or (n,).
+        Priors and walks by the names in `ERROR_KINDS`, scalar or (n,).
     """
     n = len(unit)
     layout["n"], layout["place"], layout["feeds"], layout["delays"] = n, -1, -1, -1
     count = 0
-    for kind in KINDS:
+    for kind in ERROR_KINDS:
         owners = places_of(kind.name, n, units)
         for owner, places in enumerate(owners):
             count += len(places)
@@ -180,12 +180,12 @@ def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
 
 
 @compiled
-def find_signals(layout: Layout, rate: Array, turn: Array, signals: Array) -> None:
+def fill_signals(layout: Layout, rate: Array, angular_acceleration: Array, signals: Array) -> None:
     """Signals (n, `SIGNALS`) at a body rate (3,) rad/s and an angular acceleration along each channel (n,) rad/s^2."""
     for i in range(layout.n):
         signals[i, ONE] = 1.0
         signals[i, RATE_X], signals[i, RATE_Y], signals[i, RATE_Z] = rate[0], rate[1], rate[2]
-        signals[i, TURN] = -turn[i]
+        signals[i, TURN] = -angular_acceleration[i]
 
 
 @compiled
@@ -256,8 +256,8 @@ def update(
     count = layout.count
     for j in range(layout.n):
         if information[j, j] != 0.0:
-            find_gain(layout, at, information, j, weight)
-    find_shares(layout, states, at, information, taught)
+            fill_gain(layout, at, information, j, weight)
+    fill_shares(layout, states, at, information, taught)
     for j in range(layout.n):
         if information[j, j] != 0.0:
             for r in range(count):
@@ -271,7 +271,7 @@ def update(
 
 
 @compiled
-def find_shares(layout: Layout, states: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
+def fill_shares(layout: Layout, states: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
     """Put into ``taught`` (states,), which holds the least variances, the share of its gain that each state takes."""
     for r in range(layout.count):
         least, taught[r], gained = taught[r], 1.0, 0.0
@@ -287,7 +287,7 @@ def find_shares(layout: Layout, states: ErrorStates, at: Projection, information
 
 
 @compiled
-def find_gain(layout: Layout, at: Projection, information: Array, j: int, weight: float) -> None:
+def fill_gain(layout: Layout, at: Projection, information: Array, j: int, weight: float) -> None:
     """Column j of P C' A, into ``at.weighted``."""
     row = at.weighted[j]
     for r in range(layout.count):

@@ -33,9 +33,9 @@ from fdi_ros.compiling.record import (
     Whole,
     record,
 )
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_joint_weights, compute_weights, eliminate_rate
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, find_signals, subtract_errors
+from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, fill_signals, subtract_errors
 from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array
 
@@ -83,10 +83,10 @@ class Constants:
     members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # channels of each unit
     length: Whole  # samples of a block
     period: Real  # of the samples, s
-    pace: Real  # of the noise of the moment, per block
+    adaptation_gain: Real  # of the noise of the moment, per block
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
-    bent: Real  # error that is not linear in the rate, standard deviation, share of it
+    nonlinearity: Real  # error that is not linear in the rate, standard deviation, share of it
     rest_std: Real  # of the rate at rest, rad/s
     spans: Sets  # sets of channels that span space
     least: Whole  # samples that a fault lasts
@@ -122,9 +122,9 @@ class Estimator:
     samples: Whole
     seconds: Real  # since the start
     mask: Mask  # channels of the last sample
-    aside: Mask  # channels under doubt that the rate leaves out
+    excluded_from_rate: Mask  # channels under doubt that the rate leaves out
     beyond: Mask  # channels of the last sample that were out of range
-    doubted: Mask  # channels under doubt, which the states learn nothing from
+    under_test: Mask  # channels under doubt, which the states learn nothing from
     learned_at: Real  # the states are of this time, s since the start
     states: ErrorStates
     noise: Noise
@@ -179,7 +179,7 @@ class Estimator:
     block_information: Square  # A of all its channels, whatever is learned from, s^2/rad^2
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
-    turn: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
+    angular_acceleration: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
     turning: Flag  # it is more than noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     turn_noise: Real  # its variance, (rad/s^2)^2
@@ -208,90 +208,90 @@ class Estimator:
 
 
 @compiled
-def weigh(params: Constants, est: Estimator) -> None:
+def update_weights(params: Constants, kf: Estimator) -> None:
     """Work out what samples of the channels present are judged and fused with.
 
     What is not known of the states lasts until the next block: it counts twice the samples of a block, or it would be
     summed up as if it were white.
     """
-    n, noise = params.sensors.n, est.noise
+    n, noise = params.sensors.n, kf.noise
     lasting = 2.0 * params.length
-    weigh_each(est.parity, n, est.mask, noise.now.sample)
-    eliminate_rate(est.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    compute_weights(kf.parity, n, kf.mask, noise.now.sample)
+    eliminate_rate(kf.parity, n, params.sensors.axes, UNKNOWN_RATE)
     for i in range(n):
-        est.known[i] = est.parity.information[i, i]
+        kf.known[i] = kf.parity.information[i, i]
     for i in range(n):
         for j in range(n):
-            est.matrix[i, j] = lasting * est.at.covariance[i, j]
-        est.matrix[i, i] += noise.now.sample[i]
-    weigh_together(est.parity, n, est.mask, est.matrix)
-    eliminate_rate(est.parity, n, params.sensors.axes, UNKNOWN_RATE)
-    est.judged = est.checked = 0
+            kf.matrix[i, j] = lasting * kf.at.covariance[i, j]
+        kf.matrix[i, i] += noise.now.sample[i]
+    compute_joint_weights(kf.parity, n, kf.mask, kf.matrix)
+    eliminate_rate(kf.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    kf.judged = kf.checked = 0
     for i in range(n):
-        information, share = est.parity.information[i, i], 0.0
-        if est.mask >> i & 1 and information * est.matrix[i, i] > SENSITIVE:
-            est.judged |= 1 << i
+        information, share = kf.parity.information[i, i], 0.0
+        if kf.mask >> i & 1 and information * kf.matrix[i, i] > SENSITIVE:
+            kf.judged |= 1 << i
             for j in range(n):
-                share += est.parity.information[i, j] * est.parity.information[i, j] * noise.now.sample[j]
-            est.share[i] = max(share / information, LEAST_SHARE)
+                share += kf.parity.information[i, j] * kf.parity.information[i, j] * noise.now.sample[j]
+            kf.share[i] = max(share / information, LEAST_SHARE)
             # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
-            hidden = est.known[i] / information - 1.0
+            hidden = kf.known[i] / information - 1.0
             if hidden * CHECKABLE_AT / lasting < 1.0 / CHECKABLE - 1.0:
-                est.checked |= 1 << i
-        est.growth[i] = est.shared.level[i] + est.at.covariance[i, i]
-    kept = est.mask & ~est.aside & ~est.beyond
+                kf.checked |= 1 << i
+        kf.growth[i] = kf.shared.level[i] + kf.at.covariance[i, i]
+    kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
     if not params.spans[kept]:
-        kept = est.mask
-    weigh_each(est.fused, n, kept, est.growth)
-    eliminate_rate(est.fused, n, params.sensors.axes, UNKNOWN_RATE)
+        kept = kf.mask
+    compute_weights(kf.fused, n, kept, kf.growth)
+    eliminate_rate(kf.fused, n, params.sensors.axes, UNKNOWN_RATE)
 
 
 @compiled
-def correct_sample(params: Constants, est: Estimator, values: Array) -> None:
+def correct_sample(params: Constants, kf: Estimator, values: Array) -> None:
     """Correct a sample by what is known now: its rate, and what is left over of every channel."""
     n, layout = params.sensors.n, params.layout
-    signals, left = est.at.signals, est.innovation
-    find_signals(layout, est.zero, est.turn, signals)
-    subtract_errors(layout, est.states, signals, values, left)
-    apply_gain(est.fused.gain, n, left, est.rate)
-    if est.noise.regime == MOTION:
-        find_signals(layout, est.rate, est.turn, signals)
-    subtract_errors(layout, est.states, signals, values, est.corrected)
-    apply_gain(est.fused.gain, n, est.corrected, est.rate)
+    signals, innovation = kf.at.signals, kf.innovation
+    fill_signals(layout, kf.zero, kf.angular_acceleration, signals)
+    subtract_errors(layout, kf.states, signals, values, innovation)
+    apply_gain(kf.fused.gain, n, innovation, kf.rate)
+    if kf.noise.regime == MOTION:
+        fill_signals(layout, kf.rate, kf.angular_acceleration, signals)
+    subtract_errors(layout, kf.states, signals, values, kf.corrected)
+    apply_gain(kf.fused.gain, n, kf.corrected, kf.rate)
     for i in range(n):
-        left[i] = 0.0
-        if est.mask >> i & 1:
-            left[i] = est.corrected[i]
+        innovation[i] = 0.0
+        if kf.mask >> i & 1:
+            innovation[i] = kf.corrected[i]
             for a in range(3):
-                left[i] -= params.sensors.axes[i, a] * est.rate[a]
+                innovation[i] -= params.sensors.axes[i, a] * kf.rate[a]
 
 
 @compiled
-def watch_for_motion(params: Constants, est: Estimator) -> None:
+def watch_for_motion(params: Constants, kf: Estimator) -> None:
     """Let rest end where a rate shows, and no error that looks like it."""
-    n, noise = params.sensors.n, est.noise
-    square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
+    n, noise = params.sensors.n, kf.noise
+    square = kf.rate[0] * kf.rate[0] + kf.rate[1] * kf.rate[1] + kf.rate[2] * kf.rate[2]
     if noise.regime == MOTION or not square > 0.0:
         return
     variance = 0.0
     for a in range(3):
         for i in range(n):
-            gain = est.fused.gain[a, i]
-            variance += gain * gain * (noise.now.sample[i] + est.at.covariance[i, i])
+            gain = kf.fused.gain[a, i]
+            variance += gain * gain * (noise.now.sample[i] + kf.at.covariance[i, i])
     if square <= BEGINS * variance:
         return
     moving = odd = 0.0
     for i in range(n):
-        if est.mask >> i & 1:
+        if kf.mask >> i & 1:
             along = 0.0
             for a in range(3):
-                along += params.sensors.axes[i, a] * est.rate[a]
+                along += params.sensors.axes[i, a] * kf.rate[a]
             moving += along * along / noise.now.sample[i]
             for j in range(n):
-                odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
+                odd += kf.innovation[i] * kf.parity.information[i, j] * kf.innovation[j]
     if moving > THREE_SIGMA * odd:
         change_regime(noise, n, MOTION, True)
-        weigh(params, est)
+        update_weights(params, kf)
 
 
 @compiled
@@ -301,28 +301,28 @@ def usual_chi(free: float) -> float:
 
 
 @compiled
-def find_statistics(params: Constants, est: Estimator) -> None:
+def update_statistics(params: Constants, kf: Estimator) -> None:
     """Statistics of a sample: the innovation of each channel in its standard deviations.
 
     What is not known of the states grows with motion, which may be faster now than in the last block.
     """
     n = params.sensors.n
-    square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
-    more = max((square + SLOW_TURN) / (est.speed_squared + SLOW_TURN), 1.0)
+    square = kf.rate[0] * kf.rate[0] + kf.rate[1] * kf.rate[1] + kf.rate[2] * kf.rate[2]
+    more = max((square + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
     chi, free = 0.0, -3.0
     for i in range(n):
-        est.statistic[i], est.inflation[i] = 0.0, 1.0
-        if est.judged >> i & 1:
+        kf.statistic[i], kf.inflation[i] = 0.0, 1.0
+        if kf.judged >> i & 1:
             total = 0.0
             for j in range(n):
-                total += est.parity.information[i, j] * est.innovation[j]
-            variance = est.share[i] + more * (1.0 - est.share[i])
-            est.statistic[i] = total / math.sqrt(est.parity.information[i, i] * variance)
-            est.inflation[i] = variance / est.share[i]
-            chi += total * est.innovation[i] / max(est.shared.level[i] / est.noise.now.sample[i], 1.0)
+                total += kf.parity.information[i, j] * kf.innovation[j]
+            variance = kf.share[i] + more * (1.0 - kf.share[i])
+            kf.statistic[i] = total / math.sqrt(kf.parity.information[i, i] * variance)
+            kf.inflation[i] = variance / kf.share[i]
+            chi += total * kf.innovation[i] / max(kf.shared.level[i] / kf.noise.now.sample[i], 1.0)
             free += 1.0
-        est.distance[i] = abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
-    est.odd = max(1.0, chi / usual_chi(free))
+        kf.distance[i] = abs(kf.statistic[i]) * math.sqrt(kf.share[i] * kf.inflation[i])
+    kf.odd = max(1.0, chi / usual_chi(free))
 
 
 @compiled
@@ -336,111 +336,111 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 
 @compiled
-def is_spike(params: Constants, est: Estimator) -> bool:
+def is_spike(params: Constants, kf: Estimator) -> bool:
     """Whether the last sample is far off, as few before it were; what is so for longer is none."""
     far = False
     for i in range(params.sensors.n):
-        far = far or est.statistic[i] * est.statistic[i] > FAR
-    est.far = est.far + 1 if far else 0
-    return 0 < est.far <= SPIKE
+        far = far or kf.statistic[i] * kf.statistic[i] > FAR
+    kf.far = kf.far + 1 if far else 0
+    return 0 < kf.far <= SPIKE
 
 
 @compiled
-def add_sample(params: Constants, est: Estimator, values: Array, seconds: float) -> bool:
+def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and to the block being filled; return whether that is complete.
 
     A block of other channels than those before is none of the same. From a spike nothing is learned.
     """
-    n, total, spike = params.sensors.n, est.total, is_spike(params, est)
-    total.sample = est.samples
-    if est.filled == 0:
-        est.begun = est.seconds - seconds
+    n, total, spike = params.sensors.n, kf.total, is_spike(params, kf)
+    total.sample = kf.samples
+    if kf.filled == 0:
+        kf.begun = kf.seconds - seconds
     for i in range(n):
-        if est.mask >> i & 1:
+        if kf.mask >> i & 1:
             total.values[i] += values[i]
             total.count[i] += 1.0
-        if est.mask >> i & 1 and not spike:
-            est.sum_values[i] += values[i]
-            est.sum_count[i] += 1.0
-            est.sum_time[i] += est.seconds - est.begun
-    est.sum_seconds += est.seconds - est.begun
+        if kf.mask >> i & 1 and not spike:
+            kf.sum_values[i] += values[i]
+            kf.sum_count[i] += 1.0
+            kf.sum_time[i] += kf.seconds - kf.begun
+    kf.sum_seconds += kf.seconds - kf.begun
     for a in range(3):
         if not spike:
-            total.instant[a] = est.rate[a]
+            total.instant[a] = kf.rate[a]
         total.rate[a] += total.instant[a]
-        est.sum_rate[a] += total.instant[a]
-    copy_total(n, total, est.last_samples[est.samples % SAMPLES])
-    est.filled += 1
-    if est.filled < params.length:
+        kf.sum_rate[a] += total.instant[a]
+    copy_total(n, total, kf.last_samples[kf.samples % SAMPLES])
+    kf.filled += 1
+    if kf.filled < params.length:
         return False
-    close_block(params, est)
-    copy_total(n, total, est.last_blocks[est.all_blocks % BLOCKS])
-    if est.all_blocks % STRIDE == 0:
-        copy_total(n, total, est.last_coarse[est.all_blocks // STRIDE % COARSE])
+    close_block(params, kf)
+    copy_total(n, total, kf.last_blocks[kf.all_blocks % BLOCKS])
+    if kf.all_blocks % STRIDE == 0:
+        copy_total(n, total, kf.last_coarse[kf.all_blocks // STRIDE % COARSE])
     return True
 
 
 @compiled
-def close_block(params: Constants, est: Estimator) -> None:
+def close_block(params: Constants, kf: Estimator) -> None:
     """Take the means of a block that is complete, and begin the next one."""
-    n, present, middle = params.sensors.n, 0, est.sum_seconds / params.length
+    n, present, middle = params.sensors.n, 0, kf.sum_seconds / params.length
     for i in range(n):
         # A unit may be slower than the others.
-        if 2.0 * est.sum_count[i] >= params.length:
+        if 2.0 * kf.sum_count[i] >= params.length:
             present |= 1 << i
-        est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / max(est.sum_count[i], 1.0)
-        est.middles[1, i] = est.middles[0, i]
-        est.middles[0, i] = est.sum_time[i] / max(est.sum_count[i], 1.0) - middle
-        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = 0.0
-    est.masks[1], est.masks[0] = est.masks[0], present
+        kf.means[1, i], kf.means[0, i] = kf.means[0, i], kf.sum_values[i] / max(kf.sum_count[i], 1.0)
+        kf.middles[1, i] = kf.middles[0, i]
+        kf.middles[0, i] = kf.sum_time[i] / max(kf.sum_count[i], 1.0) - middle
+        kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
+    kf.masks[1], kf.masks[0] = kf.masks[0], present
     for a in range(3):
-        est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
-        est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.total.instant[a]
-        est.rates[0, a] = est.sum_rate[a] / params.length
-        est.sum_rate[a] = 0.0
-    est.times[2], est.times[1], est.times[0] = est.times[1], est.times[0], est.begun + middle
-    est.ended[2], est.ended[1], est.ended[0] = est.ended[1], est.ended[0], est.seconds
-    est.sum_seconds = 0.0
-    est.filled = 0
-    est.span = est.seconds - est.begun
-    est.blocks += 1
-    est.all_blocks += 1
+        kf.rates[2, a], kf.rates[1, a] = kf.rates[1, a], kf.rates[0, a]
+        kf.ends[2, a], kf.ends[1, a], kf.ends[0, a] = kf.ends[1, a], kf.ends[0, a], kf.total.instant[a]
+        kf.rates[0, a] = kf.sum_rate[a] / params.length
+        kf.sum_rate[a] = 0.0
+    kf.times[2], kf.times[1], kf.times[0] = kf.times[1], kf.times[0], kf.begun + middle
+    kf.ended[2], kf.ended[1], kf.ended[0] = kf.ended[1], kf.ended[0], kf.seconds
+    kf.sum_seconds = 0.0
+    kf.filled = 0
+    kf.span = kf.seconds - kf.begun
+    kf.blocks += 1
+    kf.all_blocks += 1
 
 
 @compiled
-def total_before(est: Estimator, sample: int, out: Total, n: int) -> None:
+def total_before(kf: Estimator, sample: int, out: Total, n: int) -> None:
     """Find the sums up to the last kept moment before a sample, or nearly."""
-    if est.samples - sample < SAMPLES - 1:
-        copy_total(n, est.last_samples[(sample - 1) % SAMPLES], out)
+    if kf.samples - sample < SAMPLES - 1:
+        copy_total(n, kf.last_samples[(sample - 1) % SAMPLES], out)
         return
-    for back in range(min(BLOCKS, est.all_blocks)):
-        kept = est.last_blocks[(est.all_blocks - back) % BLOCKS]
+    for back in range(min(BLOCKS, kf.all_blocks)):
+        kept = kf.last_blocks[(kf.all_blocks - back) % BLOCKS]
         if kept.sample < sample:
             copy_total(n, kept, out)
             return
-    found = est.last_coarse[est.all_blocks // STRIDE % COARSE]
-    for back in range(min(COARSE, est.all_blocks // STRIDE)):
-        found = est.last_coarse[(est.all_blocks // STRIDE - back) % COARSE]
+    found = kf.last_coarse[kf.all_blocks // STRIDE % COARSE]
+    for back in range(min(COARSE, kf.all_blocks // STRIDE)):
+        found = kf.last_coarse[(kf.all_blocks // STRIDE - back) % COARSE]
         if found.sample < sample:
             break
     copy_total(n, found, out)
 
 
 @compiled
-def drop_block(est: Estimator, n: int) -> None:
+def drop_block(kf: Estimator, n: int) -> None:
     """Begin the block anew: with a hole in it, it would have no time of its own."""
-    est.filled, est.sum_seconds = 0, 0.0
+    kf.filled, kf.sum_seconds = 0, 0.0
     for i in range(n):
-        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = 0.0
+        kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
     for a in range(3):
-        est.sum_rate[a] = 0.0
+        kf.sum_rate[a] = 0.0
 
 
 @compiled
-def forget_motion(est: Estimator, n: int) -> None:
+def forget_motion(kf: Estimator, n: int) -> None:
     """Begin all anew that is known of the motion."""
-    drop_block(est, n)
-    est.blocks, est.rest_count, est.rest = 0, 0, False
-    est.unseen = est.samples > 0
+    drop_block(kf, n)
+    kf.blocks, kf.rest_count, kf.rest = 0, 0, False
+    kf.unseen = kf.samples > 0
     for i in range(n):
-        est.turn[i] = est.extra[i] = 0.0
+        kf.angular_acceleration[i] = kf.extra[i] = 0.0

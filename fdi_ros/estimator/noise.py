@@ -159,7 +159,7 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
         noise.unknown[i] = 1.0 + UNKNOWN
         noise.degrees[i] = TRUST
         noise.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
-    find_longest(noise, n)
+    update_longest(noise, n)
 
 
 @compiled
@@ -171,7 +171,7 @@ def fill_levels(levels: Levels, i: int, expected: float) -> None:
 
 
 @compiled
-def find_longest(noise: Noise, n: int) -> None:
+def update_longest(noise: Noise, n: int) -> None:
     """Take over from the levels by how much the noise of longer times exceeds that of blocks, at least 1."""
     for i in range(n):
         noise.longest[i] = 1.0
@@ -192,7 +192,7 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
             before.level[k, i] = noise.now.level[k, i]
             noise.now.level[k, i] = max(after.level[k, i], noise.now.level[k, i] if at_least else 0.0)
     noise.regime = regime
-    find_longest(noise, n)
+    update_longest(noise, n)
 
 
 @compiled
@@ -209,9 +209,9 @@ def place_of(noise: Noise, mask: int) -> int:
 
 
 @compiled
-def take_sample_steps(noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
+def update_sample_noise(noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
     """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
-    pace = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    adaptation_gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
     # Of other channels the rate is another: their difference would be that of the errors of the sensors.
     place = place_of(noise, mask)
     for i in range(n):
@@ -225,8 +225,8 @@ def take_sample_steps(noise: Noise, n: int, mask: int, t: Array, inflation: Arra
             noise.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * noise.quick[i])
             if learn:
-                noise.neighbours[i] += pace * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
-                noise.square[i] += pace * (step - noise.square[i])
+                noise.neighbours[i] += adaptation_gain * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
+                noise.square[i] += adaptation_gain * (step - noise.square[i])
             noise.squares[odd, i] = step
     count_wild(noise, SAMPLE, n, mask, t)
 
@@ -246,8 +246,8 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
 
 
 @compiled
-def take_block_of_samples(
-    noise: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: Array, learn: bool
+def update_sample_variance(
+    noise: Noise, n: int, mask: int, length: int, blocks: int, adaptation_gain: float, expected: Array, learn: bool
 ) -> None:
     """Learn the variance of samples from those of a block.
 
@@ -259,7 +259,7 @@ def take_block_of_samples(
         Channels; those that delivered throughout.
     length, blocks
         Samples of a block; blocks so far.
-    pace
+    adaptation_gain
         Of the noise of the moment, per block.
     expected
         (n,) (rad/s)^2.
@@ -271,16 +271,16 @@ def take_block_of_samples(
         if mask >> i & 1:
             part = noise.counted[i] / length
             step = noise.steps[i] / length - part
-            noise.quick[i] += pace * (step + part * (1.0 - noise.quick[i]))
+            noise.quick[i] += adaptation_gain * (step + part * (1.0 - noise.quick[i]))
             if learn:
                 factor = 1.0 + gain * (step + part * noise.cross[i])
                 noise.now.sample[i] = max(noise.now.sample[i] * factor, QUIETEST * expected[i])
         noise.steps[i] = noise.counted[i] = 0.0
-    find_degrees(noise, n, mask)
+    update_degrees(noise, n, mask)
 
 
 @compiled
-def find_degrees(noise: Noise, n: int, mask: int) -> None:
+def update_degrees(noise: Noise, n: int, mask: int) -> None:
     """Degrees of freedom, as of a Student's: ``3 + 0.5 / x`` with ``x = E[d d'] / E[d]^2 - 1`` of adjacent squares d.
 
     Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by itself if that is more for certain.
@@ -298,7 +298,7 @@ def find_degrees(noise: Noise, n: int, mask: int) -> None:
 
 
 @compiled
-def take_block_steps(noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
+def update_block_noise(noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
     """Take the statistics t (n,) of a block; expected: (n,) (rad/s)^2."""
     gain = 1.0 / min(noise.seen[BLOCK] + 25.0, 100.0)
     for i in range(n):
@@ -315,7 +315,7 @@ def take_block_steps(noise: Noise, n: int, mask: int, t: Array, expected: Array,
 
 
 @compiled
-def take_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
+def update_slow_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
         level = noise.now.level[k, i]
@@ -325,33 +325,35 @@ def take_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bo
 
 
 @compiled
-def take_long_steps(noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
+def update_long_noise(noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
     """Take the statistics t (n,) of a longer time: its level over that of blocks."""
     quarter, gain = int(noise.seen[QUARTER]) % 4, 1.0 / min(noise.seen[scale] + 3.0, 80.0)
     for i in range(n):
         if mask >> i & 1:
             if scale == QUARTER:
                 # Noise with a memory shows at a second's distance, a beat at half its period.
-                take_level(noise, QUARTER, i, t[i] - noise.apart[quarter, i], gain, learn and noise.seen[scale] > 4)
+                update_slow_level(
+                    noise, QUARTER, i, t[i] - noise.apart[quarter, i], gain, learn and noise.seen[scale] > 4
+                )
                 for lag in range(1, LAGS + 1):
                     step = t[i] - noise.apart[(quarter - lag) % 4, i]
-                    take_level(noise, SCALES + lag - 1, i, step, gain, learn and noise.seen[scale] > lag)
+                    update_slow_level(noise, SCALES + lag - 1, i, step, gain, learn and noise.seen[scale] > lag)
                 noise.apart[quarter, i] = t[i]
             else:
-                take_level(noise, scale, i, t[i] - noise.last[scale, i], gain, learn and noise.seen[scale] > 1)
-    find_longest(noise, n)
+                update_slow_level(noise, scale, i, t[i] - noise.last[scale, i], gain, learn and noise.seen[scale] > 1)
+    update_longest(noise, n)
     count_wild(noise, scale, n, mask, t)
 
 
 @compiled
-def meet_rate(noise: Noise, square: float) -> None:
+def update_largest_rate(noise: Noise, square: float) -> None:
     """Begin to learn the slow noise of motion anew where the square of the rate is far beyond any before."""
     if noise.regime == MOTION and square > FASTER * noise.met:
         noise.met, noise.lived[MOTION] = square, 0.0
 
 
 @compiled
-def find_unknown(noise: Noise, n: int, seconds: float) -> None:
+def update_unknown(noise: Noise, n: int, seconds: float) -> None:
     """Of the slow noise nothing is known at first, at rest and in motion each, and longer where it is coloured."""
     noise.lived[noise.regime] += seconds
     lived = noise.lived[noise.regime]

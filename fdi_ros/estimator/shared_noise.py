@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, invert, weigh_each
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_weights, eliminate_rate, invert
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
@@ -67,51 +67,53 @@ def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
 
 
 @compiled
-def update_shared(params: Constants, est: Estimator) -> None:
+def update_shared(params: Constants, kf: Estimator) -> None:
     """Take the innovations of a sample and, every 20 ms, fourth differences of the corrected values."""
-    shared = est.shared
-    update_covariance(params, est)
+    shared = kf.shared
+    update_covariance(params, kf)
     for a in range(3):
-        shared.rate_sum[a] += est.rate[a]
-        shared.rate_squares[a] += est.rate[a] * est.rate[a]
+        shared.rate_sum[a] += kf.rate[a]
+        shared.rate_squares[a] += kf.rate[a] * kf.rate[a]
     if shared.fresh % params.stride == 0:
         if shared.fresh >= PAST * params.stride:
-            take_fourth_difference(params, est)
+            add_fourth_difference(params, kf)
         for i in range(params.sensors.n):
             for k in range(PAST - 1, 0, -1):
                 shared.past[k, i] = shared.past[k - 1, i]
-            shared.past[0, i] = est.corrected[i]
+            shared.past[0, i] = kf.corrected[i]
     shared.fresh += 1
 
 
 @compiled
-def update_covariance(params: Constants, est: Estimator) -> None:
+def update_covariance(params: Constants, kf: Estimator) -> None:
     """Take the innovations about their mean of half a second into R; what is absent leaves its rows as they are."""
-    shared, n, largest = est.shared, params.sensors.n, 0.0
+    shared, n, largest = kf.shared, params.sensors.n, 0.0
     for i in range(n):
-        largest = max(largest, abs(est.statistic[i]))
-    half = params.length / params.pace
+        largest = max(largest, abs(kf.statistic[i]))
+    half = params.length / params.adaptation_gain
     shared.count = min(shared.count + 1.0, MEMORY * half)
     share = min(1.0, (FARTHEST / max(largest, 1.0)) ** 2)
     for i in range(n):
         if shared.kept >> i & 1:
-            left = est.innovation[i] - shared.local[i]
-            shared.local[i] += left / half
-            shared.difference[i] = left
+            innovation = kf.innovation[i] - shared.local[i]
+            shared.local[i] += innovation / half
+            shared.difference[i] = innovation
             for j in range(i + 1):
                 if shared.kept >> j & 1:
-                    shared.outer[i, j] += (share * left * shared.difference[j] - shared.outer[i, j]) / shared.count
+                    shared.outer[i, j] += (
+                        share * innovation * shared.difference[j] - shared.outer[i, j]
+                    ) / shared.count
 
 
 @compiled
-def take_fourth_difference(params: Constants, est: Estimator) -> None:
+def add_fourth_difference(params: Constants, kf: Estimator) -> None:
     """Sum the products of what channels have in common and what they differ by, of one fourth difference."""
-    shared, n = est.shared, params.sensors.n
+    shared, n = kf.shared, params.sensors.n
     past = shared.past
     for i in range(n):
         shared.difference[i] = 0.0
         if shared.kept >> i & 1:
-            ends = est.corrected[i] + past[3, i]
+            ends = kf.corrected[i] + past[3, i]
             shared.difference[i] = (ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]) / FOURTH
     apply_gain(shared.alone.gain, n, shared.difference, shared.common)
     size = 0.0
@@ -132,27 +134,27 @@ def take_fourth_difference(params: Constants, est: Estimator) -> None:
 
 
 @compiled
-def find_shape(params: Constants, est: Estimator) -> None:
+def update_shape(params: Constants, kf: Estimator) -> None:
     """Work out the parity of the channels in use by their noise alone: once a block, and as they change.
 
     What was measured of others before stands: missing channels make no noise smaller. At rest, and in motion, R begins
     anew with the variances of that time.
     """
-    shared, n, noise = est.shared, params.sensors.n, est.noise
-    kept = est.mask & ~est.aside & ~est.beyond
+    shared, n, noise = kf.shared, params.sensors.n, kf.noise
+    kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
     if not params.spans[kept]:
-        kept = est.mask
-    if kept == shared.kept and est.filled > 0:
+        kept = kf.mask
+    if kept == shared.kept and kf.filled > 0:
         return
-    weigh_each(shared.alone, n, kept, noise.now.sample)
+    compute_weights(shared.alone, n, kept, noise.now.sample)
     eliminate_rate(shared.alone, n, params.sensors.axes, UNKNOWN_RATE)
     if kept != shared.kept:
         # Differences are of samples of the same channels.
         shared.kept, shared.fresh = kept, 0
-        weigh_each(shared.even, n, kept, shared.ones)
+        compute_weights(shared.even, n, kept, shared.ones)
         eliminate_rate(shared.even, n, params.sensors.axes, UNKNOWN_RATE)
     if noise.regime != shared.regime:
-        shared.regime, shared.count = noise.regime, 0.5 * params.length / params.pace
+        shared.regime, shared.count = noise.regime, 0.5 * params.length / params.adaptation_gain
         for i in range(n):
             shared.local[i] = 0.0
             for j in range(n):
@@ -160,16 +162,16 @@ def find_shape(params: Constants, est: Estimator) -> None:
 
 
 @compiled
-def find_level(params: Constants, est: Estimator) -> None:
+def update_shared_level(params: Constants, kf: Estimator) -> None:
     """Find the variance of each channel now, with all that independent channels do not explain; once a block."""
-    shared, n, noise, k = est.shared, params.sensors.n, est.noise, -3.0
+    shared, n, noise, k = kf.shared, params.sensors.n, kf.noise, -3.0
     for i in range(n):
         k += shared.kept >> i & 1
-    coherent = find_coherence(params, est)
-    find_vibration(params, est)
+    coherent = update_coherence(params, kf)
+    update_vibration(params, kf)
     pooled = 0.0
     if k > 0.0:
-        coherent = max(coherent, find_dimensions(params, est, k))
+        coherent = max(coherent, update_dimensions(params, kf, k))
         for i in range(n):
             for j in range(i + 1):
                 pooled += (1.0 if i == j else 2.0) * shared.even.information[i, j] * shared.outer[i, j]
@@ -185,20 +187,20 @@ def find_level(params: Constants, est: Estimator) -> None:
 
 
 @compiled
-def keep_line(params: Constants, est: Estimator) -> None:
+def update_line(params: Constants, kf: Estimator) -> None:
     """Remember what of R is a line, while nothing is suspicious: the onset of a fault is in R for a second."""
-    shared, pace = est.shared, params.pace / MEMORY
+    shared, adaptation_gain = kf.shared, params.adaptation_gain / MEMORY
     for i in range(params.sensors.n):
         for j in range(params.sensors.n):
             now = shared.coherent * shared.outer[max(i, j), min(i, j)]
-            shared.line[i, j] += pace * (now - shared.line[i, j])
+            shared.line[i, j] += adaptation_gain * (now - shared.line[i, j])
 
 
 @compiled
-def find_dimensions(params: Constants, est: Estimator, k: float) -> float:
+def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
     """Find the level of R over that of the variances; return the share of it that is a line, by its dimensions."""
-    shared, n, first, second = est.shared, params.sensors.n, 0.0, 0.0
-    product = est.block_parity.weight
+    shared, n, first, second = kf.shared, params.sensors.n, 0.0, 0.0
+    product = kf.block_parity.weight
     for i in range(n):
         for j in range(i):
             shared.outer[j, i] = shared.outer[i, j]
@@ -219,17 +221,17 @@ def find_dimensions(params: Constants, est: Estimator, k: float) -> float:
 
 
 @compiled
-def find_coherence(params: Constants, est: Estimator) -> float:
+def update_coherence(params: Constants, kf: Estimator) -> float:
     """Take the products of a block into their means, and what they say of each variance; return the coherent share."""
-    shared, n, noise = est.shared, params.sensors.n, est.noise
-    pace, count = params.pace / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
-    steady = update_common(shared, pace, count) < STEADY
+    shared, n, noise = kf.shared, params.sensors.n, kf.noise
+    adaptation_gain, count = params.adaptation_gain / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
+    steady = update_common(shared, adaptation_gain, count) < STEADY
     explained = total = 0.0
     for i in range(n):
         noise.cross[i] = along = 0.0
-        shared.apart[i] += pace * (shared.apart_sum[i] / count - shared.apart[i])
+        shared.apart[i] += adaptation_gain * (shared.apart_sum[i] / count - shared.apart[i])
         for a in range(3):
-            shared.mixed[a, i] += pace * (shared.mixed_sum[a, i] / count - shared.mixed[a, i])
+            shared.mixed[a, i] += adaptation_gain * (shared.mixed_sum[a, i] / count - shared.mixed[a, i])
             shared.mixed_sum[a, i] = 0.0
         for a in range(3):
             for b in range(3):
@@ -245,12 +247,12 @@ def find_coherence(params: Constants, est: Estimator) -> float:
 
 
 @compiled
-def update_common(shared: SharedNoise, pace: float, count: int) -> float:
+def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> float:
     """Take what channels have in common into Q, and invert it; return its energy over that of noise."""
     over = 0.0
     for a in range(3):
         for b in range(3):
-            shared.square[a, b] += pace * (shared.common_sum[a, b] / count - shared.square[a, b])
+            shared.square[a, b] += adaptation_gain * (shared.common_sum[a, b] / count - shared.square[a, b])
             shared.common_sum[a, b] = 0.0
             over += shared.alone.normal[max(a, b), min(a, b)] * shared.square[a, b] / 3.0
             shared.factor[a, b] = shared.square[a, b]
@@ -260,16 +262,16 @@ def update_common(shared: SharedNoise, pace: float, count: int) -> float:
 
 
 @compiled
-def find_vibration(params: Constants, est: Estimator) -> None:
+def update_vibration(params: Constants, kf: Estimator) -> None:
     """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion."""
-    shared, length = est.shared, float(params.length)
+    shared, length = kf.shared, float(params.length)
     for a in range(3):
         noise, within = shared.alone.inverse[a, a], 0.0
-        if length > 2.0 and est.blocks > 0:
+        if length > 2.0 and kf.blocks > 0:
             # About a line through the samples of the block.
-            slope = est.rates[0, a] - est.rates[1, a]
+            slope = kf.rates[0, a] - kf.rates[1, a]
             about = shared.rate_squares[a] - shared.rate_sum[a] * shared.rate_sum[a] / length
             within = (about - slope * slope * (length * length - 1.0) / (12.0 * length)) / (length - 2.0)
-        shared.within[a] += params.pace / MEMORY * (within - shared.within[a])
+        shared.within[a] += params.adaptation_gain / MEMORY * (within - shared.within[a])
         shared.rate_sum[a] = shared.rate_squares[a] = 0.0
         shared.vibration[a] = max(shared.within[a] - noise, shared.square[a, a] - noise, 0.0)

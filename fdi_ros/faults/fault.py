@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import KINDS, ChannelSamples, FaultKind, Memory
+from fdi_ros.faults.kinds import FAULT_KINDS, ChannelSamples, FaultKind, Memory
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -89,7 +89,7 @@ class Fault:
 
 
 _OWN = ("channel", "kind", "start", "stop", "seed")
-_KEYS = (*_OWN, *dict.fromkeys(name for kind in KINDS.values() for name in kind.options()))
+_KEYS = (*_OWN, *dict.fromkeys(name for kind in FAULT_KINDS.values() for name in kind.options()))
 """All that a fault may be given: the options of all kinds too."""
 
 
@@ -99,7 +99,7 @@ def create_kind(name: str, /, **options: float | None) -> FaultKind:
     Parameters
     ----------
     name
-        A key of `KINDS`.
+        A key of `FAULT_KINDS`.
     options
         Options of the kind; None is the same as not given.
 
@@ -108,9 +108,9 @@ def create_kind(name: str, /, **options: float | None) -> FaultKind:
     FaultError
         If there is no such kind, or an option is missing, out of range or not taken by it.
     """
-    if name not in KINDS:
-        raise FaultError(f"unknown fault kind {name!r}, expected one of: {', '.join(KINDS)}")
-    kind, given = KINDS[name], {option: value for option, value in options.items() if value is not None}
+    if name not in FAULT_KINDS:
+        raise FaultError(f"unknown fault kind {name!r}, expected one of: {', '.join(FAULT_KINDS)}")
+    kind, given = FAULT_KINDS[name], {option: value for option, value in options.items() if value is not None}
     taken = kind.options()
     for option in given:
         if option not in taken:

@@ -3,7 +3,7 @@
 
 """Kinds of faults: one class each, with the numbers it takes and what it does to the channels it strikes.
 
-A new kind is a class here and its place in `KINDS`. The first line of its docstring says what it does. Its options are
+A new kind is a class here, listed in `FAULT_KINDS`. The first line of its docstring says what it does. Options are
 fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`, or, where it
 depends on the samples before or on chance, in `FaultKind.strike`. A random kind draws one number per active sample and
 channel, so that the cut of a stream into blocks changes no draw.
@@ -287,7 +287,7 @@ class TriadLoss(FaultKind):
         Dropout(missing=1).strike(samples, memory, random)
 
 
-KINDS: dict[str, type[FaultKind]] = {
+FAULT_KINDS: dict[str, type[FaultKind]] = {
     kind.name: kind
     for kind in (
         Bias,

@@ -82,7 +82,7 @@ MESSAGES: dict[int, ImuMessage] = {
     )
 }
 """By message id."""
-KINDS = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")
+IMU_MESSAGES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")
 """Kinds of messages, the finest first."""
 RESOLUTION = {
     "SCALED_IMU": "1 mrad/s, 1 ms",

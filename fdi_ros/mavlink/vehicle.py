@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
 from fdi_ros.mavlink.imu import (
-    KINDS,
+    IMU_MESSAGES,
     MESSAGES,
     MOST_UNITS,
     NO_AUTOPILOT,
@@ -66,7 +66,7 @@ FIRST_SYSTEM = 1
 
 
 @dataclass(frozen=True)
-class Settings:
+class VehicleSettings:
     """What an autopilot is asked for."""
 
     system: int = 0
@@ -157,7 +157,9 @@ class Vehicle:
         If pymavlink is not installed.
     """
 
-    def __init__(self, settings: Settings, send: Callable[[bytes, Any], None], seconds: Callable[[], float]) -> None:
+    def __init__(
+        self, settings: VehicleSettings, send: Callable[[bytes, Any], None], seconds: Callable[[], float]
+    ) -> None:
         self.settings = settings
         self.system = settings.system or None
         """System id in use; None: no autopilot was heard yet."""
@@ -356,7 +358,7 @@ class Vehicle:
         if again:
             self.streams.ask_again()
         else:
-            kinds = (self.kind,) if self.kind else KINDS
+            kinds = (self.kind,) if self.kind else IMU_MESSAGES
             wanted = [number for kind in kinds if understood(kind, self.autopilot) for number in numbers(kind)]
             self.streams.want(wanted, self._interval)
 
@@ -427,10 +429,10 @@ class Vehicle:
             self._seen[kind, unit] += 1
             if now - self._first_imu < CHOICE:
                 return False
-            units = {kind: sum(seen == kind for seen, _ in self._seen) for kind in KINDS}
-            self.kind = max(KINDS, key=lambda kind: units[kind])
+            units = {kind: sum(seen == kind for seen, _ in self._seen) for kind in IMU_MESSAGES}
+            self.kind = max(IMU_MESSAGES, key=lambda kind: units[kind])
             self._seen.clear()
-            for other in KINDS:
+            for other in IMU_MESSAGES:
                 if other != self.kind and understood(other, self.autopilot):
                     self.streams.want(numbers(other), DEFAULT_INTERVAL)
         self._chosen = True

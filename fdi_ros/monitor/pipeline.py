@@ -17,7 +17,7 @@ from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import restart_bias
 from fdi_ros.core.decision import clear_declarations
-from fdi_ros.core.fusion import find_level
+from fdi_ros.core.fusion import update_level
 from fdi_ros.core.path import begin_bias, run
 from fdi_ros.core.records import EventRow, OutputRow, Sample
 from fdi_ros.core.subsets import mask_of, prepare_capability, prepare_subsets, single_losses
@@ -109,7 +109,7 @@ class Pipeline:
         self._equip(config, self.config)
         self.config = config
         if self.core["samples"][0]:
-            find_level(self.core[0], self.subsets)
+            update_level(self.core[0], self.subsets)
             self.supply()
 
     def reset(self) -> None:
@@ -180,10 +180,10 @@ class Pipeline:
             self.detector.reset()
             begin_bias(core, self.geometry.n)
         if core["now"]["waiting"]:
-            self.detector.prepare(int(core["now"]["fed_mask"]))
+            self.detector.prepare(int(core["now"]["input_mask"]))
         if core["wanted"]:
             self.integrity.fill(self.subsets[core["wanted"]], int(core["wanted"]))
-            find_level(core, self.subsets)
+            update_level(core, self.subsets)
 
     def _equip(self, config: Config, before: Config | None) -> None:
         """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""

@@ -21,7 +21,7 @@ from fdi_ros.core.alignment import Alignment, are_parted, is_live, new_aligner
 from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
-from fdi_ros.core.path import MORE, NEVER, work
+from fdi_ros.core.path import MORE, NEVER, process
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
@@ -153,7 +153,7 @@ class Receiver:
             *pipeline.path,
             *(self.aligner, self.live, self._events, self.fused, self.integrity),
         )
-        self._work: Callable[[], int] = partial(work, *self._records)
+        self._process: Callable[[], int] = partial(process, *self._records)
 
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take a message of an input topic; stamp: when it arrived, ns; 0: not known."""
@@ -161,13 +161,13 @@ class Receiver:
             self._take_over_detector()
         # Bytes: arrays of what can be written would be compiled once more.
         told = self.source.take(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
-        return self._work() if told & MORE else told
+        return self._process() if told & MORE else told
 
     def go_on(self) -> int:
         """Work the next sample."""
         if self.pipeline.detector is not self._detector:
             self._take_over_detector()
-        return self._work()
+        return self._process()
 
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
@@ -222,7 +222,7 @@ class Receiver:
         aside: Any = tuple(one.copy() for one in self._records)
         with reported("the way from message to message"):
             kind.take(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
-            work(*aside)
+            process(*aside)
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
             are_parted(self.aligner[0])

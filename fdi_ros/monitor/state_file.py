@@ -55,7 +55,7 @@ def configuration_hash(config: Config) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Estimated errors of the sensors, in the order of `fdi_ros.estimator.error_states.KINDS`."""
+    """Estimated errors of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
 
     value: Array
     """(N,)"""

@@ -20,7 +20,7 @@ from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import is_in, mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
-from fdi_ros.estimator.error_states import KINDS, places_of
+from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
@@ -118,7 +118,7 @@ class ErrorStatus:
     owner: str
     """Name of the channel, or of the unit."""
     kind: str
-    """Name in `fdi_ros.estimator.error_states.KINDS`; of three components with x, y or z."""
+    """Name in `fdi_ros.estimator.error_states.ERROR_KINDS`; of three components with x, y or z."""
     unit: str
     value: float
     std: float
@@ -181,7 +181,7 @@ class Status:
     max_drift: float = 0.0
     """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
     errors: tuple[ErrorStatus, ...] = ()
-    """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.KINDS`."""
+    """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
     names_rest_on: str = ""
     """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
     copies: tuple[tuple[str, str], ...] = ()
@@ -352,7 +352,7 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
     states, found = estimator["states"], []
     prior = np.sqrt(layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"]))
     units = [detector.geometry.unit_of[channels[0]] for channels in detector.geometry.units]
-    for kind in KINDS:
+    for kind in ERROR_KINDS:
         owners = units[1:] if kind.per_unit else names
         for owner, places in zip(owners, places_of(kind.name, n, len(units)), strict=True):
             parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [f" {k + 1}" for k in range(len(places))]

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fdi_ros.replay.front import Injected, Settings, Source
+    from fdi_ros.replay.front import ConfigSource, Injected, Source
     from fdi_ros.replay.summary import Summary
 
 
@@ -22,7 +22,7 @@ class _Callable(ModuleType):
     def __call__(
         self,
         path: Source,
-        config: Settings = None,
+        config: ConfigSource = None,
         faults: Sequence[Injected] = (),
         start: float = 0.0,
         end: float = math.inf,

@@ -23,13 +23,13 @@ from fdi_ros.replay.summary import Summary
 from fdi_ros.setup.starting_config import assumed_config, starting_config_of
 
 Source = str | PathLike[str]
-Settings = Config | str | PathLike[str] | None
+ConfigSource = Config | str | PathLike[str] | None
 """Settings, or a parameter file; None: what ``fdi inspect`` writes for the recording."""
 Injected = Fault | str | Mapping[str, Any]
 """A fault, or its words, or a mapping with the same keys."""
 
 
-def read(path: Source, config: Settings = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:
+def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:
     """Read a recording block by block, aligned as the node aligns its messages.
 
     Parameters
@@ -62,7 +62,7 @@ def read(path: Source, config: Settings = None, start: float = 0.0, end: float =
 
 def replay(
     path: Source,
-    config: Settings = None,
+    config: ConfigSource = None,
     faults: Sequence[Injected] = (),
     start: float = 0.0,
     end: float = math.inf,

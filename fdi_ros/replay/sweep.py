@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import Output
@@ -66,7 +66,7 @@ class Swept:
     @property
     def unit(self) -> str:
         """Of its size."""
-        option = KINDS[self.kind].options().get("size")
+        option = FAULT_KINDS[self.kind].options().get("size")
         return option.unit if option else ""
 
     @property
@@ -87,7 +87,7 @@ class Swept:
             "seed": seed,
             **dict(self.items),
         }
-        if self.size is not None and KINDS[self.kind].has_signed_size():
+        if self.size is not None and FAULT_KINDS[self.kind].has_signed_size():
             items["size"] = sign * self.size
         return fault_from(items)
 
@@ -105,13 +105,13 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
         if name in ("channel", "start", "stop", "seed"):
             raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
     kind = items.pop("kind", "")
-    if kind in KINDS and KINDS[kind].whole_unit:
+    if kind in FAULT_KINDS and FAULT_KINDS[kind].whole_unit:
         raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
     sizes = items.pop("size", "").split(",")
     found = tuple(Swept(kind, (*([("size", size)] if size else []), *items.items())) for size in dict.fromkeys(sizes))
     for one in found:
         fault_from({"channel": "any", "kind": kind, **dict(one.items)})
-        if one.size is not None and one.size < 0 and KINDS[kind].has_signed_size():
+        if one.size is not None and one.size < 0 and FAULT_KINDS[kind].has_signed_size():
             raise FaultError(f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn")
     return tuple(sorted(found, key=lambda one: one.size or 0.0))
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from fdi_ros.core.states import Reason
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.replay.episodes import (
@@ -316,7 +316,7 @@ def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
     """Size of a fault with its unit; where it is a rate, in the unit asked for."""
     if fault.size is None:
         return "-"
-    option = KINDS[fault.kind].options()["size"].unit
+    option = FAULT_KINDS[fault.kind].options()["size"].unit
     if not option.startswith(RADIANS.name):
         return f"{fault.size:g} {option}".rstrip()
     return f"{fault.size * unit.factor:g} {unit.named(option)}"

@@ -33,7 +33,7 @@ from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
 from fdi_ros.mavlink.report import Announcer, Report, Reporter, channel_report, whole_state
-from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
+from fdi_ros.mavlink.vehicle import Sample, Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
 from fdi_ros.ros import parameters
@@ -102,7 +102,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self.every(REPORT_PERIOD, self._report)
         self.get_logger().info(f"listening on {params['url']}")
 
-    def _settings(self, params: dict[str, Any]) -> Settings:
+    def _settings(self, params: dict[str, Any]) -> VehicleSettings:
         if not is_plain_name(params["monitor"]):
             raise ConfigError(
                 f"monitor is {params['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
@@ -112,7 +112,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             raise ConfigError(f"rate is {rate:g} Hz, expected 1 to 1000 Hz")
         kind = "" if params["messages"] == "auto" else f"{params['messages'].upper()}_IMU"
         key = read_key(params["signing_key"]) if params["signing_key"] else b""
-        return Settings(params["system_id"], params["component_id"], kind, rate, key)
+        return VehicleSettings(params["system_id"], params["component_id"], kind, rate, key)
 
     def _make_failover(self, params: dict[str, Any]) -> Failover:
         units = len(self.config.topics)

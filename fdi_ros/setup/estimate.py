@@ -24,11 +24,11 @@ from fdi_ros.config.config import PARAMETERS
 from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     BIAS_RATE_STD,
-    KINDS,
+    ERROR_KINDS,
     ONE,
     SIGNALS,
     Layout,
-    find_signals,
+    fill_signals,
     places_of,
     prepare_layout,
 )
@@ -412,13 +412,13 @@ def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array,
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
     prior = {"bias_std": sensors.bias_std, "scale_std": scale, "delay_std": sensors.delay_std}
-    names = [name for kind in KINDS for name in (kind.prior, kind.walk) if name]
+    names = [name for kind in ERROR_KINDS for name in (kind.prior, kind.walk) if name]
     prepare_layout(layouts[0], sensors.unit, units, {name: np.asarray(prior.get(name, 0.0)) for name in names})
     signals = np.zeros((BASE, n, SIGNALS))
     zero = np.zeros(3)
     for k in range(BASE):
         rate, turn = (np.eye(3)[k - 1] if 1 <= k < 4 else zero), (axes[:, k - 4] if k >= 4 else np.zeros(n))
-        find_signals(layouts[0], rate, np.ascontiguousarray(turn), signals[k])
+        fill_signals(layouts[0], rate, np.ascontiguousarray(turn), signals[k])
     signals[1:, :, ONE] = 0.0
     shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}

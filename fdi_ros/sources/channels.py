@@ -24,7 +24,7 @@ from fdi_ros.core.messages import (
     read_doubles,
     read_only,
 )
-from fdi_ros.core.path import take_arrived
+from fdi_ros.core.path import receive_arrived
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.sources.source import ArraySource
 
@@ -87,7 +87,7 @@ def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, st
     own = live[0]
     if not 0 <= inlet < aligner[0].n:
         return 0
-    return take_arrived(own, _read(data, 0, len(data), own.channels, own.sample.z), stamp)
+    return receive_arrived(own, _read(data, 0, len(data), own.channels, own.sample.z), stamp)
 
 
 class ChannelsSource(ArraySource):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import IMU_BEFORE_RATE, IMU_DOUBLES, place_after_header, read_rate
-from fdi_ros.core.path import take_stamped
+from fdi_ros.core.path import receive_stamped
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.sources.source import UnitSource
 
@@ -36,7 +36,7 @@ def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, st
     if not 0 <= inlet < aligner[0].n:
         return 0
     measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
-    return take_stamped(live[0], aligner[0], inlet, measured, stamp)
+    return receive_stamped(live[0], aligner[0], inlet, measured, stamp)
 
 
 class ImuSource(UnitSource):

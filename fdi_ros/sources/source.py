@@ -70,7 +70,7 @@ class Source(ABC):
         Parameters
         ----------
         aligner, live
-            As for `fdi_ros.core.path.work`.
+            As for `fdi_ros.core.path.process`.
         inlet
             Number of the input topic.
         data

@@ -26,7 +26,7 @@ from bag import logs
 from fdi_ros.cli import arguments, command_line
 from fdi_ros.cli.outputs import Progress
 from fdi_ros.detectors import DETECTORS
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.system.installation import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -263,8 +263,8 @@ def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
 
 
 CHOICES = {
-    "replay": [*DETECTORS, *KINDS, "two_at_once.yaml"],
-    "sweep": [*DETECTORS, *KINDS],
+    "replay": [*DETECTORS, *FAULT_KINDS, "two_at_once.yaml"],
+    "sweep": [*DETECTORS, *FAULT_KINDS],
     "compile": DETECTORS,
     "montecarlo": [path.name for path in shipped_files() if path.parent.name == "studies"],
     "fleet": ["none", "each"],
@@ -284,7 +284,7 @@ def test_every_help_has_examples_that_can_be_typed_and_all_choices(capsys, verb)
         assert command_line._parser().parse_args(words).verb == verb
     said = " ".join(said.split())
     assert not [choice for choice in CHOICES.get(verb, ()) if choice not in said]
-    assert (sorted(arguments.DETECTORS), sorted(arguments.KINDS)) == (sorted(DETECTORS), sorted(KINDS))
+    assert (sorted(arguments.DETECTORS), sorted(arguments.FAULT_KINDS)) == (sorted(DETECTORS), sorted(FAULT_KINDS))
 
 
 def test_convert_writes_where_output_says_and_as_before(fdi, refused, flight, tmp_path):

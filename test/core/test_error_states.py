@@ -17,17 +17,17 @@ from scipy.linalg import expm
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.alignment import restamp
-from fdi_ros.core.parity import eliminate_rate, weigh_together
-from fdi_ros.core.records import Line, Parity
+from fdi_ros.core.parity import compute_joint_weights, eliminate_rate
+from fdi_ros.core.records import DelayBuffer, Parity
 from fdi_ros.estimator.error_states import (
-    KINDS,
+    ERROR_KINDS,
     MAX_STATES,
     SIGNALS,
     ErrorStates,
     Layout,
     Projection,
     begin_states,
-    find_signals,
+    fill_signals,
     places_of,
     predict,
     prepare_layout,
@@ -36,7 +36,7 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 
-STD = {name: np.array(1e-4) for kind in KINDS for name in (kind.prior, kind.walk) if name} | {
+STD = {name: np.array(1e-4) for kind in ERROR_KINDS for name in (kind.prior, kind.walk) if name} | {
     "bias_std": np.array(0.01),
     "bias_walk": np.array(1e-3),
     "scale_std": np.array(0.02),
@@ -70,7 +70,7 @@ def test_information_is_that_of_the_parity_vector(seed: int, n: int, absent: int
     if np.linalg.svd(axes[kept], compute_uv=False)[-1] < 0.1:
         return
     parity = allocate(Parity)[0]
-    weigh_together(parity, n, int((1 << kept).sum()), padded(covariance))
+    compute_joint_weights(parity, n, int((1 << kept).sum()), padded(covariance))
     eliminate_rate(parity, n, axes, 1e-9)
     null = np.linalg.svd(axes[kept])[0][:, 3:].T
     inner = covariance[np.ix_(kept, kept)]
@@ -93,7 +93,7 @@ def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(("n", "units"), [(4, 0), (6, 2), (12, 4)])
 def test_every_state_of_the_table_has_its_place(n: int, units: int) -> None:
     layout, _, unit = estimator(n, units)
-    places = [place for kind in KINDS for owner in places_of(kind.name, n, units) for place in owner]
+    places = [place for kind in ERROR_KINDS for owner in places_of(kind.name, n, units) for place in owner]
     assert places == list(range(layout["count"]))
     for i in range(n):
         used = [p for p in layout["place"][i] if p >= 0]
@@ -110,7 +110,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     count = int(layout["count"])
     before, prior = states["x"][:count].copy(), states["p"][:count, :count].copy()
     rate, turn, at = rng.normal(0, 1, 3), rng.normal(0, 5, MAX_CHANNELS), allocate(Projection)[0]
-    find_signals(layout, rate, turn, at["signals"])
+    fill_signals(layout, rate, turn, at["signals"])
     project(layout, states, at)
     matrix = np.zeros((n, count))
     for i in range(n):
@@ -123,7 +123,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     values = np.concatenate([y, np.zeros(MAX_CHANNELS - n)])
     subtract_errors(layout, states, at["signals"], values, innovation)
     parity = allocate(Parity)[0]
-    weigh_together(parity, n, (1 << n) - 1, padded(noise + at["covariance"][:n, :n]))
+    compute_joint_weights(parity, n, (1 << n) - 1, padded(noise + at["covariance"][:n, :n]))
     eliminate_rate(parity, n, axes, 1e-6)
     update(layout, states, at, parity["information"], innovation, 1.0, np.zeros(MAX_STATES))
     joint = np.block([[prior, np.zeros((count, 3))], [np.zeros((3, count)), 1e6 * np.eye(3)]])
@@ -145,9 +145,9 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed: int, share: float)
     count = int(layout["count"])
     x, p = states["x"][:count].copy(), states["p"][:count, :count].copy()
     at, parity = allocate(Projection)[0], allocate(Parity)[0]
-    find_signals(layout, rng.normal(0, 1, 3), np.pad(rng.normal(0, 5, 6), (0, MAX_CHANNELS - 6)), at["signals"])
+    fill_signals(layout, rng.normal(0, 1, 3), np.pad(rng.normal(0, 5, 6), (0, MAX_CHANNELS - 6)), at["signals"])
     project(layout, states, at)
-    weigh_together(parity, 6, ALL, padded(noise + at["covariance"][:6, :6]))
+    compute_joint_weights(parity, 6, ALL, padded(noise + at["covariance"][:6, :6]))
     eliminate_rate(parity, 6, axes, 1e-6)
     columns, information = at["columns"][:6, :count].copy(), parity["information"][:6, :6].copy()
     gained = np.diag(columns.T @ information @ columns)
@@ -188,7 +188,7 @@ def restamped(
     late: tuple[float, float], samples: Iterable[tuple[int, np.ndarray, int]]
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Channels and values (6,) that two units of three channels are given, of stamps, values and what is plain."""
-    line, out, members = allocate(Line)[0], np.zeros(MAX_CHANNELS), np.array([0b111, 0b111000, 0, 0])
+    line, out, members = allocate(DelayBuffer)[0], np.zeros(MAX_CHANNELS), np.array([0b111, 0b111000, 0, 0])
     for stamp, values, plain in samples:
         full = np.concatenate([values, np.zeros(MAX_CHANNELS - 6)])
         found = restamp(line, 6, 2, members, np.array([*late, 0.0, 0.0]), stamp, full, ALL, plain, out)

@@ -16,7 +16,7 @@ from scipy.stats import multivariate_normal
 from fdi_ros import Geometry
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.compiling.record import MAX_UNITS
-from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
     COINCIDENCE,
@@ -50,7 +50,7 @@ class Mean:
         own = self.own = self.rows[0]
         own["mask"] = own["judged"] = (1 << self.n) - 1
         own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, self.covariance
-        weigh_together(own["parity"], self.n, int(own["mask"]), own["covariance"])
+        compute_joint_weights(own["parity"], self.n, int(own["mask"]), own["covariance"])
         eliminate_rate(own["parity"], self.n, self.axes, UNKNOWN_RATE)
 
     @property
@@ -58,7 +58,7 @@ class Mean:
         return self.geometry.axes.copy()
 
     def moving(self, rate: np.ndarray, acceleration: np.ndarray) -> Mean:
-        self.own["rate"], self.own["turn"][: self.n] = rate, self.geometry.axes @ acceleration
+        self.own["rate"], self.own["angular_acceleration"][: self.n] = rate, self.geometry.axes @ acceleration
         return self
 
     def explained(self, confidence: float = 0.999) -> tuple[set[int], set[int]]:
@@ -117,7 +117,10 @@ def oracle(mean: Mean) -> list[tuple[int, float, int]]:
     for unit in units:
         inside = np.isin(np.arange(n), unit)
         take(unit, COINCIDENCE / len(units), unit_vectors[:, list(unit)])
-        for about, std in ((mean.geometry.axes @ mean.own["rate"], GAIN_STD), (mean.own["turn"][:n], DELAY_STD)):
+        for about, std in (
+            (mean.geometry.axes @ mean.own["rate"], GAIN_STD),
+            (mean.own["angular_acceleration"][:n], DELAY_STD),
+        ):
             take(unit, COINCIDENCE / len(units), np.where(inside, about, 0.0)[:, None], std)
     return found
 

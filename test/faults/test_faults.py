@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, load_scenario, parse_fault
-from fdi_ros.faults.kinds import KINDS, Bias
+from fdi_ros.faults.kinds import FAULT_KINDS, Bias
 from fdi_ros.model.samples import Block
 
 NAMES = ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x", "imu_2.y", "imu_2.z")
@@ -51,7 +51,7 @@ def during(block, start=1, stop=3):
     return time, (time >= start) & (time < stop)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_ground_truth_covers_all_that_is_changed(kind):
     block, given = stream(), stream()
     faulty, injector = inject(EXAMPLES[kind], given)
@@ -137,7 +137,7 @@ def test_several_faults_at_once_act_one_after_the_other():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    kinds=st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=4),
+    kinds=st.lists(st.sampled_from(sorted(FAULT_KINDS)), min_size=1, max_size=4),
     cuts=st.lists(st.integers(0, 400), max_size=12),
     one_by_one=st.booleans(),
 )
@@ -155,7 +155,7 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
     np.testing.assert_array_equal(np.concatenate(received), expected)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_says_itself_in_words_that_read_back(kind):
     fault = parse_fault(EXAMPLES[kind])
     assert parse_fault(str(fault)) == fault

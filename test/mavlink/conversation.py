@@ -14,7 +14,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.link import Received
-from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
+from fdi_ros.mavlink.vehicle import Sample, Vehicle, VehicleSettings
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 
 UTC = 1_790_000_000
@@ -43,7 +43,7 @@ class Conversation:
         self.latency, self.may_set = latency, may_set
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
-        self.vehicle = Vehicle(Settings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
+        self.vehicle = Vehicle(VehicleSettings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
         self.samples: list[tuple[int, Sample]] = []
         """With the time at which each came out, ns."""
         self.cut = False

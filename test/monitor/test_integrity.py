@@ -13,7 +13,7 @@ from monitor.streams import config, parallel
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY
-from fdi_ros.core.subsets import find_level_of, passes_test, prepare_subsets
+from fdi_ros.core.subsets import fill_level, passes_test, prepare_subsets
 from fdi_ros.detectors import create_detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
@@ -167,7 +167,7 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
     for ratio in (np.full(6, rng.uniform(1.0, 9.0)), rng.uniform(1.0, 9.0, 6)):
         own.variance, growth[:6] = ratio * noise.noise_std**2, ratio
         exact = own.of(ALL)
-        find_level_of(subsets[63], 6, 63, growth, level)
+        fill_level(subsets[63], 6, 63, growth, level)
         assert (level >= exact.level * (1 - 1e-9)).all()
         alike = ratio.min() == ratio.max()
         assert (level <= exact.level * (1 + 1e-9 if alike else math.sqrt(ratio.max() / ratio.min()))).all()

@@ -15,7 +15,7 @@ from monitor.streams import SIGMA, START, config, parallel, run, stream, struck
 from fdi_ros import Config, Geometry
 from fdi_ros.core.decision import WHY
 from fdi_ros.errors import ConfigError
-from fdi_ros.estimator.error_states import KINDS, places_of
+from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
@@ -23,7 +23,7 @@ from fdi_ros.monitor.state_file import StateFile
 
 LEARNING = {"bias__startup_bias_duration": 1.0, "detector__name": "sequential"}
 OFFSET = 0.01
-COUNT = sum(len(places) for kind in KINDS for places in places_of(kind.name, 6, 2))
+COUNT = sum(len(places) for kind in ERROR_KINDS for places in places_of(kind.name, 6, 2))
 """Error states of six channels in two units."""
 NOTHING = {"value": [0.0] * COUNT, "covariance": [0.0] * (COUNT * (COUNT + 1) // 2), "late": [0.0, 0.0]}
 NAMES = [f"g{k}" for k in range(1, 7)]

@@ -19,7 +19,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.evaluate import GRACE, Evaluation
@@ -84,7 +84,7 @@ def sound(root, flight):
     return keep
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound):
     fault = parse_fault(f"{FAULTS[kind]} start={BEGIN} stop={STOP} seed=3")
     config, faulty = cone(root, **UNCALIBRATED), Keep()
@@ -114,7 +114,7 @@ def check(found, fault):
 
 def test_every_detector_is_scored_on_every_kind(root, flight):
     faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
-    assert {fault.kind.name for fault in faults} == set(KINDS)
+    assert {fault.kind.name for fault in faults} == set(FAULT_KINDS)
     assert max(fault.stop for fault in faults) < 60.0, "the flight ends before"
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
     requests = {name: Request(flight, config.replaced({"detector.name": name}), faults) for name in DETECTORS}

@@ -17,7 +17,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind, Scored, score
@@ -54,7 +54,7 @@ def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector: s
     config = Config.from_file(FILE, {"detector.name": detector})
     pipeline, block = Pipeline(config), flown()
     onsets = list(onsets_of(pipeline, block, (11.9, 29.6), 1.5))
-    assert {one.kind for one in EVERY} == KINDS.keys() - {"triad_loss"}
+    assert {one.kind for one in EVERY} == FAULT_KINDS.keys() - {"triad_loss"}
     compared = 0
     # The later one first: nothing of it may be left when the earlier one is gone on from.
     for onset in reversed(onsets):

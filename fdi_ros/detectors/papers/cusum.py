@@ -22,8 +22,8 @@ from fdi_ros.detectors.papers.likelihood_ratio import (
     Scratch,
     along,
     explain,
+    fill_scratch,
     prepare_hypotheses,
-    take_sample,
     whitened,
     whitened_directions,
 )
@@ -205,12 +205,12 @@ def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleV
     """Advance all sums by one sample; on alarm, name the channels by the largest."""
     sensors, room = params.sensors, state.room
     n = sensors.n
-    take_sample(params.resting, sensors, sample, room)
+    fill_scratch(params.resting, sensors, sample, room)
     for i in range(n):
         state.resting[i], state.variance[i] = room.residual[i], 1.0
     if not sensors.constant:
         plain_variances(params, sample, state)
-        take_sample(params.hypotheses, sensors, sample, room)
+        fill_scratch(params.hypotheses, sensors, sample, room)
     largest = size = spread = 1.0
     systematic = 0.0
     for i in range(n):

@@ -27,7 +27,7 @@ from fdi_ros.detectors.papers.single_fault import (
     SumsOfForms,
     conclude,
     error_ratio,
-    find_variances,
+    fill_variances,
     largest_form_threshold,
     resting_std,
     score_by_sums,
@@ -238,7 +238,7 @@ def judge_innovations(params: Innovations, state: NoState, sample: SampleInput, 
     n, constant = params.sensors.n, params.sensors.constant
     if not constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(params, sample, verdict.error)
+        fill_variances(params, sample, verdict.error)
     largest = 0.0
     for i in range(n):
         before, last = 0.0, 0.0
@@ -371,7 +371,7 @@ class Struck(SingleFault):
     determinants: Annotated[NDArray[np.float64], "f8", (CHANNELS, CHANNELS)]  # as forms of z
     determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]  # their standard deviations at rest, rad/s
     by_condition: Flag  # the criterion is the condition number
-    left: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]  # U' of H, as forms of z
+    complement: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]  # U' of H, as forms of z
     singular: Annotated[NDArray[np.float64], "f8", (CHANNELS, 3)]  # singular values of H
 
 
@@ -381,7 +381,7 @@ def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verd
     constant = params.sensors.constant
     if not constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(params, sample, verdict.error)
+        fill_variances(params, sample, verdict.error)
     statistic = 0.0
     for j in range(CHANNELS):
         size = abs(value_of(params.determinants[j], sample.z, CHANNELS))
@@ -405,10 +405,14 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither divides by delta, which is zero for a failed
     row without noise.
     """
-    left, z = params.left[j], sample.z
+    complement, z = params.complement[j], sample.z
     s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
-    a, b, c = value_of(left[0], z, CHANNELS), value_of(left[1], z, CHANNELS), value_of(left[2], z, CHANNELS)
-    delta = abs(value_of(left[3], z, CHANNELS))
+    a, b, c = (
+        value_of(complement[0], z, CHANNELS),
+        value_of(complement[1], z, CHANNELS),
+        value_of(complement[2], z, CHANNELS),
+    )
+    delta = abs(value_of(complement[3], z, CHANNELS))
     largest = largest_root((a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0))
     a, b, c = a / s, b / t, c / v
     s, t, v = delta / s, delta / t, delta / v
@@ -512,8 +516,8 @@ class Determinant(SingleFaultDetector):
         params["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
         for j in range(CHANNELS):
             others = np.delete(np.arange(CHANNELS), j)
-            left, params["singular"][j], _ = np.linalg.svd(geometry.axes[others])
-            params["left"][j][:, others] = left.T
+            complement, params["singular"][j], _ = np.linalg.svd(geometry.axes[others])
+            params["complement"][j][:, others] = complement.T
 
     @classmethod
     def refuses(cls, n: int) -> str:

@@ -133,7 +133,7 @@ def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
 
 
 @compiled
-def take_sample(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
+def fill_scratch(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
     """Work out what all hypotheses on one sample share."""
     n = sensors.n
     for i in range(n):
@@ -181,7 +181,7 @@ def leave_out(params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int)
 
 
 @compiled
-def weigh(sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+def correct_rate(sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
     """Correct the rate of the channels kept by their weights in this sample; return the chi-square they leave.
 
     `kept` holds residuals about the plain least-squares rate: of the size of the noise, so that the weighted solution
@@ -233,20 +233,20 @@ def along(axis: Array, vector: Array) -> float:
 def fit(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
     """Fit the hypothesis that channels a, b, c are faulty: chi-square of the others; errors in `estimate`, rad/s."""
     leave_out(params, sensors.n, room, a, b, c)
-    left = 0.0
+    residual = 0.0
     if params.fixed:
         for j in range(sensors.n):
             if j != a and j != b and j != c:
-                left += room.kept[j] * room.kept[j]
+                residual += room.kept[j] * room.kept[j]
     else:
-        left = weigh(sensors, sample, room, a, b, c)
+        residual = correct_rate(sensors, sample, room, a, b, c)
     for place in range(3):
         i = a if place == 0 else b if place == 1 else c
         if i >= 0 and params.fixed:
             room.estimate[place] = room.kept[i] * sensors.noise_std[i]
         elif i >= 0:
             room.estimate[place] = room.kept[i] - along(sensors.axes[i], room.correction)
-    return left
+    return residual
 
 
 @compiled
@@ -257,7 +257,7 @@ def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
     if params.fixed:
         return room.residual[i] / math.sqrt(params.residual[i, i])
     leave_out(params, sensors.n, room, i, NONE, NONE)
-    weigh(sensors, sample, room, i, NONE, NONE)
+    correct_rate(sensors, sample, room, i, NONE, NONE)
     h, s = sensors.axes[i], room.inverse
     own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (s[3] * h[1] + 2 * s[4] * h[2])
     spread = room.variance[i] + own_part + h[2] * s[5] * h[2]
@@ -266,7 +266,7 @@ def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
 
 @compiled
 def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
-    """Name the channels that explain a sample taken by `take_sample`: suspects, whether isolated, their errors.
+    """Name the channels that explain a sample taken by `fill_scratch`: suspects, whether isolated, their errors.
 
     With c(k) the chi-square with k degrees of freedom that a true hypothesis stays below with the confidence asked
     for, and m = n - 3:
@@ -319,11 +319,11 @@ def explain_by_pairs(
         for j in range(i + 1, n):
             # Two that cannot be told apart explain no more together than one of them.
             if sensors.detectable[i] and sensors.detectable[j] and not sensors.alike[i, j]:
-                left = fit(params, sensors, sample, room, i, j, NONE)
-                if left <= params.pair_limit:
+                residual = fit(params, sensors, sample, room, i, j, NONE)
+                if residual <= params.pair_limit:
                     possible += 1
-                    take_estimate(room, verdict, i, left, room.estimate[0])
-                    take_estimate(room, verdict, j, left, room.estimate[1])
+                    add_suspect(room, verdict, i, residual, room.estimate[0])
+                    add_suspect(room, verdict, j, residual, room.estimate[1])
     if possible == 0:
         return False
     verdict.isolated = add_alike(sensors, verdict.suspects) == 2 and possible == 1
@@ -331,16 +331,16 @@ def explain_by_pairs(
 
 
 @compiled
-def take_estimate(room: Scratch, verdict: SampleVerdict, i: int, left: float, estimate: float) -> None:
+def add_suspect(room: Scratch, verdict: SampleVerdict, i: int, residual: float, estimate: float) -> None:
     """Make a channel of a pair that explains the sample a suspect; its error is that of the best pair it is in.
 
     Of pairs that explain the sample equally well, as all pairs of three parallel axes do, the largest error counts.
     """
     verdict.suspects[i] = True
-    as_good = left <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(verdict.error[i])
-    if left < room.misfit[i] - SAME_FIT or as_good:
+    as_good = residual <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(verdict.error[i])
+    if residual < room.misfit[i] - SAME_FIT or as_good:
         verdict.error[i] = estimate
-    room.misfit[i] = min(room.misfit[i], left)
+    room.misfit[i] = min(room.misfit[i], residual)
 
 
 @compiled
@@ -399,7 +399,7 @@ class Constants:
 def judge(params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Largest whitened residual of all channels; on alarm, the channels that explain it."""
     sensors, largest = params.sensors, 0.0
-    take_sample(params.hypotheses, sensors, sample, room)
+    fill_scratch(params.hypotheses, sensors, sample, room)
     for i in range(sensors.n):
         verdict.scores[i] = math.nan
         if sensors.detectable[i]:

@@ -218,7 +218,7 @@ def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
 
 
 @compiled
-def find_variances(params: SingleFault, sample: SampleInput, variance: Array) -> None:
+def fill_variances(params: SingleFault, sample: SampleInput, variance: Array) -> None:
     """Fill in the error variance of each channel at the least-squares rate of the sample, (rad/s)^2."""
     for i in range(params.sensors.n):
         rate_along = sample.z[i] - error_of(params, i, sample) * params.sensors.share[i]
@@ -231,7 +231,7 @@ def error_ratio(params: SingleFault, named: int, sample: SampleInput, verdict: S
     std = params.resting[named]
     if not params.sensors.constant:
         # The place of the errors is free until the verdict is concluded.
-        find_variances(params, sample, verdict.error)
+        fill_variances(params, sample, verdict.error)
         std = std_of(params.errors[named], verdict.error, params.sensors.n)
     return abs(error_of(params, named, sample)) / std
 

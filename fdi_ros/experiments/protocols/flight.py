@@ -18,7 +18,7 @@ from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.faults.fault import Fault, Injector, create_kind
-from fdi_ros.faults.kinds import KINDS
+from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
@@ -27,7 +27,7 @@ from fdi_ros.replay.outcomes import OutcomeKind, quantiles, score, share, standi
 
 NONE = "none"
 """The cell in which every channel stays healthy."""
-DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.study_size is not None}
+DEFAULT_SIZES = {name: kind.study_size for name, kind in FAULT_KINDS.items() if kind.study_size is not None}
 """Of each kind that needs one, in its own unit."""
 
 
@@ -56,7 +56,9 @@ class Flight(TrialProtocol[str]):
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
         "kinds": Field(
-            "texts", [NONE, *(name for name, kind in KINDS.items() if not kind.whole_unit)], choices=(NONE, *KINDS)
+            "texts",
+            [NONE, *(name for name, kind in FAULT_KINDS.items() if not kind.whole_unit)],
+            choices=(NONE, *FAULT_KINDS),
         ),
         "sizes": Field("mapping", DEFAULT_SIZES),
         "monitor": Field("mapping", {}),
@@ -137,7 +139,7 @@ class Flight(TrialProtocol[str]):
         if kind == NONE:
             return Flown(block, truth, None, int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9))))
         size = settings["sizes"].get(kind, DEFAULT_SIZES.get(kind))
-        if size is not None and KINDS[kind].has_signed_size():
+        if size is not None and FAULT_KINDS[kind].has_signed_size():
             size *= sign
         names = self._geometry.channel_names
         injector = Injector([Fault(names[channel], create_kind(kind, size=size), start=onset, seed=seed)], names)
