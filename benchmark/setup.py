@@ -127,7 +127,7 @@ def errors_of(seed: int, kind: str, units: int) -> tuple[float, ...]:
     left = np.linalg.svd(np.kron(np.eye(n) - made.axes @ np.linalg.pinv(made.axes), np.eye(3)))[0][:, : 3 * (n - 3)]
     apart, known = left.T @ off, left.T @ found.axes_covariance @ left
     size, uncertainty = result.scale
-    delays = (found.late[::3] - made.late)[1:] / found.late_std[3::3]
+    delays = (found.delay[::3] - made.late)[1:] / found.delay_std[3::3]
     return (
         rms(off / np.sqrt(np.diag(found.axes_covariance))),
         float(np.sqrt(apart @ np.linalg.solve(known, apart) / len(apart))),

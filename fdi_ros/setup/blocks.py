@@ -240,10 +240,10 @@ class Blocks:
         return np.asarray(np.add.reduceat(self.seconds, self.start) / np.diff([*self.start, len(self.seconds)]))
 
 
-def make_blocks(data: Data, late: Array) -> Blocks:
+def make_blocks(data: Data, delay: Array) -> Blocks:
     """Cut a recording into blocks, delays (n,) s taken off."""
     span = max(round(BLOCK_TIME / data.step), 1) * data.step
-    source = Resampled(data, late)
+    source = Resampled(data, delay)
     # A sample on the edge must not fall to either side as its stamp jitters.
     number = np.floor(source.seconds / span + 0.25 * data.step / span).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1))
@@ -281,18 +281,18 @@ def portions(begin: Int) -> Iterator[tuple[int, int]]:
 class Resampled:
     """Values of a recording at the instants of its samples, delays (n,), s, taken off."""
 
-    def __init__(self, data: Data, late: Array) -> None:
+    def __init__(self, data: Data, delay: Array) -> None:
         self.seconds = data.seconds
-        self._z, self._late = data.z, late
+        self._z, self._delay = data.z, delay
         self._squares, self._count = np.zeros((2, data.z.shape[1]))
         every, there = np.arange(len(data.z)), np.isfinite(data.z)
-        whole = [bool(own.all()) for own in there.T]
+        whole = [bool(column.all()) for column in there.T]
         self._groups: list[tuple[Int, Int, float]] = []
         """Channels alike in delay and in samples that they have; these samples, and the usual time between them, s."""
-        left = [i for i in range(len(late)) if not whole[i] or abs(late[i]) >= NOT_SHIFTED]
+        left = [i for i in range(len(delay)) if not whole[i] or abs(delay[i]) >= NOT_SHIFTED]
         while left:
             i = left[0]
-            alike = [j for j in left if late[j] == late[i] and (there[:, j] == there[:, i]).all()]
+            alike = [j for j in left if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()]
             rows = every if whole[i] else np.flatnonzero(there[:, i])
             usual = float(np.median(np.diff(self.seconds[rows]))) if len(rows) > 1 else 0.0
             self._groups.append((np.array(alike), rows, usual))
@@ -302,8 +302,8 @@ class Resampled:
         """Values (N, n) of some samples, rad/s, NaN: not known."""
         z = self._z[begin:end].copy()
         for channels, rows, usual in self._groups:
-            late = float(self._late[channels[0]])
-            first, weight = lagrange_weights(self.seconds[rows], self.seconds[begin:end] + late, usual)
+            delay = float(self._delay[channels[0]])
+            first, weight = lagrange_weights(self.seconds[rows], self.seconds[begin:end] + delay, usual)
             known = np.flatnonzero(first >= 0)
             z[:, channels] = np.nan
             if len(known):

@@ -27,8 +27,8 @@ from fdi_ros.replay.run import Kept, Sink, Walk
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement
 from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
-from fdi_ros.setup.estimate import SCALE_STD, Estimate, Sensors, estimate
-from fdi_ros.setup.result import Calibration, Delay, Span
+from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
+from fdi_ros.setup.result import Calibration, Span, StampDelay
 from fdi_ros.sources import source_of
 
 UNKNOWN_MOUNT = 0.58
@@ -99,22 +99,23 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
         found = estimate(data, sensors)
         settings = _settings(config, active, data.step, found)
         tried = Config.from_parameters({**config.parameters(), **settings})
-        faults, spectrum = _watch(_aligned(block, data, found.late, active), tried, active)
+        faults, spectrum = _watch(_aligned(block, data, found.delay, active), tried, active)
         if faults:
             _check_share(faults, data, nominal.channel_names)
             found = estimate(_left_out(data, faults), sensors)
             settings = _settings(config, active, data.step, found)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
-    units = [np.flatnonzero(sensors.unit == k) for k in range(1, sensors.units)]
+    delays = []
+    for k in range(1, sensors.units):
+        unit = np.flatnonzero(sensors.unit == k).tolist()
+        delays.append(StampDelay(tuple(unit), float(found.delay[unit[0]]), float(found.delay_std[unit[0]])))
     return Calibration(
         names=nominal.channel_names,
         nominal=nominal.axes,
         estimate=found,
         timing=float(_timing(config, active, found).max()),
-        delays=tuple(
-            Delay(tuple(unit.tolist()), float(found.late[unit[0]]), float(found.late_std[unit[0]])) for unit in units
-        ),
+        delays=tuple(delays),
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
@@ -123,9 +124,9 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
     )
 
 
-def _aligned(block: Block, data: Data, late: Array, active: Int) -> Iterator[Block]:
+def _aligned(block: Block, data: Data, delay: Array, active: Int) -> Iterator[Block]:
     """Give the usable values, part by part, as the monitor will have them once the delays (n,), s, are taken off."""
-    source, shifted = Resampled(data, late), np.abs(late) >= NOT_SHIFTED
+    source, shifted = Resampled(data, delay), np.abs(delay) >= NOT_SHIFTED
     for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
         part, usable, moved = block[first:end], data.z[first:end], source.part(first, end)
         z, received = part.z.copy(), part.delivered.copy()
@@ -184,7 +185,7 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
     return chosen
 
 
-def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -> Sensors:
+def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -> Priors:
     source, axes, scale = source_of(config), nominal.axes.copy(), np.full(nominal.n, SCALE_STD)
     if not source.units:
         found = _axes_from_motion(data, axes, chosen)
@@ -195,7 +196,7 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
     delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
-    return Sensors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
+    return Priors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
 
 
 def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
@@ -280,7 +281,7 @@ def _check_share(faults: tuple[Span, ...], data: Data, names: tuple[str, ...]) -
 # Settings -------------------------------------------------------------------------------------------------------------
 
 
-def _settings(config: Config, active: Int, step: float, found: Estimate) -> dict[str, object]:
+def _settings(config: Config, active: Int, step: float, found: StateEstimate) -> dict[str, object]:
     """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
     all_axes = build_geometry(config).axes.copy()
     n = len(all_axes)
@@ -302,41 +303,41 @@ def _settings(config: Config, active: Int, step: float, found: Estimate) -> dict
         # No single recording shows how biases differ from one start to the next.
         "bias.turn_on_std": config.bias.turn_on_std,
     }
-    if found.walk.value > 0:
+    if found.bias_walk.value > 0:
         walk = np.broadcast_to(np.array(config.noise.bias_walk), n).copy()
-        walk[active] = found.walk.value
+        walk[active] = found.bias_walk.value
         changed["noise.bias_walk"] = _short(walk)
     source = source_of(config)
     if source.stamped:
         total = np.array(source.delays)
-        shown = np.abs(found.late) > np.maximum(LEAST_SKEW, SHOWN * found.late_std)
+        shown = np.abs(found.delay) > np.maximum(LEAST_SKEW, SHOWN * found.delay_std)
         # Of all channels of a unit the first is taken.
         units, first = np.unique([source.chip_of(int(channel)) for channel in active], return_index=True)
-        total[units] += np.where(shown, found.late, 0.0)[first]
+        total[units] += np.where(shown, found.delay, 0.0)[first]
         changed["imus.delays"] = _rounded(total - total[0], 6)
         if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
             changed["imus.timeout"] = float(f"{needed:.2g}")
-        if (narrow := _skew(config, step, found.late)) < config.imus.max_skew:
+        if (narrow := _skew(config, step, found.delay)) < config.imus.max_skew:
             changed["imus.max_skew"] = narrow
     return changed
 
 
-def _noise(found: Estimate) -> Array:
+def _noise(found: StateEstimate) -> Array:
     """Noise (n,) of one sample as written, rad/s: the channels' own."""
     moving = found.moment[~found.rest]
     return np.maximum(found.floor.std, np.median(moving, axis=0) / LOUDER) if len(moving) else found.floor.std
 
 
-def _timing(config: Config, active: Int, found: Estimate) -> Array:
+def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
     """Find what is not known of the sampling instants (n,), s; as configured where no motion shows it."""
     before = build_noise(config, build_geometry(config).n).timing_std[active]
-    error = float(np.sqrt(np.mean(found.late_std**2))) if source_of(config).stamped else 0.0
+    error = float(np.sqrt(np.mean(found.delay_std**2))) if source_of(config).stamped else 0.0
     return np.where(error < np.maximum(before, LEAST_SKEW), error, before)
 
 
-def _skew(config: Config, step: float, late: Array) -> float:
+def _skew(config: Config, step: float, delay: Array) -> float:
     """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
-    offset = np.abs(late - np.round(late / step) * step)
+    offset = np.abs(delay - np.round(delay / step) * step)
     hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= config.imus.max_skew)]
     return float(f"{hidden.min() / 2:.2g}") if len(hidden) else config.imus.max_skew
 

@@ -36,7 +36,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
-from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
+from fdi_ros.setup.smoother import NormalEquations, RandomWalk, Smoothed, find_random_walk, smooth
 from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
 SCALE_STD = 0.008
@@ -75,7 +75,7 @@ ESTIMATED = ("bias", "scale", "delay")
 
 
 @dataclass(frozen=True)
-class Sensors:
+class Priors:
     """What is estimated, and what is known of it before."""
 
     axes: Array
@@ -93,16 +93,16 @@ class Sensors:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Estimate of everything."""
+class StateEstimate:
+    """All states, estimated."""
 
     axes: Array
     """(n, 3)."""
     axes_covariance: Array
     """(3 n, 3 n) of all of them."""
-    late: Array
+    delay: Array
     """(n,) by how much the stamps of each channel's unit are late against those of the first, s."""
-    late_std: Array
+    delay_std: Array
     """(n,) s."""
     bias: Array
     """(n,) mean over the recording, rad/s."""
@@ -112,7 +112,7 @@ class Estimate:
     """(K, n) biases over time, rad/s."""
     times: Array
     """(K,) s."""
-    walk: Walk
+    bias_walk: RandomWalk
     """Of the biases."""
     floor: Floor
     """Noise that channels have by themselves."""
@@ -143,34 +143,34 @@ class Estimate:
         return float(np.sqrt(square)), float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * np.sqrt(square)))
 
 
-def estimate(data: Data, sensors: Sensors) -> Estimate:
+def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
     # Of the constants, the first are those that motion shows.
     motion = 3 * n + units - 1
-    late, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
+    delay, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
     # Delays that are taken off the blocks, and by how much they were to be others.
-    taken, moved = late, np.inf
-    walk: Walk | None = None
+    taken, moved = delay, np.inf
+    walk: RandomWalk | None = None
     colour = np.ones((2, n))
     blocks, prior_scale = make_blocks(data, taken[sensors.unit]), sensors.scale_std
     for number in range(PASSES):
         one = _Pass(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
         if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
-            walk = find_walk(one.evidence)
+            walk = find_random_walk(one.evidence)
         usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
         shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
         found = smooth(one.evidence, usual, (shown.constant[:motion], shown.constant_covariance[:motion, :motion]))
         scale = found.constant[: 3 * n].reshape(n, 3)
         step = np.append(0.0, np.clip(found.constant[3 * n : motion], -STEP_DELAY, STEP_DELAY))
         axes = axes + scale
-        late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), one.curve_of(found)
+        delay, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), one.curve_of(found)
         colour = one.colours(axes)
-        moved = float(np.abs(late - taken).max())
+        moved = float(np.abs(delay - taken).max())
         if number > TRUSTING and walk is not None and moved < SETTLED and np.abs(scale).max() < SETTLED:
             break
         if moved > SETTLED:
-            taken = late
+            taken = delay
             blocks = make_blocks(data, taken[sensors.unit])
         # Where the axes are farther off than was supposed, they are not known as well either.
         off = axes - sensors.axes
@@ -183,15 +183,15 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
     # No less is known than before.
     known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(known, known)
-    late_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
+    delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
     # What interpolation has taken of white noise is given back to what is left once the motion is out.
     kept = np.sqrt(blocks.white)
     moment = np.sqrt(of_the_moment(blocks.samples, one.present & one.has_samples, axes)) / kept
-    return Estimate(
+    return StateEstimate(
         axes,
         covariance[: 3 * n, : 3 * n],
-        late[sensors.unit],
-        late_std[sensors.unit],
+        delay[sensors.unit],
+        delay_std[sensors.unit],
         found.mean,
         found.mean_covariance,
         one.curve_of(found),
@@ -212,7 +212,7 @@ class _Pass:
     ----------
     blocks, sensors
         The recording, and what is known of the sensors beforehand.
-    axes, late
+    axes, delay
         (n, 3), and (units,) s taken off the blocks.
     biases
         (K, n) of joined windows, rad/s.
@@ -225,7 +225,7 @@ class _Pass:
     """
 
     def __init__(
-        self, blocks: Blocks, sensors: Sensors, axes: Array, late: Array, biases: Array, colour: Array, known: bool,
+        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, colour: Array, known: bool,
         scale: Array,
     ) -> None:  # fmt: skip
         self.blocks, self.axes = blocks, axes
@@ -256,12 +256,12 @@ class _Pass:
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
         self.variance: Array = np.where(self.present, moment * factor, ABSENT)
-        turn, inside = self._differentiate()
+        acceleration, inside = self._differentiate()
         self.used = self.used & (inside | self.rest[blocks.window]) & enough[blocks.window]
         each = -(-blocks.windows // MOST_STEPS)
         self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
         self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
-        self.evidence, self.careful = self._find_evidence(sensors, late, y, turn, scale)
+        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration, scale)
 
     @property
     def times(self) -> Array:
@@ -282,11 +282,15 @@ class _Pass:
 
     def _differentiate(self) -> tuple[Array, Mask]:
         """Angular acceleration (B, 3), rad/s^2, and where it is known (B,)."""
-        turn, inside, t = np.zeros_like(self.rate), np.zeros(len(self.rate), dtype=bool), self.blocks.seconds
+        acceleration, inside, t = (
+            np.zeros_like(self.rate),
+            np.zeros(len(self.rate), dtype=bool),
+            self.blocks.seconds,
+        )
         span = t[2:] - t[:-2]
         inside[1:-1] = (span < 2.5 * self.blocks.length) & self.used[2:] & self.used[:-2]
-        turn[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
-        return turn * inside[:, None], inside
+        acceleration[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
+        return acceleration * inside[:, None], inside
 
     def _find_rest(self, gain: Array, variance: Array, known: bool) -> Mask:
         """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
@@ -315,13 +319,13 @@ class _Pass:
         return found if seconds >= LEAST_REST else np.zeros_like(found)
 
     def _find_evidence(
-        self, sensors: Sensors, late: Array, y: Array, turn: Array, scale: Array
-    ) -> tuple[Evidence, Evidence]:
+        self, sensors: Priors, delay: Array, y: Array, acceleration: Array, scale: Array
+    ) -> tuple[NormalEquations, NormalEquations]:
         """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
         blocks, axes, variance, rest, n = self.blocks, self.axes, self.variance, self.rest, len(self.axes)
         coefficients, prior = coefficients_of(sensors, axes, scale)
         moving = (~rest[blocks.window])[:, None]
-        base = np.hstack([np.ones((len(y), 1)), self.rate * moving, turn * moving]) * self.used[:, None]
+        base = np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving]) * self.used[:, None]
         # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
         moments, cross = self._by_window(base, base), self._by_window(base, residual)
@@ -334,11 +338,11 @@ class _Pass:
         moments = np.einsum("wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors)
         a = information(variance, axes)
         a[rest] = _at_rest(variance[rest], axes)
-        start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
+        start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -delay[1:], np.zeros(n)])
         prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
         flat = coefficients.reshape(-1, n * BASE)
 
-        def summed(moments: Array, cross: Array) -> Evidence:
+        def summed(moments: Array, cross: Array) -> NormalEquations:
             normal, right = np.zeros((len(self.groups), len(flat), len(flat))), np.zeros((len(self.groups), len(flat)))
             for k, group in enumerate(self.groups):
                 # (n, n, 7, 7): sum of the products of A and s s'.
@@ -352,7 +356,7 @@ class _Pass:
             whole = np.block([[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]])
             rights = np.hstack([right, since[:, 0] * right[:, :n]])
             apart = np.diff(self.middle, append=self.middle[-1])
-            return Evidence.in_units(n, whole, rights, apart, prior, start)
+            return NormalEquations.in_units(n, whole, rights, apart, prior, start)
 
         kept = self._beyond_vibration(moments, count)
         return summed(moments, cross), summed(kept @ moments, kept @ cross)
@@ -407,7 +411,7 @@ def _at_rest(variance: Array, axes: Array) -> Array:
     return np.asarray(np.eye(len(axes)) / variance[..., :, None] - weighted @ solved)
 
 
-def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
+def coefficients_of(sensors: Priors, axes: Array, scale: Array) -> tuple[Array, Array]:
     """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
@@ -417,8 +421,9 @@ def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array,
     signals = np.zeros((BASE, n, SIGNALS))
     zero = np.zeros(3)
     for k in range(BASE):
-        rate, turn = (np.eye(3)[k - 1] if 1 <= k < 4 else zero), (axes[:, k - 4] if k >= 4 else np.zeros(n))
-        fill_signals(layouts[0], rate, np.ascontiguousarray(turn), signals[k])
+        rate = np.eye(3)[k - 1] if 1 <= k < 4 else zero
+        acceleration = axes[:, k - 4] if k >= 4 else np.zeros(n)
+        fill_signals(layouts[0], rate, np.ascontiguousarray(acceleration), signals[k])
     signals[1:, :, ONE] = 0.0
     shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}
@@ -430,7 +435,7 @@ def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array,
     return coefficients, np.asarray(layouts[0]["prior"][shown])
 
 
-def _misfit(of: Evidence, found: Smoothed) -> float:
+def _misfit(of: NormalEquations, found: Smoothed) -> float:
     """Scatter of what single windows say of the constants, over what the noise explains."""
     n = of.n
     x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))]) / of.prior

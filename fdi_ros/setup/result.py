@@ -17,7 +17,7 @@ from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import SHOWN
-from fdi_ros.setup.estimate import SCALE_STD, Estimate
+from fdi_ros.setup.estimate import SCALE_STD, StateEstimate
 from fdi_ros.setup.findings import Finding, Role
 
 UNMEASURED = SCALE_STD / 2
@@ -38,7 +38,7 @@ MANY = 0.01
 """Share of the samples that are missing or spikes, which is worth a look."""
 
 
-class Delay(NamedTuple):
+class StampDelay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
@@ -68,10 +68,10 @@ class Calibration:
     names: tuple[str, ...]
     nominal: Array
     """(n, 3) as configured."""
-    estimate: Estimate
+    estimate: StateEstimate
     timing: float
     """What is not known of the sampling instants, s, as written."""
-    delays: tuple[Delay, ...]
+    delays: tuple[StampDelay, ...]
     """Of all units but the first."""
     faults: tuple[Span, ...]
     unusable: dict[str, Int]
@@ -163,8 +163,8 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
             "scale_std": result.scale[0],
             "scale_std_error": result.scale[1],
             "timing_std_s": result.timing,
-            "bias_walk": found.walk.value or None,
-            "bias_walk_possible": found.walk.possible,
+            "bias_walk": found.bias_walk.value or None,
+            "bias_walk_possible": found.bias_walk.possible,
         },
         "delays": [
             {"channels": [names[i] for i in d.channels], "late_s": d.value, "std_s": d.error, "shown": d.shown}
@@ -222,7 +222,7 @@ def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADI
 def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
     found, name, factor = result.estimate, unit.name, unit.factor
-    rest, walk = found.rest_seconds, found.walk
+    rest, walk = found.rest_seconds, found.bias_walk
     words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
     yield Finding(Role.FOUND, "time at rest", words, value=rest)
     std, usual = found.floor.std * factor, np.median(found.moment, axis=0) * factor

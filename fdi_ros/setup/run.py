@@ -173,7 +173,7 @@ MOST_NAMED = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class LearnedSettings:
     """A config, and the calibration that it is from; without one as it was before it."""
 
     parameters: Parameters
@@ -197,7 +197,7 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SetupResult(Settings):
+class SetupResult(LearnedSettings):
     """The config that a recording gives, and what it is from."""
 
     kept: str
@@ -265,14 +265,14 @@ def set_up(
     reports, damage = inspect(bag)
     chosen = _gyros(reports, bag)
     parameters: Parameters = {**starting_config(chosen, bag).parameters}
-    begun = Settings(parameters=parameters, config=Config.from_parameters(parameters))
+    begun = LearnedSettings(parameters=parameters, config=Config.from_parameters(parameters))
     reference_channels(begun.config, build_geometry(begun.config), reference)
     block = read_block(bag, begun.config, start, end)
     together = np.isfinite(block.z).all(axis=1).any()
     if source_of(begun.config).units and not together and (apart := clocks_apart(chosen, 0.0)):
         raise BagError(f"{bag}: {apart}")
 
-    def learn(part: Block) -> tuple[Settings, Settings]:
+    def learn(part: Block) -> tuple[LearnedSettings, LearnedSettings]:
         before = _mounted(part, begun)
         return before, _with_mounts(part, before, reference)
 
@@ -297,10 +297,10 @@ def recalibrate(
     if silent := [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]:
         words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
-    given = Settings(parameters=dict(config.parameters()), config=config)
+    given = LearnedSettings(parameters=dict(config.parameters()), config=config)
     part = _split(block, bag, start, end, proof)
 
-    def learn(block: Block) -> tuple[Settings, Settings]:
+    def learn(block: Block) -> tuple[LearnedSettings, LearnedSettings]:
         found = _calibrated(block, given, reference)
         if found.why is not None and block is part.learned:
             raise found.why
@@ -329,7 +329,7 @@ def _split(block: Block, bag: Path, start: float, end: float, proof: Path | None
     return _Split(block[:rows], block, (bag, start + since, end, f"the last {kept:.0f} s, kept aside", True))
 
 
-def _proved(split: _Split, learn: Callable[[Block], tuple[Settings, Settings]]) -> SetupResult:
+def _proved(split: _Split, learn: Callable[[Block], tuple[LearnedSettings, LearnedSettings]]) -> SetupResult:
     """Prove what a part of a recording gives; then take what all of it gives, or the settings before."""
     before, found = learn(split.learned)
     proof = prove(*split.proof, before.config, found.config)
@@ -357,7 +357,7 @@ def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
     raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {'; '.join(words) or 'none'}")
 
 
-def _mounted(block: Block, start: Settings) -> Settings:
+def _mounted(block: Block, start: LearnedSettings) -> LearnedSettings:
     """Find how units are mounted against each other."""
     if not source_of(start.config).units:
         return start
@@ -367,7 +367,7 @@ def _mounted(block: Block, start: Settings) -> Settings:
     return replace(_if_built(known, start), mounts=mounts)
 
 
-def _if_built(known: Parameters, before: Settings) -> Settings:
+def _if_built(known: Parameters, before: LearnedSettings) -> LearnedSettings:
     """Take the settings that are known now where a monitor can be built from them; else those before."""
     try:
         new = Config.from_parameters(known)
@@ -377,7 +377,7 @@ def _if_built(known: Parameters, before: Settings) -> Settings:
     return replace(before, parameters=known, config=new)
 
 
-def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
+def _with_mounts(block: Block, before: LearnedSettings, reference: str) -> LearnedSettings:
     """Calibrate with the mounts found, or refuse by what they contradict."""
     names, mounts = before.config.imu_names, before.mounts
     if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
@@ -400,7 +400,7 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
     return replace(careful, why=why)
 
 
-def _calibrated(block: Block, before: Settings, reference: str, unknown: Sequence[int] = ()) -> Settings:
+def _calibrated(block: Block, before: LearnedSettings, reference: str, unknown: Sequence[int] = ()) -> LearnedSettings:
     try:
         calibration = calibrate(block, before.config, reference, unknown)
     except FdiError as error:

@@ -29,7 +29,7 @@ POSSIBLE = 2.0
 
 
 @dataclass(frozen=True)
-class Evidence:
+class NormalEquations:
     """What the groups say of the states, the n biases first, in units of their standard deviations before.
 
     In units of their own, information on them would be apart by more than what rounding leaves of a number.
@@ -49,7 +49,7 @@ class Evidence:
     """(s,) means before."""
 
     @classmethod
-    def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> Evidence:
+    def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> NormalEquations:
         """Take the same of states in units of their own."""
         return cls(n, normal * np.outer(prior, prior), right * prior, apart, prior, start / prior)
 
@@ -70,7 +70,7 @@ class Smoothed:
     """(n, n) of it."""
 
 
-class Walk(NamedTuple):
+class RandomWalk(NamedTuple):
     """How the biases walk, rad/s/sqrt(s)."""
 
     value: float
@@ -92,7 +92,7 @@ class _Eliminated(NamedTuple):
     """Logarithm of the marginal likelihood of the walk."""
 
 
-def _eliminate(of: Evidence, walk: float) -> _Eliminated:
+def _eliminate(of: NormalEquations, walk: float) -> _Eliminated:
     n, count = of.n, len(of.normal)
     stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
     blocks = of.normal[:, :n, :n].copy()
@@ -118,10 +118,10 @@ def _eliminate(of: Evidence, walk: float) -> _Eliminated:
     return _Eliminated(solved, information, side, 0.5 * (fits - float(volume)))
 
 
-def find_walk(of: Evidence) -> Walk:
+def find_random_walk(of: NormalEquations) -> RandomWalk:
     """Find the walk of the biases by its marginal likelihood."""
     if len(of.normal) < 3:
-        return Walk(0.0, float(WALKS[-1]))
+        return RandomWalk(0.0, float(WALKS[-1]))
     none, *logs = (_eliminate(of, walk).likelihood for walk in (0.0, *WALKS))
     best = int(np.argmax(logs))
     # Between the walks tried, by a parabola.
@@ -132,10 +132,10 @@ def find_walk(of: Evidence) -> Walk:
     value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
     likely = np.array(logs) > max(logs[best], none) - POSSIBLE
     possible = float(WALKS[likely].max(initial=0.0))
-    return Walk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
+    return RandomWalk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
 
 
-def smooth(of: Evidence, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
+def smooth(of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
     """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
 
     Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and

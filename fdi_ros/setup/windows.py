@@ -163,10 +163,10 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
     sums, precision, weight = np.zeros(n), np.zeros(n), np.zeros(n)
     windows = np.zeros(len(level), dtype=bool)
     # A unit that comes late has quiet windows of its own.
-    for own in np.unique(there, axis=1).T:
-        quiet = _quietest(np.where(own, level, np.inf), count)
+    for pattern in np.unique(there, axis=1).T:
+        quiet = _quietest(np.where(pattern, level, np.inf), count)
         windows |= quiet
-        alike = (there == own[:, None]).all(axis=0)
+        alike = (there == pattern[:, None]).all(axis=0)
         for rows, columns in patterns_of(there & quiet[:, None]):
             samples = count[rows].sum()
             v = variances(

@@ -54,7 +54,7 @@ def test_stated_errors_are_the_actual_ones(kind: str) -> None:
         one, result = made(seed, kind, units)
         axes.append(((result.axes - one.axes) / result.axes_std).ravel())
         biases.append((result.estimate.bias - one.bias) / result.bias_std)
-        late, std = result.estimate.late[::3], result.estimate.late_std[::3]
+        late, std = result.estimate.delay[::3], result.estimate.delay_std[::3]
         delays.append(((late - one.late) / np.maximum(std, 1e-9))[1:])
     assert 0.7 < np.sqrt(np.mean(np.concatenate(axes) ** 2)) < 1.3
     assert 0.5 < np.sqrt(np.mean(np.concatenate(biases) ** 2)) < 1.5
@@ -85,8 +85,8 @@ def test_any_recording_gives_settings_with_errors_as_stated(
     result = calibrate(one.block if change is None else change(one.block), one.config)
     assert np.abs((result.axes - one.axes) / result.axes_std).max() < 4.0
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 4.0
-    assert np.abs((result.estimate.late[::3] - one.late)[1:] / result.estimate.late_std[3::3]).max() < 4.0
-    assert result.estimate.late_std.max() < (1e-3 if rate > 10.0 else 2e-3)
+    assert np.abs((result.estimate.delay[::3] - one.late)[1:] / result.estimate.delay_std[3::3]).max() < 4.0
+    assert result.estimate.delay_std.max() < (1e-3 if rate > 10.0 else 2e-3)
     assert result.scale[0] < (2e-3 if rate > 10.0 else 3e-3)
 
 
@@ -146,7 +146,7 @@ def test_bad_values_are_left_out_and_counted() -> None:
     z[-200:] = z[-201]
     result = calibrate(Block(one.block.stamp, z), one.config)
     np.testing.assert_allclose(result.axes, one.axes, atol=0.03)
-    assert np.abs(result.estimate.late[::3] - one.late).max() < 1e-3
+    assert np.abs(result.estimate.delay[::3] - one.late).max() < 1e-3
     assert result.unusable["not_finite"].sum() > 100
     assert result.unusable["out_of_range"].sum() > 50
     assert any("values not used" in line for line in said(result, Role.WARNING))
@@ -221,7 +221,7 @@ def test_a_noisy_channel_hides_no_rest() -> None:
 
 def test_an_error_state_that_calibration_does_not_estimate_is_taken_to_be_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     axes, unit = hand().axes, np.repeat(np.arange(3), 3)
-    sensors = estimate.Sensors(axes, unit, 3, np.full(9, 0.01), 0.02, 0.005)
+    sensors = estimate.Priors(axes, unit, 3, np.full(9, 0.01), 0.02, 0.005)
     whole, prior = estimate.coefficients_of(sensors, axes, sensors.scale_std)
     # As if scale errors were a kind that only the monitor knows.
     monkeypatch.setattr(estimate, "ESTIMATED", ("bias", "delay"))
