@@ -42,8 +42,7 @@ def _inspect(arguments: Namespace) -> int:
     """Print what it is fit for, a table of the topics, and a config to start from."""
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.findings import verdict_of
-    from fdi_ros.setup.fitness import recording_findings
+    from fdi_ros.setup.findings import recording_findings, verdict_of
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
     from fdi_ros.system.result_file import write_json, write_text
 
@@ -72,7 +71,7 @@ def _inspect(arguments: Namespace) -> int:
 def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
     """Return a config to start from, or none, and why the node would refuse it."""
     from fdi_ros.config.config import Config
-    from fdi_ros.setup.fitness import candidates, needs
+    from fdi_ros.setup.findings import candidates, needs
     from fdi_ros.setup.starting_config import starting_config
 
     if needs(reports):

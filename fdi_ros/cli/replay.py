@@ -72,7 +72,7 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.replay.summary import as_json
     from fdi_ros.replay.words import summary_text, verdict
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.fitness import refuse_degrees
+    from fdi_ros.setup.findings import refuse_degrees
     from fdi_ros.system.result_file import whole_file, write_json
 
     request, assumed = _request(arguments)

@@ -29,7 +29,7 @@ from fdi_ros.replay.summary import Summary
 from fdi_ros.replay.words import sample_rate_notes, verdict
 from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
-from fdi_ros.setup.noise_segments import NoiseSegments
+from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
 from fdi_ros.system.jobs import Cluster, run_jobs
 from fdi_ros.system.text import date_of, shown, storable

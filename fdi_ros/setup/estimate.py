@@ -36,8 +36,8 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
+from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.setup.smoother import NormalEquations, RandomWalk, Smoothed, find_random_walk, smooth
-from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
 SCALE_STD = 0.008
 """Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""

@@ -1,15 +1,36 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One table of what was found in a recording: of it come the verdict, the lines for people and the figures in JSON."""
+"""One table of what was found in a recording: of it come the verdict, the lines for people and the figures in JSON.
+
+And what a recording is fit for: gyros enough, in rad/s, stamped by one clock, each a sensor of its own. These are the
+findings of ``fdi inspect``, and the refusals that inspection, set-up, calibration, replay and fleet share.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.config.config import Config, is_plain_name
+from fdi_ros.errors import BagError
+from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.model.geometry import MIN_CHANNELS
+from fdi_ros.model.noise import noisier_words
+from fdi_ros.model.samples import Array
+from fdi_ros.monitor.encoder import OUTPUTS
+from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.report.verdict import Severity, Verdict
+from fdi_ros.setup.agreement import LEAST_ROTATION
+from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
+from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
+from fdi_ros.sources import SOURCES, Source
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -84,3 +105,231 @@ def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
         **{role.value: lines_of(findings, role) for role in Role if role is not Role.WORTH},
         "findings": [one._asdict() for one in findings],
     }
+
+
+# What a recording is fit for ------------------------------------------------------------------------------------------
+
+
+_CLOCKS = 1.0
+"""s by which clocks differ: less may be the time that messages take."""
+_OF_A_MONITOR = {output.name.rpartition("/")[2] for output in OUTPUTS}
+_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
+"""Kinds of input, first those with stamps."""
+NEEDED = ", or ".join(kind.needed() for kind in _PREFERRED)
+_NAMED = 8
+"""Topics that are named with what is wrong with them."""
+
+
+def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
+    """Return the topics a config is made for: up to four units, else the first array that fits.
+
+    What a monitor itself has published is no sensor: the fused rate must not be its own witness.
+    """
+    possible = [report for report in reports if _is_usable(report)]
+    for kind in _PREFERRED:
+        alike = [report for report in possible if report.kind is kind]
+        if len(alike) >= kind.fewest:
+            return alike[: kind.most]
+    return []
+
+
+def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str:
+    """Say which units are stamped by clocks so many s and more from the first one's; empty: none is."""
+    first = next((report for report in reports if math.isfinite(report.ahead)), None)
+    if first is None:
+        return ""
+    off = [(report.topic.name, report.ahead - first.ahead) for report in reports]
+    words = [f"{shown(name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
+    if not words:
+        return ""
+    return (
+        f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
+        " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
+    )
+
+
+def missing(reports: Sequence[TopicReport]) -> str:
+    """Say what a recording lacks of which no config can be made, and what is wrong with each topic that could do."""
+    why = [
+        f"{shown(report.topic.name)}: {words}"
+        for report in reports
+        if report.kind is not None and (words := _unusable(report, report.kind))
+    ]
+    more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
+    good = [shown(report.topic.name) for report in reports if _is_usable(report)]
+    usable = [f"usable: only {', '.join(good)}"] if good else []
+    return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
+
+
+def _is_usable(report: TopicReport) -> bool:
+    return report.kind is not None and report.channels > 0 and not _unusable(report, report.kind)
+
+
+def _unusable(report: TopicReport, kind: type[Source]) -> str:
+    """Say why a topic that could carry gyros cannot be used; empty: it can."""
+    # The first that holds is the reason.
+    reasons = {
+        "no messages": not report.received,
+        "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
+        "no name that ROS allows": not is_plain_name(report.topic.name),
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not kind.stamped and not report.channels,
+        f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
+        == report.received,
+        f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
+        "a single message": report.received == 1,
+        "its times of recording do not increase": not report.rate,
+        f"it gives the values of {shown(report.copy_of)}: one sensor on two topics is no redundancy": bool(
+            report.copy_of
+        ),
+    }
+    return next((words for words, holds in reasons.items() if holds), "")
+
+
+def needs(reports: Sequence[TopicReport]) -> str:
+    """Say what a recording needs before a config can be made of it; empty: nothing."""
+    chosen = candidates(reports)
+    return in_degrees(chosen) if chosen else missing(reports)
+
+
+def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Iterator[Finding]:
+    """Say what a recording is fit for.
+
+    Parameters
+    ----------
+    reports
+        What was seen of each topic.
+    refused
+        Why no config can be made of it, where it needs nothing; empty: one can.
+    unit
+        Of rates.
+    """
+    chosen = candidates(reports)
+    lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
+    if lacking or clocks:
+        words = lacking or f"one clock: {clocks}"
+        yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
+        return
+    if copies := copy_words(reports):
+        words = f"{copies}; the copy is left out"
+        yield Finding(Role.WARNING, "copy", words, headline="NEEDS A LOOK")
+    names: list[str] = []
+    units: list[list[int]] = []
+    for one in chosen:
+        assert one.kind is not None
+        places = list(range(len(names), len(names) + one.channels))
+        units += [places] if len(chosen) > 1 else [[i] for i in places]
+        names += [f"{shown(one.topic.name)} {place}" for place in one.kind.value_names(one.channels)]
+    words = f"{len(names)} channels in {f'{len(chosen)} units' if len(chosen) > 1 else 'one array'}"
+    words += f" at {max(one.rate for one in chosen):.3g} Hz"
+    noise = np.concatenate([one.segments.moving_noise() for one in chosen])
+    if noisy := noisier_words(names, noise, units, unit.name, unit.factor):
+        yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
+    yield Finding(Role.WORTH, "ready", words, headline="READY")
+
+
+def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Iterator[Finding]:
+    """Say what is wrong with the messages of each topic."""
+    for one in chosen:
+        words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
+        if words := words + troubles(one, unit):
+            yield Finding(Role.WARNING, "messages", f"{one.topic.name}: {', '.join(words)}", (one.topic.name,))
+
+
+def copy_words(reports: Sequence[TopicReport]) -> str:
+    """Say which topics give the values of others; empty: none does."""
+    copies = [f"{shown(one.topic.name)} gives the values of {shown(one.copy_of)}" for one in reports if one.copy_of]
+    return f"{' and '.join(copies)}: one sensor on two topics is no redundancy" if copies else ""
+
+
+# Degrees a second -----------------------------------------------------------------------------------------------------
+
+
+DEGREES = math.degrees(1.0)
+NEAR = 0.2
+"""A factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less."""
+QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)
+"""Of the rates of a unit, that are compared with those of another."""
+FEWEST_QUANTILES = 2
+"""That must show motion."""
+FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
+"""Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
+than so many times the factor of a degree."""
+STILL, NOISIEST = 0.3, 0.02
+"""Share of a recording that lies still; noise of a sample there, rad/s, that no gyro at rest has."""
+
+
+def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
+    """Say which topics are in deg/s, and what shows it; empty: nothing does.
+
+    Parameters
+    ----------
+    chosen
+        Topics of one body.
+    largest_rate
+        The range that gyros may have, rad/s.
+    """
+    chosen = [one for one in chosen if one.complete]
+    rates = [_rate_quantiles(one) for one in chosen]
+    for k, fast in enumerate(rates):
+        for j, slow in enumerate(rates):
+            moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
+            factors = fast[moving] / slow[moving]
+            if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
+                factor = float(np.median(factors))
+                fast_name, slow_name = shown(chosen[k].topic.name), shown(chosen[j].topic.name)
+                return f"rad/s: {fast_name} is in deg/s, it shows {factor:.3g} times the rotation of {slow_name}"
+    names = " and ".join(shown(one.topic.name) for one in chosen)
+    verb = "is" if len(chosen) == 1 else "are"
+    if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
+        largest = max(one.largest for one in chosen)
+        return (
+            f"rad/s: {names} {verb} in deg/s, {largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
+        )
+    if chosen and all(map(_no_gyro_at_rest, chosen)):
+        noise = max(float(one.segments.quiet_noise().max()) for one in chosen)
+        return f"rad/s: {names} {verb} in deg/s, no gyro at rest has a bias and noise of {noise:.2g} rad/s"
+    return ""
+
+
+def _block_means(report: TopicReport) -> Array:
+    """Means of blocks (B, c), rad/s."""
+    segments = report.segments.all_segments()
+    return np.concatenate([one.means for one in segments]) if segments else np.zeros((1, report.channels))
+
+
+def _rate_quantiles(report: TopicReport) -> Array:
+    """Quantiles of the size of the rate; a bias is no rotation."""
+    means = _block_means(report)
+    return np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), QUANTILES)
+
+
+def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
+    """Whether rates, less than a shock or damage makes, are beyond the range of gyros for long."""
+    largest = np.abs(_block_means(report)).max(axis=1)
+    beyond = largest > largest_rate
+    lasting = beyond & (largest < FAST_RANGE * DEGREES * largest_rate)
+    seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())
+    return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
+
+
+def _no_gyro_at_rest(report: TopicReport) -> bool:
+    """Whether it lies still, and with more noise and bias than any gyro in rad/s has."""
+    rest = report.segments.at_rest(largest_bias=FASTEST)
+    if not sum(rest) > STILL * len(rest) or not (report.segments.quiet_noise() > NOISIEST).all():
+        return False
+    still = [one.means.mean(axis=0) for one, lies in zip(report.segments.all_segments(), rest, strict=True) if lies]
+    return bool(np.abs(np.median(still, axis=0)).max() > LARGEST_BIAS)
+
+
+def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
+    """Refuse a recording whose gyros, of this config, are in deg/s; return what was seen of their topics.
+
+    Raises
+    ------
+    BagError
+        If it cannot be read, or which topic is and what shows it.
+    """
+    chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
+    if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
+        raise BagError(f"{bag} needs {words}; mend the driver")
+    return chosen

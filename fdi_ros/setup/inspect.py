@@ -18,7 +18,7 @@ from fdi_ros.core.copies import copies_among
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
-from fdi_ros.setup.noise_segments import NoiseSegments
+from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.sources import Source, source_of_type
 from fdi_ros.system.text import date_of, shown
 

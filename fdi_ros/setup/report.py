@@ -29,8 +29,7 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.findings import Finding, Role, findings_figures, lines_of, verdict_of
-from fdi_ros.setup.fitness import copy_words, topic_findings
+from fdi_ros.setup.findings import Finding, Role, copy_words, findings_figures, lines_of, topic_findings, verdict_of
 from fdi_ros.setup.inspect import topic_columns
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.result import Calibration, calibration_figures, calibration_findings, channel_columns

@@ -33,7 +33,7 @@ from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare_channels
 from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
-from fdi_ros.setup.fitness import candidates, clocks_apart, copy_words, needs, refuse_degrees
+from fdi_ros.setup.findings import candidates, clocks_apart, copy_words, needs, refuse_degrees
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.setup.result import Calibration

@@ -21,7 +21,7 @@ from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
 from fdi_ros.setup.agreement import LEAST_WINDOWS, SQUARE, angle_of, find_turn
 from fdi_ros.setup.blocks import WINDOW
-from fdi_ros.setup.fitness import candidates, copy_words, needs
+from fdi_ros.setup.findings import candidates, copy_words, needs
 from fdi_ros.setup.inspect import TopicReport, inspect
 from fdi_ros.sources import input_of
 from fdi_ros.system.text import shown

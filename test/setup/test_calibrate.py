@@ -184,6 +184,9 @@ def test_contradictions_are_refused_and_named() -> None:
     )
     dead[:, 5] = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(dead))
     refused(dead, r"imu_2", config=one.config)
+    off = one.block.z.copy()
+    off[len(off) // 4 :, 4] += 0.1
+    refused(off, r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; mend it")
     z, stamp = one.block.z, one.block.stamp
     refused(z[:100], r"1\.0 s long, a calibration needs at least 10 s", stamp[:100])
     refused(z[::100], r"^the recording has \d\d samples, a calibration needs at least 100$", stamp[::100])
@@ -237,6 +240,16 @@ def test_a_reference_is_believed() -> None:
     np.testing.assert_allclose(result.axes[3:6], one.nominal.axes[3:6], atol=1e-4)
     with pytest.raises(ConfigError, match=r"imu_9.*imu_1, imu_2, imu_3"):
         calibrate(one.block, one.config, "imu_9")
+
+
+def test_axes_of_an_array_are_found_from_those_of_its_first_three() -> None:
+    one, array = hand(), {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "cone"}
+    config = Config.from_parameters({**array, "geometry.cone_channels": 6, "sample_rate": one.config.sample_rate})
+    result = calibrate(Block(one.block.stamp, one.block.z[:, :6]), config)
+    np.testing.assert_allclose(result.axes[:3], result.nominal[:3], atol=1e-5)
+    true = one.axes[:6] @ np.linalg.solve(one.axes[:3], result.nominal[:3])
+    assert np.abs(true - result.nominal).max() > 0.5
+    assert (np.abs(result.axes - true) < 4.0 * result.axes_std + 1e-5).all()
 
 
 def test_exact_repeats_are_not_data() -> None:

@@ -15,7 +15,7 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_m
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.setup.fitness import candidates
+from fdi_ros.setup.findings import candidates
 from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
 from fdi_ros.setup.starting_config import starting_config, starting_config_of
 
