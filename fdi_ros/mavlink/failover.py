@@ -10,6 +10,7 @@ written right after the parameter is sent: the disk may take longer than the veh
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,12 +36,18 @@ TEXTS = {
     "back": (INFO, "in use again"),
     "not out": (CRITICAL, "out of use: not accepted"),
     "not back": (CRITICAL, "back in use: not accepted"),
-    "changed": (WARNING, "set by somebody else, left alone"),
-    "stays": (CRITICAL, "stays in use: "),
+    "changed": (WARNING, "set by others, left alone"),
+    "stays": (CRITICAL, "stays: "),
 }
 """Severity and words, by the kind of action."""
 LARGEST = 4096
 """Bytes of the file, at most."""
+
+
+def format_imu(unit: int, channels: Sequence[str]) -> str:
+    """Name an IMU, from 0, as the autopilot counts it and as the topics name it: ``IMU 1 (imu_0)``."""
+    name = channels[3 * unit].rpartition(".")[0]
+    return f"IMU {unit + 1} ({name})" if name else f"IMU {unit + 1}"
 
 
 class Declarations:
@@ -105,8 +112,8 @@ class Failover:
     def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
         self._vehicle, self._channels, self._limit, self._path = vehicle, channels, limit, path
         count = len(channels) // 3
-        self.errors: dict[str, str] = {}
-        """Estimated error of each channel, as the monitor last reported it, rad/s."""
+        self.errors: dict[str, float] = {}
+        """Estimated error of each channel, as the monitor last reported it, rad/s; NaN: it reported none."""
         self.reported = 0
         """When the monitor last reported as a whole, of these IMUs, ns; 0: it has not, or of others since."""
         self.is_alone = False
@@ -170,13 +177,13 @@ class Failover:
 
     def restore(self, now: int) -> tuple[bool, str]:
         """Put all back that is out of use by our hand; return whether that was asked of the autopilot, and words."""
-        ours = ", ".join(str(unit + 1) for unit in sorted(self._state.orders))
+        ours = ", ".join(format_imu(unit, self._channels) for unit in sorted(self._state.orders))
         if not ours:
             return True, "no IMU is out of use by failover"
         if not self._known(now).linked:
-            return False, f"IMU {ours} cannot be put back: the autopilot is not heard"
+            return False, f"{ours} cannot be put back: the autopilot is not heard"
         self.turn(now, restore=True)
-        return True, f"IMU {ours} is put back"
+        return True, f"{ours} is put back"
 
     def _read(self, now: int) -> None:
         vehicle = self._vehicle
@@ -193,7 +200,9 @@ class Failover:
 
     def _tell(self, kind: str, unit: int, more: str = "") -> None:
         severity, words = TEXTS[kind]
-        text = f"FDI: IMU {unit + 1} {words}{more}"[:LENGTH]
+        text = f"FDI: {format_imu(unit, self._channels)} {words}{more}"
+        if len(text) > LENGTH:
+            text = f"FDI: IMU {unit + 1} {words}{more}"[:LENGTH]
         self._vehicle.say(severity, text)
         self._vehicle.events.append(text)
 
@@ -204,11 +213,9 @@ class Failover:
         if kind != "out" or not faulty:
             return ""
         newest = max(faulty, key=lambda i: declared[i] or 0)
-        try:
-            size = float(self.errors.get(self._channels[newest], ""))
-        except ValueError:
-            return f" (gyro {'xyz'[newest % 3]})"
-        return f" (gyro {'xyz'[newest % 3]} {size if newest % 3 == 0 else -size:+.2f} rad/s)"
+        size = self.errors.get(self._channels[newest], math.nan)
+        words = "" if math.isnan(size) else f" {size if newest % 3 == 0 else -size:+.2f} rad/s"
+        return f" (gyro {'xyz'[newest % 3]}{words})"
 
     # The file, and what is said of it all ------------------------------------------------------------------------
 
@@ -237,9 +244,9 @@ class Failover:
 
     def status(self, name: str, now: int) -> tuple[Level, str, str]:
         """Return level, name and words for the diagnostics: what is out, or what would speak against taking one out."""
-        if out := [str(k + 1) for k, order in self._state.orders.items() if order.is_out]:
+        if out := [format_imu(k, self._channels) for k, order in self._state.orders.items() if order.is_out]:
             unsaved = "" if self._state.orders.keys() == self._saved else "; failover_file is not written"
-            return Level.WARN, name, f"out of use: IMU {', '.join(out)} of system {self._system}{unsaved}"
+            return Level.WARN, name, f"out of use: {', '.join(out)} of system {self._system}{unsaved}"
         known = self._known(now)
         known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
         against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]

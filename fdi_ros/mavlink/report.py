@@ -19,7 +19,7 @@ from fdi_ros.mavlink.imu import MESSAGES, RESOLUTION, numbers
 from fdi_ros.mavlink.link import Link
 from fdi_ros.mavlink.streams import ENOUGH
 from fdi_ros.mavlink.vehicle import Vehicle
-from fdi_ros.monitor.diagnostics import Level, StatusLine
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 LOSSY = 0.05
 """Share of messages lost on the link that is worth a warning."""
@@ -155,8 +155,6 @@ SILENT = 3 * NS
 """A monitor that reports nothing for so long is silent, ns."""
 FROZEN = "FROZEN"
 """In place of the state of a channel that is not declared: its unit gives old values."""
-WHOLE = ""
-"""In place of a channel: the monitor as a whole."""
 _STATES = {
     "FAULTY": (CRITICAL, "faulty, left out"),
     "AMBIGUOUS": (CRITICAL, "one of them faulty"),
@@ -165,6 +163,7 @@ _STATES = {
 }
 """By the state of a channel that is announced."""
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
+NOTHING_SEEN = "no further fault would be seen"
 
 
 class Text(NamedTuple):
@@ -174,37 +173,14 @@ class Text(NamedTuple):
     text: str
 
 
-class Report(NamedTuple):
-    """What a monitor reports of one channel, or of the whole."""
-
-    name: str
-    """Of the channel; `WHOLE`."""
-    state: str
-    """Of a channel: its state; of the whole: its message."""
-    group: str = ""
-    """Channels of which one is faulty, if the state says so."""
-    apart: str = ""
-    """By how much the two channels of a group differ, rad/s, as "0.100 +- 0.002"."""
-
-
-def whole_state(message: str, level: int) -> str:
-    """Return what of a monitor's own status is announced; empty: nothing."""
-    if level == 3:
+def _format_whole(line: StatusLine) -> str:
+    """Say what of a monitor's own status is announced; empty: nothing."""
+    if line.level == Level.STALE:
         # At a start there is nothing yet that could be missed.
-        return "" if message == "no sample yet" else "no samples"
-    if message.startswith("no fused rate: the biases are being learned"):
-        return ""
-    if message.startswith("no fused rate"):
-        return "no fused rate"
-    return "no further fault would be seen" if "no further fault would be seen" in message else ""
-
-
-def channel_report(name: str, values: Mapping[str, str]) -> Report:
-    """Return what is announced of a channel, from the values of its status."""
-    state = values["state"]
-    if values.get("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
-        state = FROZEN
-    return Report(name, state, values.get("one of", ""), values.get("apart (rad/s)", ""))
+        return "" if line.message == "no sample yet" else "no samples"
+    if line.message.startswith("no fused rate"):
+        return "" if line.message.startswith("no fused rate: the biases are being learned") else "no fused rate"
+    return NOTHING_SEEN if NOTHING_SEEN in line.message else ""
 
 
 class Announcer:
@@ -229,18 +205,20 @@ class Announcer:
         """When the first of what has changed since the last texts did, ns."""
         self._tokens, self._filled = float(AT_ONCE), 0
 
-    def hear(self, reports: Sequence[Report], now: int) -> None:
-        """Take reports of the monitor at a time, ns."""
+    def hear(self, lines: Sequence[StatusLine], now: int) -> None:
+        """Take the diagnostics of the monitor, under names without its own, at a time, ns."""
         self._heard = now
-        for report in reports:
-            if report.name == WHOLE:
-                self._change_whole(report.state, now)
-            elif report.name in self._now and (report.state in _STATES or report.state in _FINE):
-                state = report.state if report.state in _STATES else "OK"
-                found = (state, report.group if state == "AMBIGUOUS" else "")
-                self._apart[report.name] = report.apart.partition(" ")[0]
-                if found != self._now[report.name]:
-                    self._now[report.name] = found
+        for line in lines:
+            state = line.value("state")
+            if line.value("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
+                state = FROZEN
+            if line.name == WHOLE:
+                self._change_whole(_format_whole(line), now)
+            elif line.name in self._now and (state in _STATES or state in _FINE):
+                found = (state if state in _STATES else "OK", line.value("one of") if state == "AMBIGUOUS" else "")
+                self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
+                if found != self._now[line.name]:
+                    self._now[line.name] = found
                     self._note_change(now)
 
     def _change_whole(self, state: str, now: int) -> None:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.system.text import plus_minus
@@ -45,15 +45,30 @@ class Level(IntEnum):
     STALE = 3
 
 
-@dataclass(frozen=True)
-class StatusLine:
+class StatusLine(NamedTuple):
     """One diagnostic_msgs/DiagnosticStatus."""
 
     level: Level
     name: str
     message: str
-    hardware_id: str
-    values: tuple[tuple[str, str], ...]
+    hardware_id: str = ""
+    values: tuple[tuple[str, str], ...] = ()
+
+    def value(self, key: str) -> str:
+        """Return a value by its key; empty: there is none."""
+        return dict(self.values).get(key, "")
+
+    def number(self, key: str) -> float:
+        """Return a value as a number; NaN: it is none."""
+        return parse_number(self.value(key))
+
+
+def parse_number(text: str) -> float:
+    """Return a number in a text; NaN: there is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 @dataclass(frozen=True)

@@ -65,19 +65,23 @@ class Event:
         return self.after in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 
     def __repr__(self) -> str:
-        return f"Event({', '.join(_words(self, ()))})"
+        return f"Event({', '.join(_cells(self, ()))})"
 
 
 _HEAD = ("stamp s", "channel", "change", "why")
 
 
-def _words(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
-    """Say when what became of which channel, and why; without names channels are numbered."""
-    name = [names[i] if names else f"channel {i}" for i in (event.channel, *event.group)]
+def format_reason(event: Event, names: Sequence[str]) -> str:
+    """Say why a channel changed its state; without names channels are numbered."""
     size = f" by {abs(event.error):.3g} rad/s" if event.error else ""
-    group = f"; one of {', '.join(name[1:])}" if len(event.group) > 1 else ""
+    group = ", ".join(names[i] if names else f"channel {i}" for i in event.group)
+    return event.reason.value + size + (f"; one of {group}" if len(event.group) > 1 else "")
+
+
+def _cells(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
+    name = names[event.channel] if names else f"channel {event.channel}"
     change = f"{event.before.name} -> {event.after.name}"
-    return f"{event.stamp / 1e9:.3f}", name[0], change, f"{event.reason.value}{size}{group}"
+    return f"{event.stamp / 1e9:.3f}", name, change, format_reason(event, names)
 
 
 class Events(Sequence[Event]):
@@ -152,7 +156,7 @@ class Output:
         return f"Output({self._words()})"
 
     def _repr_html_(self) -> str:
-        return html_table(self._words(), _HEAD, (_words(event, self.channel_names) for event in self.events))
+        return html_table(self._words(), _HEAD, (_cells(event, self.channel_names) for event in self.events))
 
     def _words(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0

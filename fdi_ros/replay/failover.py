@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.clock import MS, NS
-from fdi_ros.mavlink.failover import PARAMETERS, TEXTS, Declarations
+from fdi_ros.mavlink.failover import PARAMETERS, TEXTS, Declarations, format_imu
 from fdi_ros.mavlink.failover_policy import HEALED, YOUNG, Known, State, Unit, decide
 from fdi_ros.replay.summary import StateChange
 
@@ -54,7 +54,7 @@ def failover_text(events: Sequence[StateChange], channels: Sequence[str]) -> str
                 use[action.unit] = action.use
             else:
                 words = TEXTS[action.kind][1] + action.why
-                done.append(f"IMU {action.unit + 1} {words} at {(now - _BEFORE) / NS:.1f} s")
+                done.append(f"{format_imu(action.unit, channels)} {words} at {(now - _BEFORE) / NS:.1f} s")
     return f"failover, if armed: {'; '.join(done) or 'nothing to do'}"
 
 

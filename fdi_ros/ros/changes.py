@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fdi_ros.monitor.diagnostics import format_apart
-from fdi_ros.monitor.output import ChannelState, Event
+from fdi_ros.monitor.output import ChannelState, Event, format_reason
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.messages import BoundedLog
 
@@ -74,7 +74,8 @@ class ChangeLog:
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
             if self._is_due(event, now):
-                words = self._words(event, pair)
+                words = format_reason(event, self._names)
+                words += f"; {format_apart(pair)}" if pair is not None and len(event.group) > 1 else ""
                 line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
                 lines.setdefault((event.after, f"{line}{words and ': '}{words}"), []).append(event.channel)
         for (state, words), channels in lines.items():
@@ -102,14 +103,6 @@ class ChangeLog:
         worst = severity if now >= one.until else max(one.worst, severity)
         self._reported[event.channel] = _Reported(now + QUIET, worst, event.after)
         return True
-
-    def _words(self, event: Event, pair: ApartStatus | None) -> str:
-        words = event.reason.value + (f" by {abs(event.error):.3g} rad/s" if event.error else "")
-        if len(event.group) > 1:
-            group = [self._names[i] for i in event.group]
-            words += f"; one of {', '.join(group)}" if pair is None or set(pair.channels) != set(group) else ""
-            words += f"; {format_apart(pair)}" if pair is not None else ""
-        return words
 
     def _write(self, state: ChannelState, channels: Sequence[int], words: str) -> None:
         line = f"{', '.join(self._names[channel] for channel in channels)}: {words}"

@@ -9,6 +9,7 @@ the vehicle, but for `failover`, which sets which IMUs of an ArduPilot are in us
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import time
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -31,13 +32,19 @@ from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.link import open_link, read_key
-from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
-from fdi_ros.mavlink.report import Announcer, Report, Reporter, channel_report, whole_state
+from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import Sample, Vehicle, VehicleSettings
-from fdi_ros.monitor.diagnostics import INPUT, WHOLE, StatusLine
+from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
 from fdi_ros.ros import parameters
-from fdi_ros.ros.messages import REPORT_PERIOD, diagnostics_publisher, message_class, output_qos, prefix_of
+from fdi_ros.ros.messages import (
+    REPORT_PERIOD,
+    diagnostics_publisher,
+    message_class,
+    output_qos,
+    prefix_of,
+    read_diagnostics,
+)
 from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
 from fdi_ros.sources.channels import ChannelsSource
 
@@ -222,27 +229,23 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         # All nodes speak there: only what can be the monitor's is taken apart.
         if len(data) > _LARGEST or prefix.encode() not in data:
             return
-        reports, topics, sizes, reporting = [], [], {}, False
-        for status in deserialize_message(data, DiagnosticArray).status:
-            if not status.name.startswith(prefix):
-                continue
-            name = status.name.removeprefix(prefix)
-            values = {pair.key: pair.value for pair in status.values}
-            if name == WHOLE:
-                reports.append(Report(WHOLE_REPORT, whole_state(status.message, status.level[0])))
-                self._tell(values, now)
-                reporting = status.level != DiagnosticStatus.STALE
-            elif name.startswith(INPUT):
-                topics.append(values.get("topic", "").removesuffix(INJECTED))
-            elif "state" in values:
-                sizes[name] = values.get("estimated error (rad/s)", "")
-                reports.append(channel_report(name, values))
-        if reports and self._announcer is not None:
-            self._announcer.hear(reports, now)
+        try:
+            lines = read_diagnostics(deserialize_message(data, DiagnosticArray), self._monitor)
+        except ValueError:
+            # Not the monitor's: it has no such level.
+            return
+        whole = next((line for line in lines if line.name == WHOLE), None)
+        if whole is not None:
+            self._tell(whole, now)
+        if self._announcer is not None:
+            self._announcer.hear(lines, now)
+        topics = [line.value("topic").removesuffix(INJECTED) for line in lines if line.name.startswith(INPUT)]
         # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
         if self._failover is not None and topics:
+            reporting = whole is not None and whole.level != Level.STALE
             agrees = reporting and topics == [output.topic_name for output in self._outputs]
-            self._failover.reported, self._failover.errors = (now if agrees else 0), sizes
+            self._failover.reported = now if agrees else 0
+            self._failover.errors = {line.name: line.number("estimated error (rad/s)") for line in lines}
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
@@ -261,16 +264,13 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self.log.warning(f"~/restore: {response.message}")
         return response
 
-    def _tell(self, values: dict[str, str], now: int) -> None:
+    def _tell(self, whole: StatusLine, now: int) -> None:
         if not self._values or not self.vehicle.in_reach or now - self._valued < _VALUE_EVERY:
             return
         self._valued = now
         for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
-            try:
-                value = float(values.get(key, ""))
-            except ValueError:
-                continue
-            self.vehicle.tell(name, value, now)
+            if not math.isnan(value := whole.number(key)):
+                self.vehicle.tell(name, value, now)
 
     # Reports ------------------------------------------------------------------------------------------------------
 

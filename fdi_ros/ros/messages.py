@@ -17,7 +17,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.diagnostics import StatusLine
+from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, encode_diagnostics
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
@@ -81,6 +81,34 @@ class Publishers:
         """Take the topics down."""
         for publisher in (self.fused, self.integrity, self.diagnostics):
             self._node.destroy_publisher(publisher)
+
+
+def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
+    """Return what one node says in a message of /diagnostics, where all speak; names without that of the node.
+
+    Parameters
+    ----------
+    message
+        diagnostic_msgs/DiagnosticArray.
+    node
+        Full name.
+
+    Raises
+    ------
+    ValueError
+        If a level is none.
+    """
+    prefix = f"{node.strip('/')}: "
+    found = []
+    for status in message.status:
+        if status.name.startswith(prefix):
+            level = ord(status.level)
+            if level > max(Level):
+                raise ValueError(f"level {level}, expected 0 to {max(Level)}")
+            values = tuple((pair.key, pair.value) for pair in status.values)
+            name = status.name.removeprefix(prefix)
+            found.append(StatusLine(Level(level), name, status.message, status.hardware_id, values))
+    return found
 
 
 def message_class(name: str) -> Any:

@@ -9,18 +9,17 @@ import math
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level
+from fdi_ros.monitor.diagnostics import INPUT, WHOLE
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.watch_view import Channel, Input, Picture
+from fdi_ros.ros.messages import read_diagnostics
+from fdi_ros.ros.watch_view import Picture
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -28,11 +27,7 @@ SERVICE = "/relearn_bias"
 """A node with this service is a monitor: it is there before the node is configured."""
 SETTLE = 1.0
 """Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
-FIRST, LAST = 2, 3
-"""Numbers of the integrity before the states, statistic and threshold, and after them, the protection level."""
-STATES = {state.name: state for state in ChannelState}
-LEVELS = {bytes([level]): level for level in Level}
-"""As a message carries them."""
+STATES = tuple(state.name for state in ChannelState)
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -56,7 +51,6 @@ class Watcher(Node):
         self.picture = Picture(monitor)
         self._callbacks: dict[str, tuple[type, Any]] = {
             "Imu": (Imu, self._on_fused),
-            "Float64MultiArray": (Float64MultiArray, self._on_integrity),
             "DiagnosticArray": (DiagnosticArray, self._on_diagnostics),
         }
         """By message type."""
@@ -112,7 +106,8 @@ class Watcher(Node):
             # DDS goes on listing one that was killed for a while.
             silent = f"{monitor} is silent: it was killed or hangs; " if "diagnostics" in self.picture.heard else ""
             return f"{silent}waiting for diagnostics of {monitor} on {topics['DiagnosticArray']}"
-        return "" if "integrity" in self.picture.heard else f"waiting for the first sample: {self.picture.whole}"
+        whole = self.picture.whole
+        return f"waiting for the first sample: {whole.message}" if whole.value("samples") == "0" else ""
 
     def _published(self, monitor: str) -> dict[str, str] | None:
         """Topics of the monitor itself by message type; None: it is not there.
@@ -135,9 +130,6 @@ class Watcher(Node):
             for kind, (message, callback) in self._callbacks.items()
         ]
 
-    def _heard(self, kind: str) -> None:
-        self.picture.heard[kind] = time.monotonic()
-
     def _ignore(self, kind: str, why: str) -> None:
         """Count a message that no monitor sends, and remember why."""
         self.picture.ignored += 1
@@ -149,58 +141,23 @@ class Watcher(Node):
             self._ignore("Imu", "a rate that is not finite")
             return
         self.picture.rate = (rate.x, rate.y, rate.z)
-        self._heard("fused")
-
-    def _on_integrity(self, message: Float64MultiArray) -> None:
-        picture, count = self.picture, len(message.data) - FIRST - LAST
-        if not 0 < count <= MAX_CHANNELS:
-            expected = f"{FIRST + LAST + 1} to {FIRST + LAST + MAX_CHANNELS}"
-            self._ignore("Float64MultiArray", f"{len(message.data)} numbers, expected {expected}")
-            return
-        picture.statistic, picture.threshold = message.data[:FIRST]
-        picture.level = tuple(message.data[-LAST:])
-        self._heard("integrity")
+        self.picture.heard["fused"] = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        # All nodes publish there: those of the monitor have its name, "drone/fdi_node: ...".
-        prefix = f"{self.picture.monitor.strip('/')}: "
-        found = [status for status in message.status if status.name.startswith(prefix)]
-        if not found:
+        try:
+            found = read_diagnostics(message, self.picture.monitor)
+        except ValueError as error:
+            self._ignore("DiagnosticArray", str(error))
             return
-        for status in found:
-            if status.level not in LEVELS:
-                self._ignore("DiagnosticArray", f"level {ord(status.level)}, expected 0 to {max(Level)}")
-                return
-        picture, channels, inputs = self.picture, {}, []
-        for status in found:
-            name, values = status.name.removeprefix(prefix), {value.key: value.value for value in status.values}
-            if name == WHOLE:
-                picture.whole, picture.whole_level = status.message, LEVELS[status.level]
-                picture.figures = values
-            elif name.startswith(INPUT):
-                rate = values.get("rate (Hz)", "?")
-                inputs.append(Input(name.removeprefix(INPUT), LEVELS[status.level], status.message, rate))
-            elif (state := values.get("state")) in STATES:
-                channels[name] = _channel(status, values)
-            elif state is not None:
-                self._ignore("DiagnosticArray", f"state {state!r}, expected one of {', '.join(STATES)}")
-                return
-        picture.inputs = inputs
-        picture.update_channels(channels or picture.channels)
-        self._heard("diagnostics")
-
-
-def _channel(status: DiagnosticStatus, values: dict[str, str]) -> Channel:
-    since, residual, bias, bias_std = (
-        _number(values.get(key, ""))
-        for key in ("state since (stamp, s)", "residual (rad/s)", "bias (rad/s)", "bias known to (rad/s)")
-    )
-    level = LEVELS[status.level]
-    return Channel(STATES[values["state"]], level, status.message, since, residual, bias, bias_std)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+        channels = {line.name: line for line in found if line.value("state")}
+        wrong = next((state for line in channels.values() if (state := line.value("state")) not in STATES), "")
+        if wrong:
+            self._ignore("DiagnosticArray", f"state {wrong!r}, expected one of {', '.join(STATES)}")
+        elif found:
+            picture = self.picture
+            picture.whole = next((line for line in found if line.name == WHOLE), picture.whole)
+            picture.inputs = [
+                line._replace(name=line.name.removeprefix(INPUT)) for line in found if line.name.startswith(INPUT)
+            ]
+            picture.update_channels(channels or picture.channels)
+            picture.heard["diagnostics"] = time.monotonic()

@@ -10,10 +10,9 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from fdi_ros.monitor.diagnostics import Level
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, parse_number
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -26,7 +25,7 @@ COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Lev
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
 """What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
-SILENT = {"integrity": 1.0, "fused": 1.0, "diagnostics": 3.0}
+SILENT = {"fused": 1.0, "diagnostics": 3.0}
 """After so long without a message the last one is no longer shown as the present state, s."""
 REMEMBERED = 50
 """Changes of state."""
@@ -38,49 +37,13 @@ REGULAR = 10.0
 """Line by line, the state of the whole is reported at least so often, s."""
 
 
-@dataclass
-class Channel:
-    """One channel, from its diagnostics."""
-
-    state: ChannelState
-    level: Level
-    words: str
-    """On its state."""
-    since: float
-    """Stamp of the sample that brought the state, s."""
-    residual: float
-    """rad/s; NaN: none, as for the bias and its standard deviation."""
-    bias: float
-    bias_std: float
-
-
-@dataclass
-class Change:
+class Change(NamedTuple):
     """Channels that changed state alike."""
 
     at: float
     """Wall clock, s since 1970."""
-    names: tuple[str, ...]
-    before: ChannelState | None
-    after: ChannelState
     level: Level
     words: str
-
-    def text(self, total: int) -> str:
-        """Say it in a line; of all channels together as "all"."""
-        names = "all" if len(self.names) == total else ", ".join(self.names)
-        was = f"{self.before.name} -> " if self.before is not None else ""
-        return shown(f"{names}  {was}{self.after.name}" + (f": {self.words}" if self.words else ""), LINE)
-
-
-@dataclass
-class Input:
-    """One input of the monitor, from its diagnostics."""
-
-    name: str
-    level: Level
-    words: str
-    rate: str
 
 
 @dataclass
@@ -95,19 +58,12 @@ class Picture:
     """What is waited for; empty: nothing."""
     since: float = field(default_factory=time.monotonic)
     """When waiting for it began, s, monotonic clock."""
-    channels: Mapping[str, Channel] = field(default_factory=dict)
+    whole: StatusLine = field(default_factory=lambda: StatusLine(Level.STALE, WHOLE, ""))
+    channels: Mapping[str, StatusLine] = field(default_factory=dict)
     """By name."""
-    statistic: float = math.nan
-    threshold: float = math.nan
-    level: tuple[float, ...] = ()
-    """Protection level of the fused rate about x, y, z, rad/s."""
+    inputs: Sequence[StatusLine] = ()
     rate: tuple[float, float, float] | None = None
     """Fused rate, rad/s."""
-    whole: str = ""
-    whole_level: Level = Level.STALE
-    figures: Mapping[str, str] = field(default_factory=dict)
-    """Of the whole."""
-    inputs: list[Input] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
     """When the last message of each kind came, s, monotonic clock."""
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
@@ -123,29 +79,31 @@ class Picture:
         return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT[kind]
 
     @property
-    def is_judged(self) -> bool:
-        """Whether there is a statistic to be shown."""
-        return math.isfinite(self.statistic) and self.threshold > 0 and not self.is_silent("integrity")
+    def evidence(self) -> tuple[float, float] | None:
+        """Statistic and threshold; None: no sample is judged now."""
+        found = self.whole.number("statistic"), self.whole.number("threshold")
+        is_stale = self.whole.level == Level.STALE or self.is_silent("diagnostics")
+        return None if is_stale or not math.isfinite(found[0]) or not found[1] > 0 else found
 
-    def ignored_words(self) -> str:
+    def format_ignored(self) -> str:
         """Say how many messages were ignored and why the last one was; empty: none."""
         some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} ignored"
-        return f"{some}: {self.ignored_why}" if self.ignored else ""
+        return shown(f"{some}: {self.ignored_why}", LINE) if self.ignored else ""
 
-    def update_channels(self, channels: Mapping[str, Channel]) -> None:
-        """Take the present channels and remember which changed state."""
-        moves: dict[tuple[ChannelState | None, ChannelState, Level, str], list[str]] = {}
-        for name, channel in channels.items():
-            before = self.channels[name].state if name in self.channels else None
-            if channel.state is not before:
-                words = "" if channel.state is ChannelState.OK else channel.words
-                moves.setdefault((before, channel.state, channel.level, words), []).append(name)
+    def update_channels(self, channels: Mapping[str, StatusLine]) -> None:
+        """Keep the present channels and remember which changed state."""
+        moves: dict[tuple[Level, str], list[str]] = {}
+        for name, line in channels.items():
+            before, state = self.channels[name].value("state") if name in self.channels else "", line.value("state")
+            if state != before:
+                why = f": {line.message}" if state != "OK" and line.message else ""
+                words = f"{before} -> {state}{why}" if before else f"{state}{why}"
+                moves.setdefault((line.level, words), []).append(name)
         self.channels = channels
         self.changed += len(moves)
-        self.changes += [Change(time.time(), tuple(names), *move) for move, names in moves.items()]
-
-
-# Drawn ----------------------------------------------------------------------------------------------------------------
+        for (level, words), names in moves.items():
+            who = "all" if len(names) == len(channels) else ", ".join(names)
+            self.changes.append(Change(time.time(), level, shown(f"{who}  {words}", LINE)))
 
 
 def draw(picture: Picture, width: int) -> Group:
@@ -159,15 +117,15 @@ def draw(picture: Picture, width: int) -> Group:
         waited = time.monotonic() - picture.since
         parts.append(Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow"))
     if picture.ignored:
-        parts.append(Text(shown(picture.ignored_words(), LINE), style="yellow"))
+        parts.append(Text(picture.format_ignored(), style="yellow"))
+    if not picture.is_silent("diagnostics"):
+        parts.append(Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level]))
     if not picture.channels:
         return Group(*parts)
-    if not picture.is_silent("diagnostics"):
-        parts.append(Text(shown(picture.whole, LINE), style=COLOURS[picture.whole_level]))
     parts += [Text(), _figure_table(picture), _channel_table(picture, width >= WIDE), *_input_lines(picture), Text()]
     for change in list(picture.changes)[: -LATEST - 1 : -1]:
         at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
-        parts.append(at.append(change.text(len(picture.channels)), style=COLOURS[change.level]))
+        parts.append(at.append(change.words, style=COLOURS[change.level]))
     return Group(*parts)
 
 
@@ -177,11 +135,11 @@ def _head(picture: Picture) -> Text:
     head = Text(f"{shown(picture.monitor) or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
     if picture.is_silent("diagnostics"):
         return head.append("says nothing" if picture.heard else "", style="magenta")
-    hertz, middle, late = (
-        picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)")
+    hertz, middle, late, detector = (
+        shown(picture.whole.value(key) or "none")
+        for key in ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector")
     )
-    figures = [f"{hertz} Hz", f"latency {middle} ms (p99 {late})", picture.figures.get("detector", "")]
-    return head.append("  ".join(map(shown, figures)), style="not bold")
+    return head.append(f"{hertz} Hz  latency {middle} ms (p99 {late})  {detector}", style="not bold")
 
 
 def _grid(widths: Sequence[int | None]) -> Table:
@@ -204,14 +162,16 @@ def _figure_table(picture: Picture) -> Table:
         table.add_row("fused", Text("no rate", style="bold red"))
     else:
         rate = "  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True))
-        known = bool(picture.level) and all(map(math.isfinite, picture.level))
-        table.add_row("fused", f"{rate} rad/s", Text(f"within {max(picture.level):.2g}" if known else "", style=GREY))
-    if not picture.is_judged:
+        level = [parse_number(text) for text in picture.whole.value("protection level (rad/s)").split()]
+        known = bool(level) and all(map(math.isfinite, level))
+        table.add_row("fused", f"{rate} rad/s", Text(f"within {max(level):.2g}" if known else "", style=GREY))
+    if picture.evidence is None:
         table.add_row("evidence", Text("none: no sample is being judged", style=GREY))
     else:
-        colour = "red" if picture.statistic >= picture.threshold else "cyan"
-        bar = Bar(picture.threshold, 0.0, min(picture.statistic, picture.threshold), color=colour)
-        table.add_row("evidence", bar, f"{picture.statistic:.3g} of {picture.threshold:.3g}")
+        statistic, threshold = picture.evidence
+        colour = "red" if statistic >= threshold else "cyan"
+        bar = Bar(threshold, 0.0, min(statistic, threshold), color=colour)
+        table.add_row("evidence", bar, f"{statistic:.3g} of {threshold:.3g}")
     return table
 
 
@@ -221,29 +181,31 @@ def _channel_table(picture: Picture, is_wide: bool) -> Table:
     from rich.text import Text
 
     is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
-    sizes = {name: abs(one.residual) if math.isfinite(one.residual) else 0.0 for name, one in picture.channels.items()}
+    residuals = {name: line.number("residual (rad/s)") for name, line in picture.channels.items()}
+    sizes = {name: abs(value) if math.isfinite(value) else 0.0 for name, value in residuals.items()}
     scale = next((scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1])
     table = _grid((max(len(shown(name)) for name in sizes), 9, None, 9, 18)[:columns])
     heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")
     table.add_row(*(Text(word, style=GREY) for word in heads[:columns]))
-    for name, channel in picture.channels.items():
-        colour = COLOURS[channel.level] if is_fresh else GREY
+    for name, line in picture.channels.items():
+        colour = COLOURS[line.level] if is_fresh else GREY
         cells = (
             # A string would be taken for markup.
             Text(shown(name)),
-            Text(channel.state.name if is_fresh else "?", style=colour),
+            Text(line.value("state") if is_fresh else "?", style=colour),
             Bar(scale, 0.0, min(sizes[name], scale) if is_fresh else 0.0, color=colour.removeprefix("bold ")),
-            f"{channel.residual:+.4f}" if is_fresh and math.isfinite(channel.residual) else "none",
-            _bias_words(channel) if is_fresh else "none",
+            f"{residuals[name]:+.4f}" if is_fresh and math.isfinite(residuals[name]) else "none",
+            _format_bias(line) if is_fresh else "none",
         )
         table.add_row(*cells[:columns])
     return table
 
 
-def _bias_words(channel: Channel) -> str:
-    if not math.isfinite(channel.bias):
+def _format_bias(line: StatusLine) -> str:
+    bias, std = line.number("bias (rad/s)"), line.number("bias known to (rad/s)")
+    if not math.isfinite(bias):
         return "none"
-    return f"{channel.bias:+.4f}" + (f" +- {channel.bias_std:.4f}" if math.isfinite(channel.bias_std) else "")
+    return f"{bias:+.4f}" + (f" +- {std:.4f}" if math.isfinite(std) else "")
 
 
 def _input_lines(picture: Picture) -> list[Text]:
@@ -252,14 +214,11 @@ def _input_lines(picture: Picture) -> list[Text]:
 
     if picture.is_silent("diagnostics") or not picture.inputs:
         return []
-    odd = [unit for unit in picture.inputs if unit.level != Level.OK]
+    odd = [line for line in picture.inputs if line.level != Level.OK]
     if odd:
-        return [Text(shown(f"input {unit.name}: {unit.words}", LINE), style=COLOURS[unit.level]) for unit in odd]
-    rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in picture.inputs)
+        return [Text(shown(f"input {line.name}: {line.message}", LINE), style=COLOURS[line.level]) for line in odd]
+    rates = ", ".join(f"{line.name} {line.value('rate (Hz)')} Hz" for line in picture.inputs)
     return [Text(shown(f"inputs   {rates}", LINE), no_wrap=True, overflow="ellipsis")]
-
-
-# Line by line ---------------------------------------------------------------------------------------------------------
 
 
 class LineReport:
@@ -276,26 +235,25 @@ class LineReport:
         """Return what is new since the last time."""
         now, before = time.time(), self._said
         new, self._changed = min(picture.changed - self._changed, len(picture.changes)), picture.changed
-        whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole)
+        whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole.message)
         self._said = (picture.caption, whole, picture.ignored > 0)
-        changes = list(picture.changes)[len(picture.changes) - new :]
         lines = [(now, picture.caption)] if picture.caption != before[0] else []
-        lines += [(change.at, change.text(len(picture.channels))) for change in changes]
+        lines += [(change.at, change.words) for change in list(picture.changes)[len(picture.changes) - new :]]
         if any(self._said[1:]) and (self._said[1:] != before[1:] or now >= self._due):
             self._due = now + REGULAR
-            lines.append((now, f"{whole}{'' if picture.waiting else _figures(picture)}"))
-            lines += [(now, picture.ignored_words())] if picture.ignored else []
+            lines.append((now, f"{whole}{'' if picture.waiting else _format_figures(picture)}"))
+            lines += [(now, picture.format_ignored())] if picture.ignored else []
         return [
             f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}  {shown(words, LINE)}"
             for at, words in lines
         ]
 
 
-def _figures(picture: Picture) -> str:
-    if picture.rate is None or picture.is_silent("fused"):
-        rate = "no fused rate"
-    else:
+def _format_figures(picture: Picture) -> str:
+    rate, evidence = "no fused rate", "nothing judged"
+    if picture.rate is not None and not picture.is_silent("fused"):
         rate = f"fused rate{''.join(f' {value:+.3f}' for value in picture.rate)} rad/s"
-    hertz, late = (picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p99 (ms)"))
-    evidence = f"evidence {picture.statistic:.3g} of {picture.threshold:.3g}" if picture.is_judged else "nothing judged"
+    if picture.evidence is not None:
+        evidence = "evidence {:.3g} of {:.3g}".format(*picture.evidence)
+    hertz, late = (picture.whole.value(key) or "none" for key in ("sample rate (Hz)", "latency p99 (ms)"))
     return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"

@@ -14,17 +14,21 @@ from fdi_ros.mavlink.report import (
     CRITICAL,
     INFO,
     LENGTH,
+    NOTHING_SEEN,
     WARNING,
-    WHOLE,
     Announcer,
-    Report,
-    channel_report,
-    whole_state,
 )
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 NS = 1_000_000_000
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz"]
+
+
+def report(name: str, state: str, group: str = "", apart: str = "", repeats: str = "") -> StatusLine:
+    """What a monitor reports of a channel."""
+    values = {"state": state, "one of": group, "apart (rad/s)": apart, "repeats for (s)": repeats}
+    return StatusLine(Level.OK, name, "", values=tuple(values.items()))
 
 
 class Ground:
@@ -34,7 +38,7 @@ class Ground:
         self.announcer, self.now = Announcer(channels), 100 * NS
         self.told: list[tuple[float, int, str]] = []
 
-    def hear(self, *reports: Report, wait: float = 1.0) -> list[tuple[int, str]]:
+    def hear(self, *reports: StatusLine, wait: float = 1.0) -> list[tuple[int, str]]:
         before = len(self.told)
         self.announcer.hear(reports, self.now)
         for k in range(round(wait * 20)):
@@ -47,26 +51,23 @@ class Ground:
 
 def test_declarations_are_told_and_suspicions_are_not() -> None:
     ground = Ground()
-    assert ground.hear(Report("imu_2.y", "SUSPECT")) == []
-    assert ground.hear(Report("imu_2.y", "FAULTY")) == [(CRITICAL, "FDI: imu_2.y faulty, left out")]
-    assert ground.hear(Report("imu_2.y", "FAULTY")) == []
-    assert ground.hear(Report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y in use again")]
-    assert ground.hear(Report("another.channel", "FAULTY"), Report("imu_1.x", "no such state")) == []
+    assert ground.hear(report("imu_2.y", "SUSPECT")) == []
+    assert ground.hear(report("imu_2.y", "FAULTY")) == [(CRITICAL, "FDI: imu_2.y faulty, left out")]
+    assert ground.hear(report("imu_2.y", "FAULTY")) == []
+    assert ground.hear(report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y in use again")]
+    assert ground.hear(report("another.channel", "FAULTY"), report("imu_1.x", "no such state")) == []
 
 
 def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
     ground = Ground()
 
-    def reports(state: str, seconds: str) -> list[Report]:
-        return [channel_report(name, {"state": state, "repeats for (s)": seconds}) for name in CHANNELS[3:6]]
+    def reports(state: str, seconds: str) -> list[StatusLine]:
+        return [report(name, state, repeats=seconds) for name in CHANNELS[3:6]]
 
     assert ground.hear(*reports("OK", "0.25")) == [(WARNING, "FDI: imu_2 frozen")]
     assert ground.hear(*reports("OK", "1.25")) == []
     assert ground.hear(*reports("OK", "")) == [(INFO, "FDI: imu_2 in use again")]
     assert ground.hear(*reports("FAULTY", "2.25")) == [(CRITICAL, "FDI: imu_2 faulty, left out")]
-
-
-BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz"]
 
 
 @pytest.mark.parametrize(
@@ -85,20 +86,23 @@ BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz
 def test_a_unit_and_a_set_are_one_text(names: list[str], state: str, apart: str, text: tuple[int, str]) -> None:
     ground = Ground(BOATS if names[0] in BOATS else CHANNELS)
     group = ", ".join(names) if state == "AMBIGUOUS" else ""
-    assert ground.hear(*(Report(name, state, group, apart) for name in names)) == [text]
+    assert ground.hear(*(report(name, state, group, apart) for name in names)) == [text]
     # That they come to be further apart is no news.
-    assert ground.hear(*(Report(name, state, group, apart and "0.2 +- 0.002") for name in names), wait=5.0) == []
+    assert ground.hear(*(report(name, state, group, apart and "0.2 +- 0.002") for name in names), wait=5.0) == []
 
 
 def test_the_whole_is_told_too() -> None:
     ground = Ground()
-    gone = whole_state("no fused rate: withheld, as channels under doubt cannot be left out; 4 of 6", 2)
-    assert ground.hear(Report(WHOLE, gone)) == [(CRITICAL, "FDI: no fused rate")]
-    assert ground.hear(Report(WHOLE, whole_state("9 of 9 channels healthy", 0))) == [(INFO, "FDI: all is judged again")]
-    assert whole_state("no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", 2) == ""
-    assert whole_state("3 of 6 channels healthy; no further fault would be seen", 2).startswith("no further")
-    assert whole_state("no sample for 3.0 s", 3) == "no samples"
-    assert whole_state("no sample yet", 3) == "", "nothing is said before the first data"
+    again = [(INFO, "FDI: all is judged again")]
+    for level, message, told in (
+        (Level.STALE, "no sample yet", []),
+        (Level.ERROR, "no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", []),
+        (Level.ERROR, "no fused rate: withheld, as channels under doubt ...", [(CRITICAL, "FDI: no fused rate")]),
+        (Level.OK, "9 of 9 channels healthy", again),
+        (Level.ERROR, "3 of 6 channels healthy; no further fault would be seen", [(CRITICAL, f"FDI: {NOTHING_SEEN}")]),
+        (Level.STALE, "no sample for 3.0 s", [(CRITICAL, "FDI: no samples")]),
+    ):
+        assert ground.hear(StatusLine(level, WHOLE, message), wait=3.0) == told, message
     assert ground.announcer.due(ground.now + 4 * NS) == []
     assert ground.announcer.due(ground.now + 5 * NS) == [(CRITICAL, "FDI: the monitor is silent")]
 
@@ -117,7 +121,7 @@ def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(chang
     ground = Ground()
     states = dict.fromkeys(CHANNELS, "OK")
     for name, state, group in changes:
-        ground.hear(Report(name, state, group), wait=0.1)
+        ground.hear(report(name, state, group), wait=0.1)
         # A suspicion is no news: what was said stands.
         states[name] = states[name] if state == "SUSPECT" else state
     busy = ground.now
@@ -135,5 +139,5 @@ def test_a_unit_that_comes_and_goes_silences_nothing() -> None:
     ground, told = Ground(), []
     for k in range(40):
         state = "STALE" if k % 2 else "OK"
-        told += ground.hear(Report("imu_1.x", "FAULTY"), *(Report(f"imu_3.{axis}", state) for axis in "xyz"), wait=0.05)
+        told += ground.hear(report("imu_1.x", "FAULTY"), *(report(f"imu_3.{axis}", state) for axis in "xyz"), wait=0.05)
     assert (CRITICAL, "FDI: imu_1.x faulty, left out") in told[:2]

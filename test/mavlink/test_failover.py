@@ -148,19 +148,19 @@ def flying(tmp_path: Path) -> Monitored:
 
 def test_an_imu_is_out_within_100_ms_told_kept_and_put_back_on_disarm(flying: Monitored, tmp_path: Path) -> None:
     autopilot, at = flying.autopilots[0], flying.now
-    flying.failover.errors["imu_1.y"] = "0.301"
+    flying.failover.errors["imu_1.y"] = 0.301
     flying.declare("imu_1.y")
     flying.run(1.0)
     assert autopilot.sets == [(pytest.approx(at, abs=100 * MS), "INS_USE", 0.0)]
     assert autopilot.flies_with == 1
-    assert autopilot.texts == [(2, "FDI: IMU 1 out of use (gyro y -0.30 rad/s)")]
+    assert autopilot.texts == [(2, "FDI: IMU 1 (imu_1) out of use (gyro y -0.30 rad/s)")]
     assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
     flying.states = [OK] * 9
     assert flying.run(20.0).autopilots[0].flies_with == 1, "healthy again, it stays out in flight"
     autopilot.armed = False
     flying.run(6.0)
     assert set(autopilot.parameters.values()) == {1.0}
-    assert autopilot.texts[-1] == (6, "FDI: IMU 1 in use again")
+    assert autopilot.texts[-1] == (6, "FDI: IMU 1 (imu_1) in use again")
     assert json.loads((tmp_path / "out.json").read_text())["out_of_use"] == []
 
 
@@ -205,7 +205,7 @@ def test_it_is_repeated_over_a_poor_link_and_given_up_where_refused(tmp_path: Pa
     talk.declare("imu_2.x")
     talk.run(5.0)
     assert len(refusing.sets) == 10
-    assert refusing.texts == [(2, "FDI: IMU 2 out of use: not accepted")]
+    assert refusing.texts == [(2, "FDI: IMU 2 (imu_2) out of use: not accepted")]
     refusing.read_only.clear()
     refusing.armed = False
     talk.run(8.0)
@@ -221,13 +221,13 @@ def test_what_somebody_else_sets_is_left_alone(flying: Monitored) -> None:
     autopilot.say_parameter("INS_USE", out)
     flying.inject(out[0])
     flying.run(1.0)
-    assert autopilot.texts[-1] == (4, "FDI: IMU 1 set by somebody else, left alone")
+    assert autopilot.texts[-1] == (4, "FDI: IMU 1 (imu_1) set by others, left alone")
     flying.declare("imu_1.y", OK)
     flying.run(3.0)
     flying.declare("imu_1.y")
     flying.run(3.0)
     assert len(autopilot.sets) == 1
-    assert autopilot.texts[-1] == (2, "FDI: IMU 1 stays in use: set by others")
+    assert autopilot.texts[-1] == (2, "FDI: IMU 1 (imu_1) stays: set by others")
 
 
 def test_a_pilot_who_puts_back_at_once_is_not_overruled(flying: Monitored) -> None:
@@ -239,7 +239,7 @@ def test_a_pilot_who_puts_back_at_once_is_not_overruled(flying: Monitored) -> No
     flying.inject(out[0])
     flying.run(5.0)
     assert [value for _, _, value in autopilot.sets] == [0.0]
-    assert autopilot.texts[-1] == (4, "FDI: IMU 1 set by somebody else, left alone")
+    assert autopilot.texts[-1] == (4, "FDI: IMU 1 (imu_1) set by others, left alone")
 
 
 def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> None:
@@ -263,7 +263,7 @@ def test_after_a_start_in_flight_what_is_in_use_again_is_left_alone(tmp_path: Pa
     talk = Monitored(tmp_path, Autopilot("ardupilot", armed=True)).run(6.0)
     talk.declare("imu_1.y")
     talk.run(3.0)
-    assert talk.autopilots[0].texts == [(2, "FDI: IMU 1 stays in use: set by others")]
+    assert talk.autopilots[0].texts == [(2, "FDI: IMU 1 (imu_1) stays: set by others")]
     assert not talk.autopilots[0].sets
 
 
@@ -302,8 +302,8 @@ def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
     autopilot.boot = -100 * NS
     again = Monitored(tmp_path, autopilot).run(12.0)
     assert autopilot.texts == [
-        (2, "FDI: IMU 1 out of use"),
-        (6, "FDI: IMU 1 in use again"),
+        (2, "FDI: IMU 1 (imu_1) out of use"),
+        (6, "FDI: IMU 1 (imu_1) in use again"),
     ]
     assert autopilot.flies_with == 0
     assert again.failover.status("failover", again.now)[2] == "ready"
@@ -318,8 +318,9 @@ def test_what_failover_would_have_done_in_a_recording() -> None:
     first = [change(105.2, "imu_1.x", "SUSPECT"), change(105.3, "imu_1.x", "FAULTY"), change(122.0, "imu_1.x", "OK")]
     second = [change(130.0, "imu_3.y", "FAULTY"), change(131.5, "imu_2.z", "FAULTY")]
     assert failover_text(begin + first + second, CHANNELS) == (
-        "failover, if armed: IMU 1 out of use at 105.3 s; IMU 1 in use again at 130.0 s; IMU 3 out of use at 130.0 s;"
-        " IMU 2 stays in use: limit at 132.5 s"
+        "failover, if armed: IMU 1 (imu_1) out of use at 105.3 s; IMU 1 (imu_1) in use again at 130.0 s;"
+        " IMU 3 (imu_3) out of use at 130.0 s;"
+        " IMU 2 (imu_2) stays: limit at 132.5 s"
     )
     assert failover_text(begin, CHANNELS[:4]) == ""
 
@@ -327,7 +328,7 @@ def test_what_failover_would_have_done_in_a_recording() -> None:
 def test_an_operator_puts_back(flying: Monitored) -> None:
     flying.declare("imu_1.y")
     flying.run(1.0)
-    assert flying.failover.restore(flying.now) == (True, "IMU 1 is put back")
+    assert flying.failover.restore(flying.now) == (True, "IMU 1 (imu_1) is put back")
     flying.run(5.0)
     assert flying.autopilots[0].flies_with == 0
     assert flying.failover.restore(flying.now) == (True, "no IMU is out of use by failover")

@@ -128,6 +128,27 @@ def test_a_unit_that_falls_silent_is_named_and_the_rest_goes_on():
     assert len(ear.fused) >= 295
 
 
+@pytest.mark.parametrize("leap", [-0.06, -0.03, 0.004, 0.03, 0.06])
+@pytest.mark.parametrize("motion", [0.0, 1.0])
+def test_a_clock_that_leaps_once_by_less_than_the_timeout_blames_no_other_unit(leap, motion):
+    """From the leap on the unit tells of another instant: in motion it disagrees by as much; a few ms are a delay."""
+    pipeline, template = Pipeline(parallel(3, detector__name="sequential")), ImuTemplate("imu")
+    ear, block = Ear(pipeline), stream(pipeline.geometry, 2000, size=motion)
+    for k, (stamp, row) in enumerate(zip(block.stamp.tolist(), block.z.reshape(2000, 3, 3).tolist(), strict=True)):
+        for unit in range(3):
+            leapt = unit == 1 and k >= 1000
+            ear.take(unit, template.fill(stamp + round(1e9 * leap) * leapt, row[unit], (0.0,) * 9))
+    assert len(ear.fused) == len(ear.integrity) >= 1990, "a rate in every sample"
+    declared = [event for event in ear.events if event.declares]
+    assert bool(declared) == (motion > 0.0 and abs(leap) > 0.01)
+    assert {event.channel for event in declared[:3]} <= {3, 4, 5}
+    assert all((event.stamp - block.stamp[1000]) / 1e9 < 0.3 for event in declared[:3])
+    assert {event.channel for event in declared if event.after == ChannelState.FAULTY} <= {3, 4, 5}
+    counts = ear.receiver.counts(1)
+    lost = counts["missing"] if leap > 0 else counts["duplicate"] + counts["backward"]
+    assert lost == (0 if leap == 0.004 else round(abs(leap) / 0.01))
+
+
 def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     """Compiled code reaches constants by their address: those of the detector before must not be asked any more."""
     pipeline = Pipeline(parallel(3))

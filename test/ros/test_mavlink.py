@@ -143,13 +143,15 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain
             assert ears.says("failover", "ready")
             strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
             assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
-            assert wait(lambda: any(text.startswith("FDI: IMU 1 out of use (gyro y") for _, text in autopilot.texts))
-            assert ears.says("failover", "out of use: IMU 1 of system 1")
+            assert wait(
+                lambda: any(text.startswith("FDI: IMU 1 (imu_1) out of use (gyro y") for _, text in autopilot.texts)
+            )
+            assert ears.says("failover", "out of use: IMU 1 (imu_1) of system 1")
             restore = ears.listener.create_client(Trigger, "/mavlink_node/restore")
             assert wait(restore.service_is_ready)
             answer = restore.call_async(Trigger.Request())
             assert wait(answer.done)
-            assert answer.result().message == "IMU 1 is put back"
+            assert answer.result().message == "IMU 1 (imu_1) is put back"
             assert wait(lambda: autopilot.flies_with == 0)
             assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
             assert "failover over an unsigned link" in process.said()
@@ -165,7 +167,7 @@ def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tm
     words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={file}")
     with OverUdp(port, autopilot):
         with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):
-            assert ears.says("failover", "out of use: IMU 2 of system 1")
+            assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
         assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
         autopilot.armed = False
         with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):

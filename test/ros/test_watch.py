@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -25,32 +24,40 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from ros.harness import ROOT, TWO_IMUS, Listener, Process, listening, parameter_file, sound, wait
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.diagnostics import Level
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.ros.watch_node import Watcher
-from fdi_ros.ros.watch_view import REMEMBERED, Channel, Input, LineReport, Picture, draw
+from fdi_ros.ros.watch_view import REMEMBERED, LineReport, Picture, draw
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
+
+
+def channel(name: str, state: str, level: Level = Level.OK, words: str = "", **values: float) -> StatusLine:
+    keys = {"residual": "residual (rad/s)", "bias": "bias (rad/s)", "std": "bias known to (rad/s)"}
+    pairs = tuple((keys[key], str(value)) for key, value in values.items())
+    return StatusLine(level, name, words, values=(("state", state), *pairs))
+
+
+def whole(message: str, **more: str) -> StatusLine:
+    figures = {"statistic": "3.1", "threshold": "19.7", "protection level (rad/s)": "0.01 0.02 0.03", **more}
+    return StatusLine(Level.WARN, "monitor", message, values=tuple(figures.items()))
 
 
 @pytest.fixture
 def picture() -> Picture:
     """Twelve channels, one of them faulty."""
     names = [f"imu_{unit}.{axis}" for unit in (1, 2, 3, 4) for axis in "xyz"]
-    seen = Picture("/drone/fdi_node", "", "", statistic=3.1, threshold=19.7, rate=(0.5, -1.25, 0.0))
-    healthy = dict.fromkeys(names, Channel(ChannelState.OK, Level.OK, "agrees", 0.0, 0.001, math.nan, math.nan))
+    seen = Picture("/drone/fdi_node", "", "", rate=(0.5, -1.25, 0.0))
+    healthy = {name: channel(name, "OK", words="agrees", residual=0.001) for name in names}
     seen.update_channels(healthy)
-    faulty = Channel(ChannelState.FAULTY, Level.ERROR, WORDS, 12.0, -0.149, 0.0021, 0.0003)
+    faulty = channel("imu_2.y", "FAULTY", Level.ERROR, WORDS, residual=-0.149, bias=0.0021, std=0.0003)
     seen.update_channels(healthy | {"imu_2.y": faulty})
-    seen.whole, seen.whole_level = "11 of 12 channels healthy; any further fault would be seen and isolated", Level.WARN
-    seen.level = (0.01, 0.02, 0.03)
-    seen.inputs = [Input("imu_3", Level.STALE, "silent for 1.2 s", "0.0")]
+    seen.whole = whole("11 of 12 channels healthy; any further fault would be seen and isolated")
+    seen.inputs = [StatusLine(Level.STALE, "imu_3", "silent for 1.2 s")]
     # Fresh, however long this machine takes to draw it.
-    seen.heard = dict.fromkeys(("integrity", "fused", "diagnostics"), math.inf)
+    seen.heard = dict.fromkeys(("fused", "diagnostics"), math.inf)
     return seen
 
 
@@ -67,7 +74,7 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture,
     lines = drawn(picture, width)
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
-    assert picture.whole in text
+    assert picture.whole.message in text
     assert f"imu_2.y OK -> FAULTY: {WORDS}" in text
     assert "input imu_3: silent for 1.2 s" in text
     (row,) = [line for line in lines if line.startswith("imu_2.y")]
@@ -94,19 +101,19 @@ def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Pict
     report = LineReport()
     said = [line.split("  ", 1)[1] for line in report.lines(picture)]
     assert said[:2] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
-    assert picture.whole in said[2]
+    assert picture.whole.message in said[2]
     assert report.lines(picture) == []
     # Alike with the same words: in one line.
-    doubtful = Channel(ChannelState.SUSPECT, Level.WARN, "disagrees", 0.0, 0.1, math.nan, math.nan)
+    doubtful = channel("imu_1.x", "SUSPECT", Level.WARN, "disagrees", residual=0.1)
     picture.update_channels({**picture.channels, "imu_1.x": doubtful, "imu_1.y": doubtful})
-    picture.whole = "9 of 12"
+    picture.whole = whole("9 of 12")
     said = [line.split("  ", 1)[1] for line in report.lines(picture)]
     assert said[0] == "imu_1.x, imu_1.y  OK -> SUSPECT: disagrees"
     assert said[1].startswith("9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7")
     # More than is remembered: those that are.
     for _ in range(2 * REMEMBERED):
         before = {**picture.channels}
-        picture.update_channels(before | {"imu_1.x": replace(doubtful, state=ChannelState.OK)})
+        picture.update_channels(before | {"imu_1.x": channel("imu_1.x", "OK")})
         picture.update_channels(before)
     assert len(report.lines(picture)) == REMEMBERED
 
@@ -115,16 +122,17 @@ EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
 
 
 def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
-    evil = Channel(ChannelState.SUSPECT, Level.WARN, EVIL, 0.0, 0.1, 0.0, 0.0)
+    evil = channel(EVIL, "SUSPECT", Level.WARN, EVIL, residual=0.1, bias=0.0, std=0.0)
     picture.update_channels({EVIL: evil} | {**picture.channels})
-    picture.whole = picture.waiting = picture.monitor = picture.caption = EVIL
-    picture.figures = dict.fromkeys(("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector"), EVIL)
+    keys = ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector", "protection level (rad/s)")
+    picture.whole = whole(EVIL, **dict.fromkeys(keys, EVIL))
+    picture.waiting = picture.monitor = picture.caption = EVIL
     report = LineReport()
     said = report.lines(picture)
     picture.waiting, picture.ignored, picture.ignored_why = "", 2, EVIL
     said += report.lines(picture)
     for level in (Level.OK, Level.WARN):
-        picture.inputs = [Input(EVIL, level, EVIL, EVIL)]
+        picture.inputs = [StatusLine(level, EVIL, EVIL, values=(("rate (Hz)", EVIL),))]
         said += drawn(picture, 500)
     assert all(line.isprintable() for line in said), [line for line in said if not line.isprintable()]
     assert len([line for line in said if "[/red][bold]" in line]) >= 12
@@ -139,7 +147,6 @@ def node(listener: Listener, **remaps: str) -> Iterator[Node]:
     speaker.create_service(Trigger, "~/relearn_bias", lambda _, answer: answer)
     speaker.says = {
         Imu: speaker.create_publisher(Imu, "fused", 10),
-        Float64MultiArray: speaker.create_publisher(Float64MultiArray, "~/integrity", 10),
         DiagnosticArray: speaker.create_publisher(DiagnosticArray, "/diagnostics", 10),
     }
     try:
@@ -181,33 +188,26 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
             return wait(look)
 
         with node(listener) as first:
-            assert comes(diagnostics("a/fdi_node"), first, lambda: picture.whole == "sound"), picture.waiting
-            assert comes(
-                Float64MultiArray(data=[1.0, 9.0, 0.0, 0.1, 0.1, 0.1]), first, lambda: picture.statistic == 1.0
-            )
+            assert comes(diagnostics("a/fdi_node"), first, lambda: picture.whole.message == "sound"), picture.waiting
             for message, words in (
-                (Float64MultiArray(data=[1.0]), "/a/fdi_node/integrity: 1 numbers, expected 6 to 17"),
-                (Float64MultiArray(), "/a/fdi_node/integrity: 0 numbers"),
-                (Float64MultiArray(data=[0.0] * 18), "/a/fdi_node/integrity: 18 numbers"),
                 (diagnostics("a/fdi_node", 0, "WELL"), "/diagnostics: state 'WELL', expected one of OK, SUSPECT"),
                 (diagnostics("a/fdi_node", 9), "/diagnostics: level 9, expected 0 to 3"),
                 (Imu(angular_velocity=Vector3(x=math.nan)), "/a/fused: a rate that is not finite"),
             ):
                 said = f"ignored: {words}"
-                assert comes(message, first, lambda said=said: said in picture.ignored_words()), said
-            assert picture.channels["g1"].state is ChannelState.OK
-            assert picture.statistic == 1.0
+                assert comes(message, first, lambda said=said: said in picture.format_ignored()), said
+            assert picture.channels["g1"].value("state") == "OK"
             assert picture.rate is None
             # Killed: DDS keeps it for there, but it says nothing.
             picture.heard["diagnostics"] -= 10
             assert comes(None, first, lambda: "/a/fdi_node is silent: it was killed or hangs" in picture.waiting)
         assert comes(None, first, lambda: "/a/fdi_node is gone: waiting" in picture.waiting), picture.waiting
-        elsewhere = {"fused": "/x/rate", "~/integrity": "/x/integrity", "/diagnostics": "/x/diagnostics"}
+        elsewhere = {"fused": "/x/rate", "/diagnostics": "/x/diagnostics"}
         with node(listener, **elsewhere) as second:
             waited.clear()
             assert comes(diagnostics("a/fdi_node"), second, lambda: not picture.is_silent("diagnostics"))
             faulty = diagnostics("a/fdi_node", 0, "FAULTY")
-            assert comes(faulty, second, lambda: picture.channels["g1"].state is ChannelState.FAULTY)
+            assert comes(faulty, second, lambda: picture.channels["g1"].value("state") == "FAULTY")
             # It has only just begun.
             assert not [words for words in waited if "silent" in words]
         executor.remove_node(watcher)
