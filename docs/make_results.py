@@ -28,9 +28,8 @@ TABULATED = {
 }
 """Largest residual the right one, and with an alarm of the chi-square test at 1e-3, by size in standard deviations."""
 STUDIES = {
-    "reference": """Against closed forms and the figures tabulated elsewhere: the chi-square test of the
-whole parity vector at 1e-3 a sample, and the name of the largest normalised residual. One standard error is at
-most 0.05 %.""",
+    "reference": """Against closed forms and tabulated figures: the chi-square test of the whole parity vector at 1e-3 a sample, and
+the name of the largest normalised residual. One standard error is at most 0.05 %.""",
     "residual_search_2019": """The paper prints 80.3 % detected, 8 % undetected, 7.3 % falsely determined, the same
 for its four searches. Its printed selection of trials (*printed*: the failed channel's error inside mean +- 3
 standard deviations of the healthy ones') cannot have been the one used; the opposite (*stands out*) gives its
@@ -38,11 +37,9 @@ figures to within 2.2 points at the ratio sigma_0 = 0.2 sigma_k 2 deg/s, which t
 3 all stay within 4.4. The tolerance (8) is no false-alarm guarantee: see *sound*.
 
 At equal false alarms `likelihood_ratio` declares the right channel 2 to 5 points more often than the searches
-(*stands out*), because it weighs every channel by its error at the rate of the sample, and is then at what is
-possible. That limit (*best possible, approximate*) is exact to about a point here: it takes errors for normal
-that the protocol clips at 3 standard deviations, and fault sizes for independent of the other errors that the
-selection compares them with. With constant noise and symmetric axes all of these name the same channel,
-see the next section.""",
+(*stands out*), because it weighs every channel by its error at the rate of the sample; that is what is
+possible (*best possible, approximate*, exact to about a point here). With constant noise and symmetric axes
+all of these name the same channel.""",
     "power": """Thresholds are found on 10^6 healthy samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:
 two methods that differ by less than half a point are alike. *best possible, approximate*: Bayes' decision that
 knows the size of the fault, integrated over parity space to 0.05 points; a method's figure has the errors of
@@ -83,9 +80,8 @@ def main() -> None:
     lines = [
         "# Results",
         "",
-        "What follows *Settings from a recording* is made by `python docs/make_results.py`; do not edit that. Figures",
-        "come from the seed of each study, whatever the number of workers; shares are in percent. A study prints more",
-        "tables than stand here; 95 % intervals stand in its JSON (`--json`) and on its page (`--report`).",
+        "What follows *Settings from a recording* is made by `python docs/make_results.py`. Figures come from the seed",
+        "of each study, shares are in percent; `--json` and `--report` of a study have more, with 95 % intervals.",
         "",
         f"fdi_ros {fdi_ros.__version__}, NumPy {np.__version__}, Python {platform.python_version()}.",
         "",
