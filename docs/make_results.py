@@ -28,8 +28,8 @@ TABULATED = {
 }
 """Largest residual the right one, and with an alarm of the chi-square test at 1e-3, by size in standard deviations."""
 STUDIES = {
-    "reference": """Against closed forms and tabulated figures: the chi-square test of the whole parity vector at 1e-3 a sample, and
-the name of the largest normalised residual. One standard error is at most 0.05 %.""",
+    "reference": """Against closed forms and tabulated figures: the chi-square test of the whole parity vector at
+1e-3 a sample, and the name of the largest normalised residual. One standard error is at most 0.05 %.""",
     "residual_search_2019": """The paper prints 80.3 % detected, 8 % undetected, 7.3 % falsely determined, the same
 for its four searches. Its printed selection of trials (*printed*: the failed channel's error inside mean +- 3
 standard deviations of the healthy ones') cannot have been the one used; the opposite (*stands out*) gives its
