@@ -42,7 +42,7 @@ def _inspect(arguments: Namespace) -> int:
     """Print what it is fit for, a table of the topics, and a config to start from."""
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.findings import recording_findings, verdict_of
+    from fdi_ros.setup.findings import findings_figures, recording_findings, verdict_of
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
     from fdi_ros.system.result_file import write_json, write_text
 
@@ -52,7 +52,7 @@ def _inspect(arguments: Namespace) -> int:
     topics = topics_text(reports, damage, unit)
     config, refused = _starting_config(reports, arguments.bag)
     found = verdict_of(recording_findings(reports, refused, unit))
-    figures = {"verdict": {"severity": found.severity.value, "words": found.words}, "config": config}
+    figures = {**findings_figures(list(recording_findings(reports, refused))), "config": config}
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), **figures})
     outputs.say(f"{found.words}\n", found.severity)
     outputs.say(f"{recording_text(reports, arguments.bag)}{topics}")

@@ -10,6 +10,7 @@ import json
 import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from functools import partial
 
 from fdi_ros.cli.arguments import Verb, add_degrees, add_report, add_results
 from fdi_ros.errors import ConfigError
@@ -41,8 +42,9 @@ def _geometry(arguments: Namespace) -> int:
 
     outputs = Outputs(arguments, ("report", "json"), arguments.config)
     result = assess(Config.from_file(arguments.config))
-    text = mounting_text(result, unit_of(arguments.degrees))
-    return outputs.finish(text, mounting_figures(result), lambda: mounting_page(result, config_words(arguments)))
+    unit, title = unit_of(arguments.degrees), config_words(arguments)
+    page = partial(mounting_page, result, title, unit)
+    return outputs.finish(mounting_text(result, unit), mounting_figures(result), page)
 
 
 GEOMETRY = Verb(

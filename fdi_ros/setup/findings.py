@@ -30,7 +30,7 @@ from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.agreement import LEAST_ROTATION
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
-from fdi_ros.sources import SOURCES, Source
+from fdi_ros.sources import SOURCES
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -125,7 +125,7 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [report for report in reports if _is_usable(report)]
+    possible = [report for report in reports if not _unusable(report)]
     for kind in _PREFERRED:
         alike = [report for report in possible if report.kind is kind]
         if len(alike) >= kind.fewest:
@@ -153,26 +153,24 @@ def missing(reports: Sequence[TopicReport]) -> str:
     why = [
         f"{shown(report.topic.name)}: {words}"
         for report in reports
-        if report.kind is not None and (words := _unusable(report, report.kind))
+        if report.kind is not None and (words := _unusable(report))
     ]
     more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
-    good = [shown(report.topic.name) for report in reports if _is_usable(report)]
+    good = [shown(report.topic.name) for report in reports if not _unusable(report)]
     usable = [f"usable: only {', '.join(good)}"] if good else []
     return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
 
 
-def _is_usable(report: TopicReport) -> bool:
-    return report.kind is not None and report.channels > 0 and not _unusable(report, report.kind)
-
-
-def _unusable(report: TopicReport, kind: type[Source]) -> str:
-    """Say why a topic that could carry gyros cannot be used; empty: it can."""
+def _unusable(report: TopicReport) -> str:
+    """Say why a topic cannot be used for gyros; empty: it can."""
     # The first that holds is the reason.
+    few = not report.channels and report.kind is not None and not report.kind.stamped
     reasons = {
+        "its type carries no gyros": report.kind is None,
         "no messages": not report.received,
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
         "no name that ROS allows": not is_plain_name(report.topic.name),
-        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not kind.stamped and not report.channels,
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": few,
         f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
         == report.received,
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
@@ -225,6 +223,7 @@ def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: 
     if noisy := noisier_words(names, noise, units, unit.name, unit.factor):
         yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
     yield Finding(Role.WORTH, "ready", words, headline="READY")
+    yield from topic_findings(chosen, unit)
 
 
 def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Iterator[Finding]:

@@ -382,15 +382,15 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     return "\n".join(lines) + "\n"
 
 
-def mounting_page(result: Mounting, title: str) -> str:
+def mounting_page(result: Mounting, title: str, unit: Unit = RADIANS) -> str:
     """Return everything, and the axes in space, as a page."""
     turned = "In the body frame; drag, or press the arrow keys, to turn."
     sections = [
         Section("Axes", turned, "", [_axes_figure(result)]),
-        *mounting_sections(result),
-        Section("After two", "", told(_losses(result, result.lost(2)))),
+        *mounting_sections(result, unit),
+        Section("After two", "", told(_losses(result, result.lost(2), unit), unit)),
     ]
-    return page(f"fdi_ros: mounting of {title}", summary_lines(result), sections)
+    return page(f"fdi_ros: mounting of {title}", summary_lines(result, unit), sections)
 
 
 def _axes_figure(result: Mounting) -> dict[str, object]:

@@ -191,7 +191,9 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi):
         "/cut: all 3 messages are malformed",
     ):
         assert f"; {words}" in said
-    figures = {topic["name"]: topic for topic in json.loads((tmp_path / "j").read_text())["topics"]}
+    written = json.loads((tmp_path / "j").read_text())
+    assert written["verdict"]["words"] == f"NEEDS {written['findings'][0]['words']}"
+    figures = {topic["name"]: topic for topic in written["topics"]}
     assert (figures["/huge"]["not_finite"], figures["/huge"]["beyond_all_rates"]) == ([0] * 3, [20] * 3)
     assert figures["/nan"]["largest"] is None
     assert not made.exists()
