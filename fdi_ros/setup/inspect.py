@@ -194,13 +194,13 @@ def _update_values(
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     """Describe when it was recorded, how long it is and how large."""
-    size = _size(bag) / 1e6
-    if (span := _span(reports)) is None:
-        return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
-    first, last = span
-    date = date_of(first)
-    begun = f"{date:%Y-%m-%d %H:%M:%S} UTC" if date is not None else f"{first * 1e-9:.1f} s after a start, date unknown"
-    return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {begun}, {size:.1f} MB\n\n"
+    words = "no messages"
+    if (span := _span(reports)) is not None:
+        first, last = span
+        date = date_of(first)
+        begun = f"{first * 1e-9:.1f} s after a start, date unknown" if date is None else f"{date:%Y-%m-%d %H:%M:%S} UTC"
+        words = f"{(last - first) * 1e-9:.1f} s from {begun}"
+    return f"{shown(bag.name)}: {words}, {_size(bag) / 1e6:.1f} MB\n\n"
 
 
 def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, object]:

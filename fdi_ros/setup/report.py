@@ -145,7 +145,7 @@ def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     yield Finding(Role.UNKNOWN, "body frame", words)
     turn_on = found.config.bias.turn_on_std
     words = "the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
-    words += f" (bias.turn_on_std: {turn_on * unit.factor:g} {unit.name} is assumed)"
+    words += f" (bias.turn_on_std: {turn_on * unit.factor:.3g} {unit.name} is assumed)"
     yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on)
     possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
     if others := [report.topic.name for report in possible if report not in found.chosen]:
@@ -156,15 +156,13 @@ def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
 def next_lines(bag: str, config: str, usable: bool) -> list[str]:
     """List what to do with the config."""
     bag, config = shlex.quote(bag), shlex.quote(config)
-    replay = f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording"
-    if not usable:
-        return [replay]
-    return [
-        replay,
+    steps = [
+        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
         f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
+    return steps if usable else steps[:1]
 
 
 # In tables ------------------------------------------------------------------------------------------------------------
