@@ -53,12 +53,8 @@ BIAS_HINT = "Best estimate over the recording, each minus its mean; what all hav
 # What was found -------------------------------------------------------------------------------------------------------
 
 
-def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> list[Finding]:
+def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
     """List everything: what the settings are from and are worth, what is not known, what to look at."""
-    return list(_findings(found, unit))
-
-
-def _findings(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     result, mounting, units = found.calibration, found.mounting, source_of(found.config).units
     g, rate = mounting.geometry, found.config.sample_rate
     yield from _worth(found, unit)
@@ -207,7 +203,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     result = found.calibration
     return {
         "bag": bag,
-        **findings_figures(setup_findings(found)),
+        **findings_figures(list(setup_findings(found))),
         "topics": [report.topic.name for report in found.chosen],
         "mounts": figures_of(_mounts(found)),
         "calibrated": result is not None,
@@ -250,7 +246,7 @@ def _sections(
 
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    (first, *lines), sections = _sections(found, setup_findings(found, unit), bag, config, unit)
+    (first, *lines), sections = _sections(found, list(setup_findings(found, unit)), bag, config, unit)
     text = [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)]
     for section in sections:
         text += ["", *section_lines(section)]
@@ -259,7 +255,8 @@ def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
 
 def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, and the course of it over time, as a page."""
-    findings, topics = setup_findings(found, unit), [report for report in found.reports if report.could_be_gyros]
+    findings = list(setup_findings(found, unit))
+    topics = [report for report in found.reports if report.could_be_gyros]
     (first, *lines), sections = _sections(found, findings, bag, config, unit)
     used = Column("", ["yes" if report in found.chosen else "no" for report in topics], ("used",))
     sections += _courses(found.refused, found.calibration, unit)

@@ -28,7 +28,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind
-from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_of, parse_swept, sweep, watch_baseline
+from fdi_ros.replay.sweep import Baseline, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare_channels
@@ -148,22 +148,17 @@ def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> 
     block = read_block(path, config, start, end)
     try:
         (one,) = sweep([Subject("settings", config, block)], plan)
-        return Tried(one.baseline, one.refused, _isolated(one))
     except FdiError as error:
         pipeline = monitor_of(config)
         pipeline.restart()
         baseline = watch_baseline(pipeline, block)
         return Tried(baseline if baseline.judged else None, baseline.note or str(error), {})
-
-
-def _isolated(one: SweepResult) -> dict[float, tuple[int, int]]:
-    found = {}
+    # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
+    missed, isolated = len(one.skipped) * len(one.used), {}
     for size in SIZES:
-        outcomes = [t.scored.outcome for t in one.trials if t.swept.size == size]
-        # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
-        missed = len(one.skipped) * len(one.used)
-        found[size] = (sum(o is OutcomeKind.ISOLATED for o in outcomes), len(outcomes) + missed)
-    return found
+        outcomes = [trial.scored.outcome for trial in one.trials if trial.swept.size == size]
+        isolated[size] = outcomes.count(OutcomeKind.ISOLATED), len(outcomes) + missed
+    return Tried(one.baseline, one.refused, isolated)
 
 
 Parameters = dict[str, object]
