@@ -331,7 +331,7 @@ def evidence_words(one: Episode) -> str:
     """Say what the declaration rests on."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
-        words.append(f"evidence {one.evidence.ratio:.3g} x its threshold")
+        words.append(f"{one.evidence.ratio:.3g} x its threshold")
     if one.state == "AMBIGUOUS" and one.evidence.last_alarm_s is not None and one.evidence.last_alarm_s < one.end_s:
         words.append(f"last above it at {one.evidence.last_alarm_s:.3f} s")
     return ", ".join(words)

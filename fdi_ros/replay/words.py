@@ -131,8 +131,16 @@ def unchecked_longest(judgement: Judgement) -> dict[str, float]:
 def _healthy_words(summary: Summary) -> str:
     checked = 1.0 - max((one.unchecked for one in summary.monitor.channels), default=0.0)
     share = "all checked" if checked > 0.995 else f"each checked in {checked:.0%} of the samples or more"
-    channels = len(summary.monitor.channels)
-    return f"no fault declared in {summary.scores.duration_s:.1f} s; {channels} channels, {share}"
+    channels, end = len(summary.monitor.channels), _unchecked_at_the_end(summary)
+    more = f"; at the end not checked: {end}" if end else ""
+    return f"no fault declared in {summary.scores.duration_s:.1f} s; {channels} channels, {share}{more}"
+
+
+def _unchecked_at_the_end(summary: Summary) -> str:
+    end = summary.scores.start_s + summary.scores.duration_s
+    return unchecked_words(
+        [one for one in summary.unchecked_channels if one.since_s is not None and end - one.since_s >= LASTING]
+    )
 
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
@@ -164,12 +172,20 @@ def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
     """Say which channels end how, from when on and why."""
-    alike: dict[str, list[str]] = {}
+    alike: dict[tuple[str, str], list[ChannelResult]] = {}
     for one in channels:
-        since = "from the start" if one.since_s is None else f"from {one.since_s:.3f} s on"
-        why = f" ({one.reason})" if one.reason else ""
-        alike.setdefault(f"{one.state} {since}{why}", []).append(one.name)
-    return "; ".join(f"{', '.join(names)} {words}" for words, names in alike.items())
+        alike.setdefault((one.state, one.reason), []).append(one)
+    return "; ".join(
+        f"{', '.join(one.name for one in group)} {state} {_since_words(group)}{f' ({reason})' if reason else ''}"
+        for (state, reason), group in alike.items()
+    )
+
+
+def _since_words(channels: Sequence[ChannelResult]) -> str:
+    since = sorted({0.0 if one.since_s is None else one.since_s for one in channels})
+    if not since[-1]:
+        return "from the start"
+    return f"from {since[0]:.3f} s on" if len(since) == 1 else f"from {since[0]:.3f} to {since[-1]:.3f} s on"
 
 
 def notes(summary: Summary) -> list[str]:
@@ -227,10 +243,9 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
     scores, story = summary.scores, summary.story
     told = [one for one in story.declared if not one.injected]
     if not scores.faults:
-        # What was declared, the verdict says.
-        end = scores.start_s + scores.duration_s
-        lost = [one for one in summary.unchecked_channels if one.since_s is not None and end - one.since_s >= LASTING]
-        return [f"At the end not checked: {unchecked_words(lost)}."] if lost else []
+        # What was declared, and that a healthy one was not checked at the end, the verdict says.
+        lost = "" if verdict(summary).severity is Severity.GOOD else _unchecked_at_the_end(summary)
+        return [f"At the end not checked: {lost}."] if lost else []
     if told:
         lines = story_lines(story, told, unit)
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
