@@ -92,8 +92,9 @@ def assumed_config(path: Path) -> tuple[Config, str]:
     if turned := _turned_units(path, config):
         raise BagError(f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes")
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
+    copies = f"{found.look}, the second is left out; " if found.look else ""
     return config, (
-        f"{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz, noise {low:.2g} to {high:.2g} rad/s,"
+        f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz, noise {low:.2g} to {high:.2g} rad/s,"
         f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
     )
 
