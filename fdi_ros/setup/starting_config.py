@@ -94,7 +94,8 @@ def assumed_config(path: Path) -> tuple[Config, str]:
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
     copies = f"{found.look}, the second is left out; " if found.look else ""
     return config, (
-        f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz, noise {low:.2g} to {high:.2g} rad/s,"
+        f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
+        f" noise {low:.2g} to {high:.2g} rad/s,"
         f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
     )
 
