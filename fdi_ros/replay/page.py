@@ -40,6 +40,8 @@ from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system.installation import there
 from fdi_ros.system.text import date_of
 
+HOLE = 1.0
+"""No curve is drawn over a longer time without a sample, s."""
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
 LOG_FROM = 10.0
@@ -109,10 +111,16 @@ class Report(Sink):
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         rates = [output.rate, deviation, output.level, output.residual]
         columns = [output.statistic, output.threshold, *(values * self._unit.factor for values in rates)]
-        self._store.add(time, columns)
-        self._last = float(time[-1])
-        if self._spectrum:
-            self._spectrum.add(output.residual)
+        # Curves also break where samples are missing for a while within a stretch.
+        holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
+        for k, part in enumerate(np.split(np.arange(len(time)), holes)):
+            if k:
+                self.begin_stretch()
+            if len(part):
+                self._store.add(time[part], [column[part] for column in columns])
+                self._last = float(time[part[-1]])
+            if self._spectrum:
+                self._spectrum.add(output.residual[part])
         for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
 

@@ -371,6 +371,23 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
     assert start[span] <= spike / 1000 <= start[span + 1]
 
 
+def test_no_curve_is_drawn_over_a_hole():
+    geometry = Geometry.cone(6)
+    made = Report(geometry, 100.0)
+    for begin in (0.0, 7.0):
+        # A hole of 2 s within a block, and one between two.
+        for output in outputs(geometry, 100, spike=50):
+            time = begin + 0.01 * np.arange(100) + 2.0 * (np.arange(100) >= 50)
+            made.add_output(time, output)
+    data = data_of(made.html(summary(samples=200, duration_s=10.0), {}))["store"]
+    time = np.frombuffer(base64.b64decode(data["time"]), dtype="<f8")
+    kind, packed = data["series"]["residual.3"]
+    values = np.frombuffer(base64.b64decode(packed), dtype=f"<{kind}")
+    long = np.flatnonzero(np.diff(time) > 1.0)
+    assert len(long) == 3
+    assert np.isnan(values[long]).all()
+
+
 def test_names_stay_text_in_the_plots(driver, folder):
     nasty = '<img src=x onerror="document.title=1">'
     geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
