@@ -267,7 +267,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     Raises
     ------
     BagError
-        If both what is usual and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples that
+        If both the median and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples that
         are lost nor samples that come in bursts are a wrong rate.
     """
     steps = np.sort(np.diff(stamp)) * 1e-9

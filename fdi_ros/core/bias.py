@@ -18,7 +18,7 @@ the first part per dimension (3) and P that of the second (k - 3 of k channels):
   al., Bayesian Data Analysis, 3rd ed., 3.3);
 - deviations of the 15 portions from their mean: C / P is F-distributed with 42 and 14 (k - 3) degrees of freedom,
   however coloured the noise, as long as it is not slower than the portions. What is no more than the noise of one
-  sample is let pass: a table that trembles is no turn.
+  sample is let pass: vibration below the sample noise is not rotation.
 
 Both need nothing of the mounting but that noise and bias of one channel are independent of the others'.
 """

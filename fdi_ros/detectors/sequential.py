@@ -196,7 +196,7 @@ def process_block(params: Constants, state: State) -> None:
 def forget_suspicion(params: Constants, state: State) -> None:
     """Begin the search anew.
 
-    Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
+    Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is re-estimated.
     """
     kf, case = state.estimator, state.case
     inflate_delays(params, kf, state.declared | (case.isolated | case.suspects if case.open else 0))

@@ -45,7 +45,7 @@ from fdi_ros.model.samples import Array
 QUIET, LIVED = 3.0, 2.0
 """At rest the variance of blocks is at most so many times what it was at rest before, once that was so many s."""
 REST_STD = 3e-4
-"""rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
+"""rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates."""
 UNLEARNED = 0.003
 """rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
 REST_CHI, REST_LAST = 1.6, 12.0

@@ -21,7 +21,7 @@ PIECE = 512
 AT_ONCE = 16 * PIECE
 """Samples of which spectra are taken at once."""
 AROUND = 31
-"""Frequencies whose median is what is usual next to a line."""
+"""Frequencies whose median is the baseline next to a line."""
 STANDS_OUT = 4.0
 """A line has so many times the amplitude density that is usual next to it."""
 FLAT = 0.8
