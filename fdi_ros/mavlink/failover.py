@@ -51,13 +51,7 @@ def format_imu(unit: int, channels: Sequence[str]) -> str:
 
 
 class Declarations:
-    """What a monitor says of some IMUs, three channels each, and since when.
-
-    Parameters
-    ----------
-    count
-        Number of IMUs.
-    """
+    """What a monitor says of some IMUs, three channels each, and since when."""
 
     def __init__(self, count: int) -> None:
         self.heard = 0

@@ -49,13 +49,7 @@ class Received(NamedTuple):
 
 
 class Link(ABC):
-    """A way to an autopilot.
-
-    Parameters
-    ----------
-    url
-        As it was given, for messages.
-    """
+    """A way to an autopilot."""
 
     def __init__(self, url: str) -> None:
         self.url = url

@@ -26,15 +26,7 @@ LOSSY = 0.05
 
 
 class Reporter:
-    """Describes a link; what is counted is also told of the time since the last report.
-
-    Parameters
-    ----------
-    link, vehicle
-        What is described.
-    names, topics
-        Of the units, and of what they are published on.
-    """
+    """Describes a link; what is counted is also told of the time since the last report."""
 
     def __init__(self, link: Link, vehicle: Vehicle, names: Sequence[str], topics: Sequence[str]) -> None:
         self._link, self._vehicle, self._names, self._topics = link, vehicle, names, topics

@@ -52,15 +52,11 @@ class Streams:
         self._current: int | None = None
 
     def want(self, messages: Iterable[int], interval: int) -> None:
-        """Ask for messages, by id, at an interval in us."""
+        """Ask for messages, by id, at an interval in us, unless they are wanted so."""
         for number in messages:
-            self._wanted[number] = _Wanted(interval)
-            self._enqueue(number)
-
-    def want_once(self, messages: Iterable[int], interval: int) -> None:
-        """Ask for messages as `want` does, unless they are wanted so."""
-        known = self._wanted
-        self.want([one for one in messages if one not in known or known[one].interval != interval], interval)
+            if number not in self._wanted or self._wanted[number].interval != interval:
+                self._wanted[number] = _Wanted(interval)
+                self._enqueue(number)
 
     def refused(self, number: int) -> bool:
         """Whether a message was asked for in vain."""

@@ -474,7 +474,7 @@ class Vehicle:
             self._checked = now
             self.streams.check(self.rates(now), now)
             if self.streams.refused(SCALED) and stands_in(RAW, self.autopilot):
-                self.streams.want_once((RAW,), self._interval)
+                self.streams.want((RAW,), self._interval)
 
     def rates(self, now: int) -> list[tuple[int, float]]:
         """Messages in use, by id, with the samples a second of each unit that they bring; the slowest counts."""

@@ -122,7 +122,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class SavedState:
-    """What outlives the process; channels by name."""
+    """What outlives the process, in the fields of the file; channels by name."""
 
     bias: dict[str, float] | None
     """rad/s; None: being learned."""
@@ -132,20 +132,8 @@ class SavedState:
     """Whether the biases are as given, after a start in motion."""
     known: list[str]
     """Channels whose bias is known."""
-    faulty: dict[str, str]
-    """Channels declared faulty, and why: one of `WHY`."""
-    ambiguous: list[str]
-    """A set of channels one of which is faulty."""
-
-    def as_json(self) -> dict[str, object]:
-        """Fields of the state file."""
-        return {
-            "bias": self.bias,
-            "errors": None if self.errors is None else self.errors.as_json(),
-            "in_motion": self.in_motion,
-            "known": self.known,
-            "declared": {"faulty": self.faulty, "ambiguous": self.ambiguous},
-        }
+    declared: dict[str, Any]
+    """``faulty``: channels declared faulty, and why, one of `WHY`; ``ambiguous``: a set of which one is faulty."""
 
 
 class StateFile:
@@ -239,7 +227,7 @@ class StateFile:
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
         try:
             with trusted_file.replacing(self.path) as file:
-                file.write(json.dumps({**about, **state.as_json()}, indent=1).encode())
+                file.write(json.dumps({**about, **vars(state)}, indent=1, default=Errors.as_json).encode())
                 if self.left:
                     with contextlib.suppress(FileNotFoundError):
                         self.path.replace(self._old)
@@ -280,7 +268,8 @@ class StateFile:
             if doubt := errors.doubt(detector, off, turn_on) if detector.takes_any else "":
                 return doubt
         _restore(pipeline, state, age)
-        restored = [f"{name} FAULTY" for name in state.faulty] + [f"{name} AMBIGUOUS" for name in state.ambiguous]
+        restored = [f"{name} FAULTY" for name in state.declared["faulty"]]
+        restored += [f"{name} AMBIGUOUS" for name in state.declared["ambiguous"]]
         what = ", ".join(["biases", *restored] if state.bias is not None else restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
         self._kept = _state_of(pipeline)
@@ -293,8 +282,9 @@ def _parsed(saved: Any, names: Sequence[str], detector: Detector) -> SavedState 
     sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *known}.issubset(names)
     if not sane or not all(why and why in WHY for why in faulty.values()):
         return None
+    declared = {"faulty": faulty, "ambiguous": ambiguous}
     if saved["bias"] is None:
-        return SavedState(None, None, False, list(known), faulty, ambiguous)
+        return SavedState(None, None, False, list(known), declared)
     values = np.array([saved["bias"][name] for name in names])
     if values.dtype != np.float64 or not np.isfinite(values).all():
         return None
@@ -304,7 +294,7 @@ def _parsed(saved: Any, names: Sequence[str], detector: Detector) -> SavedState 
         if errors is None:
             return None
     bias = dict(zip(names, values.tolist(), strict=True))
-    return SavedState(bias, errors, saved["in_motion"] is True, list(known), faulty, ambiguous)
+    return SavedState(bias, errors, saved["in_motion"] is True, list(known), declared)
 
 
 def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
@@ -323,9 +313,10 @@ def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
     if state.errors is not None:
         _go_on_estimating(pipeline.detector, state.errors, age)
         core["estimate"]["bias"][: len(names)] = state.errors.value[: len(names)]
-    core["decision"]["faulty"] = mask_of(number[name] for name in state.faulty)
-    core["decision"]["ambiguous"] = core["decision"]["voted"] = mask_of(number[name] for name in state.ambiguous)
-    for name, why in state.faulty.items():
+    faulty, ambiguous = state.declared["faulty"], state.declared["ambiguous"]
+    core["decision"]["faulty"] = mask_of(number[name] for name in faulty)
+    core["decision"]["ambiguous"] = core["decision"]["voted"] = mask_of(number[name] for name in ambiguous)
+    for name, why in faulty.items():
         core["decision"]["why"][number[name]] = WHY.index(why)
 
 
@@ -361,6 +352,8 @@ def _state_of(pipeline: Pipeline) -> SavedState:
         errors=None if bias["learning"] else Errors.of(pipeline.detector),
         in_motion=bool(bias["outcome"] == IN_MOTION),
         known=[name for i, name in enumerate(names) if is_in(i, known)],
-        faulty={name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
-        ambiguous=[name for i, name in enumerate(names) if is_in(i, ambiguous)],
+        declared={
+            "faulty": {name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
+            "ambiguous": [name for i, name in enumerate(names) if is_in(i, ambiguous)],
+        },
     )

@@ -42,17 +42,7 @@ class _Reported:
 
 
 class ChangeLog:
-    """Logs changes of state.
-
-    Parameters
-    ----------
-    log
-        Of the node.
-    names
-        Of the channels.
-    clock
-        Steady time, s.
-    """
+    """Logs changes of state."""
 
     def __init__(self, log: BoundedLog, names: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
         self._log, self._names, self._clock = log, names, clock

@@ -177,17 +177,7 @@ class InputQueue:
 
 
 class Topic:
-    """Status of one input topic.
-
-    Parameters
-    ----------
-    receiver
-        Takes its messages.
-    number
-        Of the topic.
-    topic
-        Its full name.
-    """
+    """Status of one input topic."""
 
     def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
         self.topic = topic

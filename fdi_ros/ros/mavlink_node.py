@@ -297,13 +297,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
 
 
 class ImuMessageBytes:
-    """Serialised Imu messages of one unit, with acceleration.
-
-    Parameters
-    ----------
-    frame_id
-        Of the header.
-    """
+    """Serialised Imu messages of one unit, with acceleration."""
 
     def __init__(self, frame_id: str) -> None:
         template = ImuTemplate(frame_id)

@@ -48,13 +48,7 @@ def diagnostics_publisher(node: Node) -> Any:
 
 
 class Publishers:
-    """The node's output topics.
-
-    Parameters
-    ----------
-    node
-        Publishes.
-    """
+    """The node's output topics."""
 
     def __init__(self, node: Node) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
@@ -141,15 +135,7 @@ PERIOD = 1.0
 
 
 class BoundedLog:
-    """Logs so many lines a second at most, each of bounded length, and says how many were left out.
-
-    Parameters
-    ----------
-    logger
-        Of the node.
-    clock
-        Steady time, s.
-    """
+    """Logs so many lines a second at most, each of bounded length, and says how many were left out."""
 
     def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic) -> None:
         self._logger, self._clock = logger, clock

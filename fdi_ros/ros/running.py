@@ -37,23 +37,7 @@ END_OF_TIME = 2**62
 
 
 class Supervisor:
-    """Logs and publishes what an operator should know of one monitor.
-
-    Parameters
-    ----------
-    node
-        Logs.
-    queue
-        Of the inputs; closed while the node is inactive.
-    receiver
-        The monitor.
-    publishers
-        Outputs of the node.
-    latencies
-        Times from the arrival of a message to the publication of its sample, of the last samples, ns.
-    state_file
-        Of the monitor, if it has one.
-    """
+    """Logs and publishes what an operator should know of one monitor."""
 
     def __init__(
         self,
@@ -242,19 +226,7 @@ class Supervisor:
 
 
 class Running:
-    """A configured monitor.
-
-    Parameters
-    ----------
-    node
-        Subscribes and publishes.
-    queue
-        Of its inputs.
-    receiver
-        The monitor.
-    state_file
-        Of the monitor, if it has one.
-    """
+    """A configured monitor."""
 
     def __init__(self, node: Node, queue: InputQueue, receiver: Receiver, state_file: StateFile | None) -> None:
         self.publishers = Publishers(node)
