@@ -165,15 +165,14 @@ def describe(
     warning
         What else is wrong with the whole, while samples come.
     """
-    level, message = _whole(status, silent)
+    worse = find_degraded(status)
+    level, message = _whole(status, worse, silent)
     if warning and silent is None:
         level, message = max(level, Level.WARN), f"{message}; {warning}"
     whole = StatusLine(level, prefix + WHOLE, message, hardware_id, (*_whole_values(status), *figures))
     channels = []
     for k, channel in enumerate(status.channels):
-        level, message = _LEVELS[channel.state], channel_message(channel, status)
-        if format_degraded(channel, status) or _format_frozen(channel, status):
-            level = max(level, Level.WARN)
+        level, message = _channel_message(channel, status, worse.get(channel.name, []))
         if silent is not None:
             level, message = Level.STALE, _no_sample(status, silent)
         values = _channel_values(channel, status, k, channel.since if since is None else since[k])
@@ -181,62 +180,67 @@ def describe(
     return [whole, *channels, *(_input_line(line, hardware_id, prefix) for line in inputs)]
 
 
-def channel_message(channel: ChannelStatus, status: Status) -> str:
-    """Say in words how a channel stands."""
-    words = [_format_state(channel, status), *_format_frozen(channel, status), *format_degraded(channel, status)]
-    return "; ".join(
-        words + [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
-    )
-
-
-def _format_frozen(channel: ChannelStatus, status: Status) -> list[str]:
-    """Say that the unit of a channel gives old values."""
-    return [_unit_frozen(unit) for unit in _frozen_units(channel, status)]
+def _channel_message(channel: ChannelStatus, status: Status, worse: Sequence[str]) -> tuple[Level, str]:
+    """Say how a channel stands, with that in which it is worse than it should be."""
+    wrong = [*(_format_frozen(unit) for unit in _frozen_units(channel, status)), *worse]
+    unusual = [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
+    level = max(_LEVELS[channel.state], Level.WARN if wrong else Level.OK)
+    return level, "; ".join([_format_state(channel, status), *wrong, *unusual])
 
 
 def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
     return [unit for unit in status.units if unit.frozen and channel.name in unit.channels]
 
 
-def _unit_frozen(unit: UnitStatus) -> str:
+def _format_frozen(unit: UnitStatus) -> str:
     return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
 
 
-def format_degraded(channel: ChannelStatus, status: Status) -> list[str]:
-    """Say in what a channel that is still used has become worse than it should be."""
-    words: list[str] = []
-    if channel.is_left_out:
-        return words
-    if channel.noisy:
-        words.append(f"noise {_times(channel.noise)} times noise_std and above the others'")
-    if status.max_drift > 0 and abs(channel.drift) > NEARLY * status.max_drift:
-        words.append(
-            f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g} (bias.max_drift)"
+def find_degraded(status: Status) -> dict[str, list[str]]:
+    """Say what is used, and worse than it should be, beside what is declared: by channel and by unit."""
+    found: dict[str, list[str]] = {}
+    for channel in (one for one in status.channels if not one.is_left_out):
+        rows = (
+            (channel.noisy, f"noise {_times(channel.noise)} times noise_std and above the others'"),
+            (
+                abs(channel.drift) > NEARLY * status.max_drift > 0,
+                f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g}"
+                " (bias.max_drift)",
+            ),
+            (
+                status.is_far(channel),
+                f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
+                f" {status.turn_on_std:g}: learned, as a fault from before the start would be",
+            ),
         )
-    if status.is_far(channel):
-        words.append(
-            f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is {status.turn_on_std:g}:"
-            " learned, as a fault from before the start would be"
-        )
-    return words
+        if words := [text for holds, text in rows if holds]:
+            found[channel.name] = words
+    for unit in status.units:
+        if abs(unit.late) > max(CERTAIN * unit.late_std, LEAST_DELAY):
+            side, off = "late" if unit.late > 0 else "early", ", taken off" if unit.taken_off else ""
+            size = f"{1e3 * abs(unit.late):.1f} +- {1e3 * unit.late_std:.1f} ms"
+            found[unit.name] = [f"its stamps are {size} {side} against {unit.against}'s{off}"]
+    return found
 
 
 def degraded(status: Status) -> dict[str, str]:
-    """Say which channels and units are worse than they should be, beside what is declared; by their names."""
-    channels = {channel.name: format_degraded(channel, status) for channel in status.channels}
-    reports = {name: f"{name}: {'; '.join(words)}" for name, words in channels.items() if words}
-    return reports | {unit.name: _format_late(unit) for unit in status.units if _is_late(unit)}
+    """Say the same in one line for each channel and unit."""
+    units = {unit.name for unit in status.units}
+    return {
+        name: f"{name}{' as a whole' if name in units else ''}: {'; '.join(words)}"
+        for name, words in find_degraded(status).items()
+    }
 
 
-def format_units(status: Status) -> list[str]:
-    """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
-    late = [unit for unit in status.units if _is_late(unit)]
+def _format_units(status: Status, late: Sequence[UnitStatus]) -> list[str]:
+    """Say what is wrong with units as a whole; the setting that takes delays off stands with the last of those late."""
     words = [
         f"{first} and {second} give the same values: one sensor, no redundancy; the second is left out;"
         " look at topics and remappings"
         for first, second in status.copies
     ]
-    words += [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_format_late(unit) for unit in late]
+    words += [_format_frozen(unit) for unit in status.units if unit.frozen]
+    words += [degraded(status)[unit.name] for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
             round(before + (unit.late if unit in late else 0.0), 5)
@@ -246,7 +250,7 @@ def format_units(status: Status) -> list[str]:
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
     words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
     groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
-    words += [_format_unit_set(names) for group in groups if (names := whole_units(group, status.units))]
+    words += [_format_unit_set(names) for group in groups if (names := _units_of(group, status.units))]
     return words if status.apart is None else [*words, format_apart(status.apart)]
 
 
@@ -255,21 +259,10 @@ def format_apart(pair: ApartStatus) -> str:
     return f"{pair.who.removesuffix(',')}, {plus_minus(pair.size, pair.std)} rad/s apart"
 
 
-def whole_units(group: Sequence[str], units: Sequence[UnitStatus]) -> list[str]:
+def _units_of(group: Sequence[str], units: Sequence[UnitStatus]) -> list[str]:
     """Names of the units that a set of channels consists of; empty if it consists of other than whole units."""
     inside = [unit for unit in units if set(group).issuperset(unit.channels)]
     return [unit.name for unit in inside] if sum(len(unit.channels) for unit in inside) == len(group) else []
-
-
-def _is_late(unit: UnitStatus) -> bool:
-    return abs(unit.late) > max(CERTAIN * unit.late_std, LEAST_DELAY)
-
-
-def _format_late(unit: UnitStatus) -> str:
-    side = "late" if unit.late > 0 else "early"
-    size = f"{1e3 * abs(unit.late):.1f} +- {1e3 * unit.late_std:.1f} ms"
-    off = ", taken off" if unit.taken_off else ""
-    return f"{unit.name} as a whole: its stamps are {size} {side} against {unit.against}'s{off}"
 
 
 def _format_unit_set(names: Sequence[str]) -> str:
@@ -284,7 +277,7 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
-        pair, units = status.apart, whole_units(channel.group, status.units)
+        pair, units = status.apart, _units_of(channel.group, status.units)
         if pair is not None and set(pair.channels) == set(channel.group):
             return f"{format_apart(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
         if len(channel.group) == 1:
@@ -309,7 +302,7 @@ def _no_sample(status: Status, silent: float) -> str:
     return f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
 
 
-def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
+def _whole(status: Status, worse: Mapping[str, object], silent: float | None) -> tuple[Level, str]:
     if silent is not None:
         return Level.STALE, _no_sample(status, silent)
     total = len(status.channels)
@@ -318,15 +311,16 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
     alive = sum(not channel.is_left_out for channel in status.channels)
     undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
     reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
-    degraded = [channel.name for channel in status.channels if format_degraded(channel, status)]
-    about = [f"degraded: {', '.join(degraded)}"] if degraded else []
-    note = "".join(f"; {words}" for words in (status.note, *format_units(status), *about) if words)
+    late = [unit for unit in status.units if unit.name in worse]
+    about = [channel.name for channel in status.channels if channel.name in worse]
+    words = [status.note, *_format_units(status, late), f"degraded: {', '.join(about)}" if about else ""]
+    note = "".join(f"; {one}" for one in words if one)
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     if not status.can_detect:
         return Level.ERROR, f"{count}; {reach}{note}"
-    odd = bool(status.copies) or any(_is_late(unit) or unit.frozen for unit in status.units)
-    complete = healthy == total and len(status.can_isolate) == total and not degraded and not odd
+    odd = bool(worse or status.copies) or any(unit.frozen for unit in status.units)
+    complete = healthy == total and len(status.can_isolate) == total and not odd
     return (Level.OK if complete else Level.WARN), f"{count}; {reach}{note}"
 
 

@@ -24,7 +24,7 @@ from vehicles import vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.diagnostics import channel_message
+from fdi_ros.monitor.diagnostics import PREFIX, describe
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -324,7 +324,7 @@ def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(settin
     assert output.valid.all()
     assert (np.abs(output.rate - body_rate(1200)) < 5 * sigma).all()
     if gone != [1, 0, 0]:
-        words = {channel.name: channel_message(channel, pipeline.status()) for channel in pipeline.status().channels}
+        words = {line.name.removeprefix(PREFIX): line.message for line in describe(pipeline.status())}
         share = round(100 * (1 - np.mean(gone)))
         delivers = {float(re.search(r"delivers in (\d+) % of samples", words[name])[1]) for name in names}
         assert max(abs(found - share) for found in delivers) < 4
@@ -347,7 +347,7 @@ def test_a_unit_that_is_not_received_in_turn_is_left_out_and_not_called_faulty(g
     assert np.abs(output.rate - body_rate(1200))[700:].max() < 0.02
     channel = pipeline.status().channels[3]
     assert (channel.state, channel.reason) == (ChannelState.SUSPECT, Reason.INTERMITTENT)
-    share = re.search(r"delivers in (\d+) % of samples", channel_message(channel, pipeline.status()))
+    share = re.search(r"delivers in (\d+) % of samples", describe(pipeline.status())[4].message)
     assert float(share[1]) == pytest.approx(100 * (1 - np.mean(gone)), abs=4)
 
 
