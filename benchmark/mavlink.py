@@ -9,8 +9,7 @@
     python benchmark/mavlink.py storms [--minutes 60]      # parameters, services, transitions, publishers, packets
 
 Storms come in turn, each from a process of its own, while three gyros come in. A line says what was sent and answered,
-the longest time without diagnostics, lines of the log a second and memory of both nodes; `plain` is a node that does
-nothing but report: what the machine alone costs.
+the longest time without diagnostics, lines of the log a second and memory of both nodes, and the load of the machine.
 
 The autopilots are those of the tests (test/mavlink/autopilots.py).
 """
@@ -285,8 +284,7 @@ def storms(minutes: float, seconds: float, seed: int) -> None:
         while time.monotonic() < end:
             kind = KINDS[seed % len(KINDS)]
             over.listener.clear()
-            for times in over.reports.values():
-                times.clear()
+            over.reports.clear()
             time.sleep(2.5)
             cost = weather(over, kind, seconds, seed) | {"load of the machine": os.getloadavg()[0]}
             print(f"{seed:4} {kind:10}", "  ".join(f"{name} {value:.4g}" for name, value in cost.items()), flush=True)

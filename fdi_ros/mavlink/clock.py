@@ -179,7 +179,7 @@ class BootClock:
         """By how much the times were ahead of those here at most, ns: those of messages with the least delay."""
         self._odd = 0
 
-    def take(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
+    def unwrap(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
         """Return a time of a message, made whole, ns; None: it is not to be used.
 
         Parameters

@@ -17,7 +17,7 @@ from pathlib import Path
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import NS
-from fdi_ros.mavlink.failover_policy import YOUNG, Known, State, Unit, decide, objection
+from fdi_ros.mavlink.failover_policy import YOUNG, FailoverState, FailoverUnit, Known, decide, objection
 from fdi_ros.mavlink.imu import ARDUPILOT
 from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
@@ -78,7 +78,7 @@ class Declarations:
             self._well[k] = None if unit & OUT else self._well[k] or now
 
     def of(self, k: int) -> tuple[int | None, bool, int | None]:
-        """Return what `Unit` holds of one IMU: ``declared``, ``ok``, ``well``."""
+        """Return what `FailoverUnit` holds of one IMU: ``declared``, ``ok``, ``well``."""
         found = [at for at in self.channels[3 * k : 3 * k + 3] if at is not None]
         return max(found, default=None), self._ok[k], self._well[k]
 
@@ -116,7 +116,7 @@ class Failover:
         self._values: list[tuple[bool, int] | None] = [None] * count
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
         self._system, ours = self._restore()
-        self._state = State.resumed(ours)
+        self._state = FailoverState.resumed(ours)
         self._saved = ours
         """Out of use by our hand, as the file says."""
         self._save()
@@ -128,12 +128,12 @@ class Failover:
 
     # What is known -----------------------------------------------------------------------------------------------
 
-    def _unit(self, k: int, now: int, ours: bool) -> Unit:
+    def _unit(self, k: int, now: int, ours: bool) -> FailoverUnit:
         use, heard = self._values[k] or (None, 0)
         track = self._vehicle.units.get(k)
         delivers = track is not None and now - track.last < SILENT
         use = use if ours and now - heard < FORGOTTEN else None
-        return Unit(use, heard, *self.declarations.of(k), delivers)
+        return FailoverUnit(use, heard, *self.declarations.of(k), delivers)
 
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle = self._vehicle
@@ -160,7 +160,7 @@ class Failover:
             if action.kind == "set":
                 self._vehicle.set_parameter(PARAMETERS[action.unit], float(action.use))
             else:
-                self._tell(action.kind, action.unit, action.why or self._size(action.kind, action.unit))
+                self._announce(action.kind, action.unit, action.why or self._size(action.kind, action.unit))
         if self._state.orders.keys() != self._saved and now >= self._save_at:
             self._system, self._save_at = self._vehicle.system or 0, now + NS
             try:
@@ -192,12 +192,12 @@ class Failover:
             vehicle.read_parameter(PARAMETERS[self._next])
             self._next = (self._next + 1) % len(self._values)
 
-    def _tell(self, kind: str, unit: int, more: str = "") -> None:
+    def _announce(self, kind: str, unit: int, more: str = "") -> None:
         severity, words = TEXTS[kind]
         text = f"FDI: {format_imu(unit, self._channels)} {words}{more}"
         if len(text) > LENGTH:
             text = f"FDI: IMU {unit + 1} {words}{more}"[:LENGTH]
-        self._vehicle.say(severity, text)
+        self._vehicle.send_text(severity, text)
         self._vehicle.events.append(text)
 
     def _size(self, kind: str, unit: int) -> str:

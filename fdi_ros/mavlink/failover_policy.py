@@ -3,8 +3,8 @@
 
 """Whether an IMU is taken out of use, and when it is put back: a pure function of what is known and the time.
 
-`decide` is given what it has decided before (`State`) and what is known now (`Known`), and returns the next state and
-what is to be done. It has no clock, no link and no memory of its own, so every sequence of events can be tried.
+`decide` is given what it has decided before (`FailoverState`) and what is known now (`Known`), and returns the next
+state and what is to be done. It has no clock, no link and no memory, so every sequence of events can be tried.
 
 - An IMU that is declared FAULTY is taken out if nothing speaks against it (`objection`).
 - It is put back on the ground, when an operator asks, and when somebody else has taken out all the others. In flight it
@@ -35,7 +35,7 @@ SETTLED = 2 * NS
 """What was sent so long ago has arrived, or never will, ns: what is heard later is the truth, or somebody else's."""
 
 
-class Unit(NamedTuple):
+class FailoverUnit(NamedTuple):
     """What is known of one IMU; times in ns."""
 
     use: bool | None = None
@@ -55,7 +55,7 @@ class Unit(NamedTuple):
 class Known(NamedTuple):
     """What is known now."""
 
-    units: tuple[Unit, ...]
+    units: tuple[FailoverUnit, ...]
     linked: bool = False
     """Whether an ArduPilot is heard that sends each IMU under its own name."""
     armed: bool = False
@@ -84,7 +84,7 @@ class Order(NamedTuple):
 
 
 @dataclass(frozen=True)
-class State:
+class FailoverState:
     """What was decided before, by IMU; never changed in place."""
 
     orders: Mapping[int, Order] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class State:
     """Declarations that were acted on, or of which it was said why not: when they were made, ns."""
 
     @classmethod
-    def resumed(cls, ours: Iterable[int]) -> State:
+    def resumed(cls, ours: Iterable[int]) -> FailoverState:
         """State after a start, of IMUs that were out of use by our hand before, and may be still.
 
         What somebody else has set meanwhile is not known: they are put back, and not taken out again in this flight.
@@ -117,7 +117,7 @@ class Action(NamedTuple):
     """Why an IMU that was declared stays in use."""
 
 
-def objection(state: State, known: Known, unit: int, limit: int) -> str:
+def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
     """Say what speaks against taking an IMU out of use, but for the age of its declaration; empty if nothing does.
 
     Parameters
@@ -145,7 +145,7 @@ def objection(state: State, known: Known, unit: int, limit: int) -> str:
     return next((words for holds, words in checks if not holds), "")
 
 
-def decide(state: State, known: Known, now: int, limit: int = 1) -> tuple[State, list[Action]]:
+def decide(state: FailoverState, known: Known, now: int, limit: int = 1) -> tuple[FailoverState, list[Action]]:
     """Decide what is to be done.
 
     Parameters
@@ -171,7 +171,7 @@ def decide(state: State, known: Known, now: int, limit: int = 1) -> tuple[State,
     return state, actions
 
 
-def _notice(state: State, known: Known) -> tuple[State, list[Action]]:
+def _notice(state: FailoverState, known: Known) -> tuple[FailoverState, list[Action]]:
     """Notice which orders are confirmed, and what somebody else has set, or may have set."""
     orders, seen, left_alone, actions = dict(state.orders), dict(state.seen), set(state.left_alone), []
     for k, unit in enumerate(known.units):
@@ -190,7 +190,7 @@ def _notice(state: State, known: Known) -> tuple[State, list[Action]]:
     return replace(state, orders=orders, seen=seen, left_alone=frozenset(left_alone)), actions
 
 
-def _compared(order: Order | None, unit: Unit, seen: bool) -> tuple[Order | None, str, bool]:
+def _compared(order: Order | None, unit: FailoverUnit, seen: bool) -> tuple[Order | None, str, bool]:
     """Compare an order with what the parameter says: what is left of it, what is to be told, and whether it is ours."""
     if order is None:
         return (None, "", True) if unit.use == seen else (None, "changed", False)
@@ -208,7 +208,7 @@ def _compared(order: Order | None, unit: Unit, seen: bool) -> tuple[Order | None
     return (None, "changed", False) if settled else (order, "", True)
 
 
-def _put_back(state: State, known: Known) -> State:
+def _put_back(state: FailoverState, known: Known) -> FailoverState:
     """Turn round all orders at the end of a flight, or earlier where that must be."""
     grounded = known.disarmed >= GROUNDED
     # The autopilot is never left without an IMU by what was done here, whoever has taken out the others.
@@ -220,7 +220,7 @@ def _put_back(state: State, known: Known) -> State:
     return replace(state, orders=orders, left_alone=left_alone)
 
 
-def _answer(state: State, known: Known, now: int, limit: int, actions: list[Action]) -> State:
+def _answer(state: FailoverState, known: Known, now: int, limit: int, actions: list[Action]) -> FailoverState:
     """Answer declarations: take an IMU out, make room for that, or say why not."""
     for k, unit in enumerate(known.units):
         if unit.declared is None or unit.declared == state.answered.get(k):
@@ -239,7 +239,7 @@ def _answer(state: State, known: Known, now: int, limit: int, actions: list[Acti
     return state
 
 
-def _make_room(state: State, known: Known, now: int) -> State:
+def _make_room(state: FailoverState, known: Known, now: int) -> FailoverState:
     """Have one IMU put back that is out of use and has long been healthy, unless one is being put back."""
     for k, order in state.orders.items():
         if order.use and not order.confirmed:
@@ -250,7 +250,7 @@ def _make_room(state: State, known: Known, now: int) -> State:
     return state
 
 
-def _send(state: State, known: Known, now: int, limit: int, actions: list[Action]) -> State:
+def _send(state: FailoverState, known: Known, now: int, limit: int, actions: list[Action]) -> FailoverState:
     """Send the orders that are due, once more if need be."""
     orders = dict(state.orders)
     for k, order in state.orders.items():

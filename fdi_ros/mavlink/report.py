@@ -36,14 +36,14 @@ class Reporter:
         """Return the statuses at the monotonic time now, ns; names begin with prefix."""
         recent = {name: count - self._before.get(name, 0) for name, count in self._vehicle.counts.items()}
         self._before = dict(self._vehicle.counts)
-        level, message = self._link_words(recent, now)
+        level, message = self._format_link(recent, now)
         lines = [StatusLine(level, f"{prefix}link", message, hardware, self._link_values(now))]
         for k, name in enumerate(self._names):
-            level, message = self._unit_words(k, now)
+            level, message = self._format_unit(k, now)
             lines.append(StatusLine(level, f"{prefix}unit {name}", message, hardware, self._unit_values(k, now)))
         return lines
 
-    def _link_words(self, recent: dict[str, int], now: int) -> tuple[Level, str]:
+    def _format_link(self, recent: dict[str, int], now: int) -> tuple[Level, str]:
         vehicle, link = self._vehicle, self._link
         if link.trouble:
             return Level.ERROR, f"{link.url}: {link.trouble}"
@@ -100,14 +100,14 @@ class Reporter:
         ids = numbers(self._vehicle.kind) if self._vehicle.kind else ()
         return next((number for number in ids if MESSAGES[number].unit in (unit, -1)), None)
 
-    def _unit_words(self, unit: int, now: int) -> tuple[Level, str]:
+    def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle
         track = vehicle.units.get(unit)
         if track is None:
             if unit in vehicle.magnetometers:
                 return Level.ERROR, "the autopilot has no such IMU: only its magnetometer comes"
             number = self._message(unit)
-            said = f"; request: {vehicle.streams.said(number)}" if number is not None else ""
+            said = f"; request: {vehicle.streams.answer_to(number)}" if number is not None else ""
             return (Level.ERROR if vehicle.in_reach else Level.STALE), f"nothing of this unit yet{said}"
         rate, asked = track.rate(now), vehicle.settings.rate
         if not rate:
@@ -115,7 +115,7 @@ class Reporter:
         number = self._message(unit)
         words = f"{rate:.1f} Hz of {asked:g} asked for"
         if rate < ENOUGH * asked:
-            said = vehicle.streams.said(number) if number is not None else "not asked for"
+            said = vehicle.streams.answer_to(number) if number is not None else "not asked for"
             return Level.WARN, f"{words}; request: {said}"
         return Level.OK, words
 

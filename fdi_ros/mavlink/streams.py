@@ -36,7 +36,7 @@ _HOPEFUL = ("not asked yet", RESULTS[5])
 class _Wanted:
     interval: int
     """us; `DEFAULT_INTERVAL`: the autopilot's own."""
-    said: str = _HOPEFUL[0]
+    answer: str = _HOPEFUL[0]
     """What the autopilot says to it."""
     asked: int = 0
     """When it was last asked for, ns."""
@@ -61,7 +61,7 @@ class Streams:
     def refused(self, number: int) -> bool:
         """Whether a message was asked for in vain."""
         wanted = self._wanted.get(number)
-        return wanted is not None and wanted.said not in (*_HOPEFUL, RESULTS[0])
+        return wanted is not None and wanted.answer not in (*_HOPEFUL, RESULTS[0])
 
     def ask_again(self) -> None:
         """Ask for all anew: the autopilot has."""
@@ -83,7 +83,7 @@ class Streams:
                 return None
             if current.tries < TRIES:
                 return self._ask(self._current, now)
-            current.said = "no answer"
+            current.answer = "no answer"
             self._current = None
         return self._ask(self._queue.popleft(), now) if self._queue else None
 
@@ -98,8 +98,8 @@ class Streams:
         if self._current is None:
             return
         wanted = self._wanted[self._current]
-        wanted.said = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
-        if wanted.said not in _HOPEFUL:
+        wanted.answer = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
+        if wanted.answer not in _HOPEFUL:
             wanted.tries = 0
             self._current = None
 
@@ -114,7 +114,7 @@ class Streams:
                 wanted.tries = 0
                 self._enqueue(number)
 
-    def said(self, number: int) -> str:
+    def answer_to(self, number: int) -> str:
         """Return what the autopilot says to the request of a message."""
         wanted = self._wanted.get(number)
-        return "not asked for" if wanted is None else wanted.said
+        return "not asked for" if wanted is None else wanted.answer

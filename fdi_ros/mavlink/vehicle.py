@@ -81,7 +81,7 @@ class VehicleSettings:
     """For signing; empty: nothing is signed, and signatures are not looked at."""
 
 
-class Sample(NamedTuple):
+class ImuSample(NamedTuple):
     """One sample of one IMU, in the body frame of REP-103."""
 
     unit: int
@@ -221,17 +221,17 @@ class Vehicle:
         self._parsers.clear()
         self.peer = self._behind_from = None
 
-    def feed(self, received: Received, now: int) -> list[Sample]:
+    def feed(self, received: Received, now: int) -> list[ImuSample]:
         """Take bytes, at the monotonic time now, ns, and return the samples in them."""
         samples = []
         for message in self._parsed(received):
             if message.get_msgId() == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
                 self.counts["bad"] += 1
-            elif (sample := self._take(message, received.peer, now)) is not None:
+            elif (sample := self._process(message, received.peer, now)) is not None:
                 samples.append(sample)
         return samples
 
-    def _take(self, message: Any, peer: Any, now: int) -> Sample | None:
+    def _process(self, message: Any, peer: Any, now: int) -> ImuSample | None:
         """Take one message; return the sample in it, if it is one of the autopilot in use."""
         number, data = message.get_msgId(), bytes(message.get_msgbuf())
         header = 10 if data[0] == 0xFD else 6
@@ -315,7 +315,7 @@ class Vehicle:
                 # Only one that says it is an autopilot is taken into use, and again after silence.
                 self.counts["before a heartbeat"] += 1
                 return False
-            self._taken(message, peer, now)
+            self._begin_with(message, peer, now)
         self.heard = now
         if beats:
             self.autopilot, self.armed = message.autopilot, bool(message.base_mode & ARMED)
@@ -346,7 +346,7 @@ class Vehicle:
         self.sync.reset()
         self.clock.reset()
 
-    def _taken(self, message: Any, peer: Any, now: int) -> None:
+    def _begin_with(self, message: Any, peer: Any, now: int) -> None:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
@@ -372,7 +372,7 @@ class Vehicle:
             self._sequence = sequence
         return is_new
 
-    def _sample(self, number: int, payload: bytes, now: int) -> Sample | None:
+    def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
         reading = read(number, payload)
         message = MESSAGES[number]
         if reading is None:
@@ -392,14 +392,14 @@ class Vehicle:
             return None
         return self._timed(reading, now) if kind == self.kind else None
 
-    def _timed(self, reading: Reading, now: int) -> Sample | None:
+    def _timed(self, reading: Reading, now: int) -> ImuSample | None:
         """Return a reading as a sample with its stamp, if it is new and its time can be."""
         track = self.units.setdefault(reading.unit, UnitTrack())
         self.magnetometers.discard(reading.unit)
         restarts = self.clock.restarts
         offset = self.sync.offset(now)
         about = None if offset is None else now + offset
-        time = self.clock.take(reading.time * US, now, reading.message.microseconds > 1, about)
+        time = self.clock.unwrap(reading.time * US, now, reading.message.microseconds > 1, about)
         if self.clock.restarts != restarts:
             self._restarted(now)
         if time is None:
@@ -420,7 +420,7 @@ class Vehicle:
             track.impossible += 1
             return None
         track.stamp = stamp
-        return Sample(reading.unit, stamp, reading.rate, reading.acceleration)
+        return ImuSample(reading.unit, stamp, reading.rate, reading.acceleration)
 
     def _choose(self, kind: str, unit: int, now: int) -> bool:
         """Choose the kind of messages with the most units, the finest of several; return whether that is done."""
@@ -487,7 +487,7 @@ class Vehicle:
             found.append((number, min(self.units[k].rate(now) if k in self.units else 0.0 for k in of)))
         return found
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
         self._transmit(self._out.statustext_encode(severity, text.encode("ascii", "replace")[:50]))
 
@@ -500,7 +500,7 @@ class Vehicle:
         message = self._out.param_set_encode(self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32)
         self._transmit(message)
 
-    def tell(self, name: str, value: float, now: int) -> None:
+    def send_value(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""
         time = (now + (self.sync.offset(now) or 0)) // MS & 0xFFFFFFFF
         value = min(max(value, -LARGEST_FLOAT), LARGEST_FLOAT)

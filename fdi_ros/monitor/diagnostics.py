@@ -216,9 +216,9 @@ def find_degraded(status: Status) -> dict[str, list[str]]:
         if words := [text for holds, text in rows if holds]:
             found[channel.name] = words
     for unit in status.units:
-        if abs(unit.late) > max(CERTAIN * unit.late_std, LEAST_DELAY):
-            side, off = "late" if unit.late > 0 else "early", ", taken off" if unit.taken_off else ""
-            size = f"{1e3 * abs(unit.late):.1f} +- {1e3 * unit.late_std:.1f} ms"
+        if abs(unit.delay) > max(CERTAIN * unit.delay_std, LEAST_DELAY):
+            side, off = "late" if unit.delay > 0 else "early", ", taken off" if unit.taken_off else ""
+            size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"
             found[unit.name] = [f"its stamps are {size} {side} against {unit.against}'s{off}"]
     return found
 
@@ -243,7 +243,7 @@ def _format_units(status: Status, late: Sequence[UnitStatus]) -> list[str]:
     words += [degraded(status)[unit.name] for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
-            round(before + (unit.late if unit in late else 0.0), 5)
+            round(before + (unit.delay if unit in late else 0.0), 5)
             for before, unit in zip(status.delays_taken_off, status.units, strict=True)
         ]
         words[-1] += f" (to take it off from the start: imus.delays: {delays})"
@@ -395,11 +395,11 @@ def _scales(channel: ChannelStatus, status: Status) -> str:
 
 
 def _late(unit: UnitStatus) -> str:
-    if not math.isfinite(unit.late):
+    if not math.isfinite(unit.delay):
         return "none"
     if unit.name == unit.against:
         return "0, the others are against it"
-    return f"{1e3 * unit.late:.2f} +- {1e3 * unit.late_std:.2f}"
+    return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
 
 
 def _input_line(line: InputStatus, hardware_id: str, prefix: str) -> StatusLine:

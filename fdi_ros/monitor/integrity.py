@@ -51,7 +51,7 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 @dataclass(frozen=True)
-class Level:
+class ProtectionLevel:
     """What holds for one set of fused channels."""
 
     level: Array
@@ -173,16 +173,16 @@ class Integrity:
         for left in single_losses(whole):
             self.fill_losses(subsets, left)
 
-    def of(self, mask: Mask) -> Level:
+    def of(self, mask: Mask) -> ProtectionLevel:
         """Level in the greatest motion when exactly the channels marked in mask (n,) are fused."""
         return self._solved(mask, self.variance)
 
-    def _solved(self, mask: Mask, variances: Array) -> Level:
+    def _solved(self, mask: Mask, variances: Array) -> ProtectionLevel:
         """Level for channels marked in mask (n,) with the given variances, (n,) (rad/s)^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
         axes, variance = self._axes[kept], variances[kept]
-        nothing = Level(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
+        nothing = ProtectionLevel(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
             return nothing
         root = 1 / np.sqrt(self._noise[kept])
@@ -204,7 +204,7 @@ class Integrity:
         share = np.zeros((len(mask), 3))
         if np.isfinite(level).all():
             share[kept] = _share(level, gain**2 * variance / sigma[:, None] ** 2, modes)
-        return Level(level, limit, share)
+        return ProtectionLevel(level, limit, share)
 
 
 def _axes(level: Array) -> Axes:

@@ -153,12 +153,12 @@ class Output:
         self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
 
     def __repr__(self) -> str:
-        return f"Output({self._words()})"
+        return f"Output({self._format_summary()})"
 
     def _repr_html_(self) -> str:
-        return html_table(self._words(), _HEAD, (_cells(event, self.channel_names) for event in self.events))
+        return html_table(self._format_summary(), _HEAD, (_cells(event, self.channel_names) for event in self.events))
 
-    def _words(self) -> str:
+    def _format_summary(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
         rated = f", a rate in {np.mean(self.valid):.0%}" if len(self) else ""
         return f"{len(self)} samples of {self.n} channels, {seconds:.3f} s{rated}; {len(self.events)} changes of state"

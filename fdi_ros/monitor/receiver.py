@@ -142,10 +142,10 @@ class Receiver:
         self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         pipeline.prepare()
-        self._take_over_detector()
+        self._update_detector()
         self.warm(self.source)
 
-    def _take_over_detector(self) -> None:
+    def _update_detector(self) -> None:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
         pipeline, detector = self.pipeline, self.pipeline.detector
         self._detector = detector
@@ -158,15 +158,15 @@ class Receiver:
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take a message of an input topic; stamp: when it arrived, ns; 0: not known."""
         if self.pipeline.detector is not self._detector:
-            self._take_over_detector()
+            self._update_detector()
         # Bytes: arrays of what can be written would be compiled once more.
-        told = self.source.take(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
-        return self._process() if told & MORE else told
+        flags = self.source.take(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+        return self._process() if flags & MORE else flags
 
     def go_on(self) -> int:
         """Work the next sample."""
         if self.pipeline.detector is not self._detector:
-            self._take_over_detector()
+            self._update_detector()
         return self._process()
 
     def supply(self) -> None:

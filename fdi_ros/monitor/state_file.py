@@ -163,7 +163,7 @@ class StateFile:
         self.max_age = max_age
         self.words = "not read yet"
         """What became of the file, for people."""
-        self.left = False
+        self.is_rejected = False
         """Whether there is a file that was not taken over; the next save moves it aside."""
         self.failed = False
         """Whether the state could not be saved when that was last tried."""
@@ -182,9 +182,9 @@ class StateFile:
         self._check_ours(self.path)
         self._check_ours(self._old)
         try:
-            refusal = self._take_over(json.loads(trusted_file.read(self.path, LONGEST).decode()), pipeline)
+            refusal = self._restore_from(json.loads(trusted_file.read(self.path, LONGEST).decode()), pipeline)
         except FileNotFoundError:
-            self.left = False
+            self.is_rejected = False
             self.words = f"no state taken from {self.path}: there is none yet"
             return False
         except trusted_file.DistrustError as error:
@@ -193,7 +193,7 @@ class StateFile:
             refusal = f"cannot be read: {error.strerror}"
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
             refusal = "damaged"
-        self.left = bool(refusal)
+        self.is_rejected = bool(refusal)
         if refusal:
             self.words = f"no state taken from {self.path}: {refusal}; it is kept as {self._old.name}"
         return not refusal
@@ -228,10 +228,10 @@ class StateFile:
         try:
             with trusted_file.replacing(self.path) as file:
                 file.write(json.dumps({**about, **vars(state)}, indent=1, default=Errors.as_json).encode())
-                if self.left:
+                if self.is_rejected:
                     with contextlib.suppress(FileNotFoundError):
                         self.path.replace(self._old)
-                    self.left = False
+                    self.is_rejected = False
         except OSError as error:
             self.words, self.failed = f"state cannot be saved to {self.path}: {error.strerror}", True
             self._not_before = time.monotonic() + RETRY
@@ -240,7 +240,7 @@ class StateFile:
             self.words = f"state saved to {self.path}"
         return True
 
-    def _take_over(self, saved: Any, pipeline: Pipeline) -> str:
+    def _restore_from(self, saved: Any, pipeline: Pipeline) -> str:
         """Take over a state; return why not, empty if it was."""
         if saved["format"] != FORMAT:
             return f"format {saved['format']!r}, expected {FORMAT}"

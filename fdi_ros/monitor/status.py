@@ -85,9 +85,9 @@ class UnitStatus:
 
     name: str
     channels: tuple[str, ...]
-    late: float
+    delay: float
     """By how much its stamps are late against those of another unit, s; negative: early; NaN: not measured."""
-    late_std: float
+    delay_std: float
     """Standard deviation of that, s."""
     against: str
     """The other unit: of two units the first, of more the one in the middle; itself for that one."""
@@ -396,8 +396,8 @@ def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple
         unit = UnitStatus(
             geometry.unit_of[channels[0]],
             tuple(geometry.channel_names[i] for i in channels),
-            late=float(late[u, middle]) if measured else math.nan,
-            late_std=float(late_std[u, middle]) if measured else math.nan,
+            delay=float(late[u, middle]) if measured else math.nan,
+            delay_std=float(late_std[u, middle]) if measured else math.nan,
             against=geometry.unit_of[geometry.units[middle][0]] if measured else "",
             frozen=_frozen(core, channels),
         )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.clock import MS, NS
 from fdi_ros.mavlink.failover import PARAMETERS, TEXTS, Declarations, format_imu
-from fdi_ros.mavlink.failover_policy import HEALED, YOUNG, Known, State, Unit, decide
+from fdi_ros.mavlink.failover_policy import HEALED, YOUNG, FailoverState, FailoverUnit, Known, decide
 from fdi_ros.replay.summary import StateChange
 
 _STEP = 20 * MS
@@ -37,7 +37,7 @@ def failover_text(events: Sequence[StateChange], channels: Sequence[str]) -> str
     count = len(channels) // 3
     if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:
         return ""
-    declarations, states, state = Declarations(count), [float(ChannelState.UNCHECKED)] * len(channels), State()
+    declarations, states, state = Declarations(count), [float(ChannelState.UNCHECKED)] * len(channels), FailoverState()
     use, done, waiting = [True] * count, [], deque(events)
     for now in _times(events):
         # Between two changes the monitor was heard all the time.
@@ -47,7 +47,7 @@ def failover_text(events: Sequence[StateChange], channels: Sequence[str]) -> str
             states[channels.index(event.channel)] = float(ChannelState[event.state])
         declarations.hear(states, now)
         stale = [ChannelState.STALE in states[3 * k : 3 * k + 3] for k in range(count)]
-        units = tuple(Unit(use[k], now, *declarations.of(k), delivers=not stale[k]) for k in range(count))
+        units = tuple(FailoverUnit(use[k], now, *declarations.of(k), delivers=not stale[k]) for k in range(count))
         state, actions = decide(state, Known(units, linked=True, armed=True, monitored=True), now)
         for action in actions:
             if action.kind == "set":

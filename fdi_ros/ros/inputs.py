@@ -176,7 +176,7 @@ class InputQueue:
         return (one for one in subscriptions if id(one) not in hidden)
 
 
-class Topic:
+class InputTopic:
     """Status of one input topic."""
 
     def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
@@ -229,7 +229,7 @@ class Topic:
             sources=self.sources,
         )
 
-    def find_sources(self, node: Node, inputs: Sequence[Topic]) -> str:
+    def find_sources(self, node: Node, inputs: Sequence[InputTopic]) -> str:
         """Say whether more than one publisher is on the topic, or an input before it reads the same one."""
         first = next(one for one in inputs if one.topic == self.topic)
         if first is not self:

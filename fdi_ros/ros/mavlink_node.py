@@ -33,7 +33,7 @@ from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import Announcer, Reporter
-from fdi_ros.mavlink.vehicle import Sample, Vehicle, VehicleSettings
+from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
 from fdi_ros.ros import parameters
@@ -193,29 +193,29 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._due = now + _SEND_EVERY
         if self._announcer is not None and self.vehicle.in_reach:
             for text in self._announcer.due(now):
-                self.vehicle.say(text.severity, text.text)
+                self.vehicle.send_text(text.severity, text.text)
         if self._failover is not None:
             self._failover.turn(now)
         self.vehicle.tick(now)
         while self.vehicle.events:
-            self._say(self.vehicle.events.popleft())
+            self._log_line(self.vehicle.events.popleft())
 
     def _receive(self) -> None:
         received = self.link.receive(time.monotonic_ns())
         if self.link.opened != self._opened:
             self._opened = self.link.opened
             self.vehicle.reopened()
-            self._say(f"{self.link.url} is open")
+            self._log_line(f"{self.link.url} is open")
         if self.link.trouble != self._trouble:
             self._trouble = self.link.trouble
             if self._trouble:
-                self._say(f"{self.link.url} is not open: {self._trouble}")
+                self._log_line(f"{self.link.url} is not open: {self._trouble}")
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
                 self._publish(sample, self._time.ahead(now))
 
-    def _publish(self, sample: Sample, shift: int) -> None:
+    def _publish(self, sample: ImuSample, shift: int) -> None:
         """Publish a sample; shift is to be added to its stamp to have the time of the system, ns."""
         stamp = sample.stamp + shift
         if sample.unit < len(self._outputs) and 0 <= stamp <= LAST_STAMP:
@@ -236,7 +236,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             return
         whole = next((line for line in lines if line.name == WHOLE), None)
         if whole is not None:
-            self._tell(whole, now)
+            self._send_values(whole, now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
         topics = [line.value("topic").removesuffix(INJECTED) for line in lines if line.name.startswith(INPUT)]
@@ -264,13 +264,13 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self.log.warning(f"~/restore: {response.message}")
         return response
 
-    def _tell(self, whole: StatusLine, now: int) -> None:
+    def _send_values(self, whole: StatusLine, now: int) -> None:
         if not self._values or not self.vehicle.in_reach or now - self._valued < _VALUE_EVERY:
             return
         self._valued = now
         for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
             if not math.isnan(value := whole.number(key)):
-                self.vehicle.tell(name, value, now)
+                self.vehicle.send_value(name, value, now)
 
     # Reports ------------------------------------------------------------------------------------------------------
 
@@ -285,7 +285,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             lines.append(StatusLine(*self._failover.status(f"{prefix_of(self)}failover", now), hardware, ()))
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
 
-    def _say(self, words: str) -> None:
+    def _log_line(self, words: str) -> None:
         self._lines += 1
         if self._lines <= _LOG_PER_REPORT:
             self.get_logger().info(words)
@@ -307,7 +307,7 @@ class ImuMessageBytes:
         # The template says that there is no acceleration; unknown is a covariance of zeros (REP-145).
         struct.pack_into("<d", self._data, self._acceleration + 8 * 3, 0.0)
 
-    def fill(self, stamp: int, sample: Sample) -> bytes:
+    def fill(self, stamp: int, sample: ImuSample) -> bytes:
         """Return the message of a sample, stamped in ns."""
         struct.pack_into("<iI", self._data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
         struct.pack_into("<3d", self._data, self._rate, *sample.rate)

@@ -80,7 +80,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             receiver = Receiver(Pipeline.from_config(self.config))
         if self._state_file is not None:
             self._state_file.restore(receiver.pipeline)
-            if self._state_file.left:
+            if self._state_file.is_rejected:
                 self.log.warning(self._state_file.words)
             else:
                 self.log.info(self._state_file.words)

@@ -24,7 +24,7 @@ from fdi_ros.monitor.output import ChannelState, Events
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros.changes import ChangeLog
-from fdi_ros.ros.inputs import InputQueue, Topic
+from fdi_ros.ros.inputs import InputQueue, InputTopic
 from fdi_ros.ros.messages import REPORT_PERIOD, Publishers, message_class, prefix_of
 from fdi_ros.ros.parameters import resolved
 
@@ -50,7 +50,7 @@ class Supervisor:
     ) -> None:
         config = receiver.pipeline.config
         names = [resolved(node, topic) for topic in config.topics]
-        self.topics = tuple(Topic(receiver, k, name) for k, name in enumerate(names))
+        self.topics = tuple(InputTopic(receiver, k, name) for k, name in enumerate(names))
         self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
         self._latencies, self._state_file = latencies, state_file
         self._prefix = prefix_of(node)
@@ -145,7 +145,7 @@ class Supervisor:
         changes = [self._check_topic(topic, now) for topic in self.topics]
         return self._watchdog.check(self._samples, now) or any(changes)
 
-    def _check_topic(self, topic: Topic, now: int) -> bool:
+    def _check_topic(self, topic: InputTopic, now: int) -> bool:
         changed = topic.watchdog.check(topic.received, now)
         logger = self._node.log
         if changed and topic.watchdog.silent and not topic.received:

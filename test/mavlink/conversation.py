@@ -14,7 +14,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.link import Received
-from fdi_ros.mavlink.vehicle import Sample, Vehicle, VehicleSettings
+from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 
 UTC = 1_790_000_000
@@ -44,7 +44,7 @@ class Conversation:
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
         self.vehicle = Vehicle(VehicleSettings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
-        self.samples: list[tuple[int, Sample]] = []
+        self.samples: list[tuple[int, ImuSample]] = []
         """With the time at which each came out, ns."""
         self.cut = False
         self._order = count()
@@ -90,8 +90,8 @@ class Conversation:
             self.vehicle.tick(self.now)
         return self
 
-    def by_unit(self) -> dict[int, list[Sample]]:
-        found: dict[int, list[Sample]] = {}
+    def by_unit(self) -> dict[int, list[ImuSample]]:
+        found: dict[int, list[ImuSample]] = {}
         for _, sample in self.samples:
             found.setdefault(sample.unit, []).append(sample)
         return found

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdi_ros.mavlink.failover_policy import GROUNDED, Known, State, Unit, decide
+from fdi_ros.mavlink.failover_policy import GROUNDED, FailoverState, FailoverUnit, Known, decide
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -31,7 +31,7 @@ class Flight:
         self.count = int(random.integers(2, 4))
         self.limit = int(random.integers(1, self.count))
         self.loss, self.slow = random.choice([0.0, 0.2, 0.5]), int(random.choice([10, 100, 700])) * MS
-        self.now, self.state, self.done = 100 * NS, State(), Counter[str]()
+        self.now, self.state, self.done = 100 * NS, FailoverState(), Counter[str]()
         self.under_way: list[tuple[int, Callable[[], None]]] = []
         every = range(self.count)
         self.use, self.by = [True for _ in every], ["" for _ in every]
@@ -57,7 +57,7 @@ class Flight:
             if self.linked and self.random.random() >= self.loss:
                 self.under_way.append((self.now + int(self.random.integers(1, self.slow)), arrive))
 
-    def say(self, k: int) -> None:
+    def send_text(self, k: int) -> None:
         """The autopilot says a parameter; one that was overtaken is dropped by its sequence number."""
         value, by, sent = self.use[k], self.by[k], self.now
 
@@ -71,7 +71,7 @@ class Flight:
 
     def set_use(self, k: int, use: bool, by: str) -> None:
         self.use[k], self.by[k] = use, by
-        self.say(k)
+        self.send_text(k)
 
     def happen(self) -> None:
         """What nobody has asked for."""
@@ -93,7 +93,7 @@ class Flight:
         self.restore = self.draw(0.02)
         if self.draw(0.01):
             # A companion that starts anew knows what is ours, and takes all else as it finds it.
-            self.state = State.resumed(self.state.orders)
+            self.state = FailoverState.resumed(self.state.orders)
             self.said, self.touched = [(None, 0)] * self.count, [False] * self.count
         if self.draw(0.02):
             # The autopilot starts anew: its parameters are as they were, and asked for again.
@@ -113,9 +113,9 @@ class Flight:
             self.touched = [False] * self.count
         k, begins = divmod(self.now // STEP % (10 * self.count), 10)
         if not begins:
-            self.travel(lambda: self.say(k))
+            self.travel(lambda: self.send_text(k))
         told = zip(self.said, self.declared, self.ok, self.well, self.delivers, strict=True)
-        units = tuple(Unit(*said, *rest) for said, *rest in told)
+        units = tuple(FailoverUnit(*said, *rest) for said, *rest in told)
         known = Known(units, self.linked, self.armed, self.disarmed, self.monitored, self.restore)
         self.state, actions = decide(self.state, known, self.now, self.limit)
         for action in actions:

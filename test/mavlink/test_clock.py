@@ -130,7 +130,7 @@ def test_milliseconds_that_run_over_go_on(start: int, steps: list[int]) -> None:
     clock, true, now = BootClock(), start * MS, 10**15
     for step in [0, *steps]:
         true, now = true + step * MS, now + step * MS
-        assert clock.take(true % OVER, now, True, true) == true
+        assert clock.unwrap(true % OVER, now, True, true) == true
     assert clock.restarts == 0
 
 
@@ -138,11 +138,11 @@ def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> N
     clock, now = BootClock(), 0
     for k in range(100):
         now += 20 * MS
-        assert clock.take(100 * NS + now, now, True) == 100 * NS + now
+        assert clock.unwrap(100 * NS + now, now, True) == 100 * NS + now
         if k % 10 == 0:
-            assert clock.take(5 * NS, now, True) is None
+            assert clock.unwrap(5 * NS, now, True) is None
     assert clock.restarts == 0
-    taken = [clock.take(k * 20 * MS, now + k * 20 * MS, True) for k in range(10)]
+    taken = [clock.unwrap(k * 20 * MS, now + k * 20 * MS, True) for k in range(10)]
     assert clock.restarts == 1
     assert taken[:3] == [None] * 3
     assert taken[3:] == [k * 20 * MS for k in range(3, 10)]
@@ -150,12 +150,12 @@ def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> N
 
 def test_a_step_ahead_is_found_and_a_pause_is_none() -> None:
     clock = BootClock()
-    clock.take(NS, NS, False)
+    clock.unwrap(NS, NS, False)
     # The link was cut for an hour; then what it had kept comes late.
-    assert clock.take(2 * NS, 3601 * NS, False) == 2 * NS
-    assert clock.take(3601 * NS, 3601 * NS, False) == 3601 * NS
+    assert clock.unwrap(2 * NS, 3601 * NS, False) == 2 * NS
+    assert clock.unwrap(3601 * NS, 3601 * NS, False) == 3601 * NS
     assert clock.restarts == 0
-    assert [clock.take((4000 + k) * NS, 3602 * NS, False) for k in range(4)] == [None, None, None, 4003 * NS]
+    assert [clock.unwrap((4000 + k) * NS, 3602 * NS, False) for k in range(4)] == [None, None, None, 4003 * NS]
     assert clock.restarts == 1
 
 

@@ -14,7 +14,16 @@ import pytest
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import Failover
-from fdi_ros.mavlink.failover_policy import HEALED, SETTLED, Known, Order, State, Unit, decide, objection
+from fdi_ros.mavlink.failover_policy import (
+    HEALED,
+    SETTLED,
+    FailoverState,
+    FailoverUnit,
+    Known,
+    Order,
+    decide,
+    objection,
+)
 from fdi_ros.replay.failover import failover_text
 from fdi_ros.replay.summary import StateChange
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
@@ -28,7 +37,7 @@ CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 
 # The policy --------------------------------------------------------------------------------------------------------
 
-HEALTHY = Unit(use=True, heard=1, ok=True, well=1, delivers=True)
+HEALTHY = FailoverUnit(use=True, heard=1, ok=True, well=1, delivers=True)
 FAULT = HEALTHY._replace(declared=10 * NS, ok=False, well=None)
 FLIGHT = Known((FAULT, HEALTHY, HEALTHY), linked=True, armed=True, monitored=True)
 NOW = 10 * NS + 1
@@ -39,7 +48,7 @@ def others(**changes) -> Known:
 
 
 def test_a_declared_imu_is_taken_out_at_once_and_kept_in_mind() -> None:
-    state, actions = decide(State(), FLIGHT, NOW)
+    state, actions = decide(FailoverState(), FLIGHT, NOW)
     assert actions == [("set", 0, False, "")]
     assert set(state.orders) == {0}
 
@@ -47,34 +56,42 @@ def test_a_declared_imu_is_taken_out_at_once_and_kept_in_mind() -> None:
 @pytest.mark.parametrize(
     ("state", "known", "words"),
     [
-        (State(), FLIGHT._replace(linked=False), "no ArduPilot that sends each IMU"),
-        (State(), FLIGHT._replace(armed=False), "not armed"),
-        (State(), FLIGHT._replace(monitored=False), "the monitor is in doubt"),
-        (State(), FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
-        (State(), FLIGHT._replace(units=(FAULT, HEALTHY, Unit(ok=True, delivers=True))), "INS_USE not known"),
-        (State(), FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
-        (State(left_alone=frozenset({0})), FLIGHT, "set by others"),
-        (State(), others(use=False), "no other is healthy"),
-        (State(), others(ok=False), "no other is healthy"),
-        (State(), others(delivers=False), "no other is healthy"),
-        (State(orders={1: Order(False)}), FLIGHT, "limit"),
-        (State(orders={1: Order(False)}), FLIGHT._replace(units=(FAULT, HEALTHY, FAULT)), "no other is healthy"),
+        (FailoverState(), FLIGHT._replace(linked=False), "no ArduPilot that sends each IMU"),
+        (FailoverState(), FLIGHT._replace(armed=False), "not armed"),
+        (FailoverState(), FLIGHT._replace(monitored=False), "the monitor is in doubt"),
+        (FailoverState(), FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
+        (
+            FailoverState(),
+            FLIGHT._replace(units=(FAULT, HEALTHY, FailoverUnit(ok=True, delivers=True))),
+            "INS_USE not known",
+        ),
+        (FailoverState(), FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
+        (FailoverState(left_alone=frozenset({0})), FLIGHT, "set by others"),
+        (FailoverState(), others(use=False), "no other is healthy"),
+        (FailoverState(), others(ok=False), "no other is healthy"),
+        (FailoverState(), others(delivers=False), "no other is healthy"),
+        (FailoverState({1: Order(False)}), FLIGHT, "limit"),
+        (
+            FailoverState(orders={1: Order(False)}),
+            FLIGHT._replace(units=(FAULT, HEALTHY, FAULT)),
+            "no other is healthy",
+        ),
     ],
 )
-def test_it_is_not_taken_out_if(state: State, known: Known, words: str) -> None:
+def test_it_is_not_taken_out_if(state: FailoverState, known: Known, words: str) -> None:
     assert objection(state, known, 0, 1) == words
     assert ("set", 0, False, "") not in decide(state, known, NOW)[1]
 
 
 def test_an_old_declaration_is_not_acted_on_and_it_is_said_once() -> None:
-    state, actions = decide(State(), FLIGHT, 12 * NS)
+    state, actions = decide(FailoverState(), FLIGHT, 12 * NS)
     assert actions == [("stays", 0, True, "declared too long ago")]
     assert decide(state, FLIGHT, 13 * NS)[1] == []
 
 
 def test_another_fault_takes_the_place_of_one_that_has_healed() -> None:
     """With the limit reached: the healed one back first, and only when that is confirmed the faulty one out."""
-    out = State(orders={1: Order(False, tries=1, begun=1, sent=1, confirmed=True)}, seen={1: False})
+    out = FailoverState(orders={1: Order(False, tries=1, begun=1, sent=1, confirmed=True)}, seen={1: False})
     healed = HEALTHY._replace(use=False, heard=2, well=NOW - HEALED)
     known = FLIGHT._replace(units=(FAULT, healed, HEALTHY))
     for changes in ({"well": NOW - HEALED + 1}, {"well": None}, {"ok": False}, {"delivers": False}):
@@ -90,7 +107,7 @@ def test_another_fault_takes_the_place_of_one_that_has_healed() -> None:
 
 def test_what_could_not_be_set_at_once_is_not_set_much_later() -> None:
     """The link is lost after the first attempt, and the fault is still there when it is back."""
-    state, _ = decide(State(), FLIGHT, NOW)
+    state, _ = decide(FailoverState(), FLIGHT, NOW)
     state, _ = decide(state, FLIGHT._replace(linked=False), NOW + NS)
     state, actions = decide(state, FLIGHT, NOW + 60 * NS)
     assert actions == [("not out", 0, False, "")]
@@ -100,7 +117,7 @@ def test_what_could_not_be_set_at_once_is_not_set_much_later() -> None:
 @pytest.mark.parametrize(("wait", "again"), [(SETTLED - 1, [("set", 1, False, "")]), (SETTLED, [])])
 def test_a_late_answer_to_a_put_back_may_be_somebody_elses(wait: int, again: list) -> None:
     """IMU 2 is put back in flight; where that has been answered late, another fault of it is the pilot's."""
-    state = State(orders={1: Order(True, tries=1, begun=NOW, sent=NOW)}, seen={1: False})
+    state = FailoverState(orders={1: Order(True, tries=1, begun=NOW, sent=NOW)}, seen={1: False})
     back = HEALTHY._replace(heard=NOW + wait)
     state, actions = decide(state, FLIGHT._replace(units=(HEALTHY, back, HEALTHY)), NOW + wait)
     assert actions[0] == ("back", 1, False, "")

@@ -189,13 +189,13 @@ def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> 
     autopilot = Autopilot("px4")
     autopilot.refuses = {129}
     talk = Conversation(autopilot, kind="SCALED_IMU").run(40.0)
-    assert talk.vehicle.streams.said(129) == "failed"
-    assert talk.vehicle.streams.said(26) == "accepted"
+    assert talk.vehicle.streams.answer_to(129) == "failed"
+    assert talk.vehicle.streams.answer_to(26) == "accepted"
     assert sum(command[1] == 129 for command in autopilot.commands) == 1
     deaf = Autopilot("px4", rates={26: 10, 116: 10, 129: 10})
     deaf.take = lambda data, now: []
     talk = Conversation(deaf, kind="SCALED_IMU").run(40.0)
-    assert talk.vehicle.streams.said(26) == "no answer"
+    assert talk.vehicle.streams.answer_to(26) == "no answer"
     assert talk.sent["COMMAND_LONG"] <= 20
     assert not talk.vehicle.sync.synchronised
     # It is used all the same, at the rate it gives.

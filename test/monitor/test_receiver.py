@@ -31,19 +31,19 @@ class Ear:
         self.fused, self.integrity, self.events = [], [], []
 
     def take(self, inlet, data, stamp=0):
-        told = self.receiver.take(inlet, data, stamp)
-        while told:
-            if told & SUPPLY:
+        flags = self.receiver.take(inlet, data, stamp)
+        while flags:
+            if flags & SUPPLY:
                 self.receiver.supply()
-            if told & HAS_RATE:
+            if flags & HAS_RATE:
                 self.fused.append(self.receiver.fused.tobytes())
-            if told & WORKED:
+            if flags & WORKED:
                 self.integrity.append(self.receiver.integrity.tobytes())
-            if told & HAS_EVENTS:
+            if flags & HAS_EVENTS:
                 self.events += self.receiver.events
-            if told & MALFORMED:
+            if flags & MALFORMED:
                 self.receiver.refused(inlet, data)
-            told = self.receiver.go_on() if told & MORE else 0
+            flags = self.receiver.go_on() if flags & MORE else 0
 
     def rates(self):
         return dict(ImuSource.parse(data, 3) for data in self.fused)
@@ -76,10 +76,10 @@ def test_message_by_message_equals_the_whole_stream(units):
     )
     output = offline.process(aligned)
     assert list(ear.events) == list(output.events)
-    told = np.array([ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity])
-    np.testing.assert_array_equal(told[:, 0], output.statistic)
-    np.testing.assert_array_equal(told[:, 2 : 2 + 3 * units], output.state)
-    np.testing.assert_array_equal(told[:, -3:], output.level)
+    figures = np.array([ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity])
+    np.testing.assert_array_equal(figures[:, 0], output.statistic)
+    np.testing.assert_array_equal(figures[:, 2 : 2 + 3 * units], output.state)
+    np.testing.assert_array_equal(figures[:, -3:], output.level)
     rates = dict(zip(output.stamp[output.valid].tolist(), map(tuple, output.rate[output.valid].tolist()), strict=True))
     assert ear.rates() == rates
     assert offline.core.tobytes() == ear.receiver.pipeline.core.tobytes()

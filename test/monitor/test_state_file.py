@@ -134,11 +134,11 @@ def test_what_does_not_fit_is_left_and_said(path, written, change, words):
     file = left(path, pipeline)
     assert words in file.words
     # And kept.
-    assert file.left
+    assert file.is_rejected
     assert file.save(pipeline)
     assert path.with_suffix(".json.old").read_bytes() == before
     assert StateFile(path, 60.0).restore(pipeline)
-    assert not file.left
+    assert not file.is_rejected
 
 
 @pytest.mark.parametrize("content", [b"", b'{"format": 2', b'{\n "format": "\xff', b'{"format":' + b"[" * 100_000])

@@ -75,7 +75,7 @@ def wait(until: Callable[[], object], seconds: float = PATIENCE) -> bool:
     return True
 
 
-def sound(
+def healthy(
     count: int, seed: int = 0, size: float = 0.5, rate: float = RATE, start: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Body rate (N, 3) and healthy channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
@@ -95,7 +95,7 @@ def parameter_file(config: Config, folder: Path, **more: object) -> Path:
 def warmed(config: Config, before: int) -> Pipeline:
     """A pipeline that has seen healthy samples up to a stamp, as the node's has."""
     pipeline = Pipeline.from_config(config)
-    z = sound(50, seed=99)[1]
+    z = healthy(50, seed=99)[1]
     pipeline.process(Block(before - 4_000_000 * np.arange(50, 0, -1), z))
     return pipeline
 
@@ -192,7 +192,7 @@ class Listener(Node):
         begin = time.monotonic()
         while (now := time.monotonic() - begin) < seconds:
             # One motion through all pauses, as of a vehicle: a delay is learned from it.
-            last = self.play(sound(25, int(1e3 * now), start=now)[1])[-1]
+            last = self.play(healthy(25, int(1e3 * now), start=now)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
             wait(lambda last=last: self.fused and ImuSource.parse(self.fused[-1], 3)[0] == last, 1.0)
             if self.integrity and not self.states()[-1].any():
@@ -206,7 +206,7 @@ class Listener(Node):
             self.send_channels([0.0] * 6)
             time.sleep(1 / RATE)
         else:
-            self.play(sound(10, size=0.0)[1])
+            self.play(healthy(10, size=0.0)[1])
 
     def rates(self) -> dict[int, tuple[float, float, float]]:
         """Fused rates by stamp."""
@@ -282,7 +282,7 @@ def wander(listener: Listener, count: int, seed: int) -> dict[str, int]:
 
     def feed() -> None:
         while not stop.is_set():
-            listener.play(sound(10)[1])
+            listener.play(healthy(10)[1])
 
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from mavlink.attack import KINDS as PACKETS
@@ -30,7 +30,7 @@ from mavlink.attack import Attacker
 from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring
 from sensor_msgs.msg import Imu
@@ -241,46 +241,28 @@ class Vehicle(NamedTuple):
     monitor: Process
     link: Process
     port: int
-    reports: dict[str, list[float]]
-    """When the node of the link reported, and when a node reported that does nothing else."""
-
-
-PLAIN = "plain_node"
-
-
-def report_plainly() -> None:
-    """Report once a second, and do nothing else: whatever keeps this from it is the machine."""
-    rclpy.init()
-    node = Node(PLAIN)
-    output = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-    message = DiagnosticArray(status=[DiagnosticStatus(name=f"{PLAIN}: alive")])
-    node.create_timer(1.0, lambda: output.publish(message))
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
+    reports: list[float]
+    """When the node of the link reported."""
 
 
 @contextlib.contextmanager
 def vehicle(folder: Path) -> Iterator[Vehicle]:
     """Three gyros of a simulated PX4 over UDP, monitored."""
-    port, reports = free_port(), {"link": [], "plain": []}
+    port, reports = free_port(), []
     autopilot = Autopilot("px4", boot=time.monotonic_ns() - 100 * NS)
 
     def hear(message: DiagnosticArray) -> None:
-        for kind, prefix in (("link", "mavlink_node: "), ("plain", f"{PLAIN}: ")):
-            if message.status and message.status[0].name.startswith(prefix):
-                reports[kind].append(time.monotonic())
+        if message.status and message.status[0].name.startswith("mavlink_node: "):
+            reports.append(time.monotonic())
 
     with OverUdp(port, autopilot), monitoring(CONFIG, folder, prime=False) as (listener, monitor):
         listener.create_subscription(DiagnosticArray, "/diagnostics", hear, 100)
         arguments = ("--params-file", str(STACK), "-p", f"url:=udpin:127.0.0.1:{port}")
         link = Process("mavlink_node", "--ros-args", *arguments)
-        plain = subprocess.Popen([sys.executable, "-m", "ros.storm"], env=_environment())
         try:
             assert listener.says("monitor", "9 of 9 channels healthy")
             yield Vehicle(listener, monitor, link, port, reports)
         finally:
-            plain.kill()
-            plain.wait()
             code = link.end()
         assert code == 0, link.said()
         assert "Traceback" not in link.said()
@@ -302,7 +284,7 @@ def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, fl
     end = time.monotonic()
     sent, answered = map(int, done.stdout.split()[-2:])
     told: dict[str, float] = {"sent": sent, "answered": answered}
-    reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], **over.reports}
+    reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], "link": over.reports}
     for name, came in reports.items():
         times = [at for at in list(came) if begun - 2 <= at]
         told[f"{name}: longest gap of the diagnostics, s"] = max(np.diff([*times, end]), default=math.inf)
@@ -312,7 +294,5 @@ def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, fl
     return told
 
 
-if __name__ == "__main__" and len(sys.argv) == 1:
-    report_plainly()
-elif __name__ == "__main__":
+if __name__ == "__main__":
     print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])))

@@ -29,9 +29,9 @@ from ros.harness import (
     Process,
     assert_refused,
     connect,
+    healthy,
     monitoring,
     parameter_file,
-    sound,
     wait,
     wander,
 )
@@ -157,14 +157,14 @@ while True:
         doomed.wait()
         assert listener.says("monitor", "no sample for")
         listener.clear()
-        listener.play(sound(50)[1])
+        listener.play(healthy(50)[1])
         assert wait(lambda: len(listener.fused) >= 49)
         assert process.end(signal.SIGTERM) == 0, process.said()
 
 
 def test_the_single_threaded_executor_does_the_same_and_ends_at_a_second_signal_too(tmp_path) -> None:
     with monitoring(TWO_IMUS, tmp_path, executor="single") as (listener, process):
-        z = sound(200)[1]
+        z = healthy(200)[1]
         z[100:, 4] += 0.3
         assert listener.settle()
         listener.play(z)
@@ -211,12 +211,12 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         listener.diagnostics.clear()
         assert listener.says("monitor", "inactive")
         listener.clear()
-        listener.play(sound(20)[1])
+        listener.play(healthy(20)[1])
         assert not listener.fused
         # Back in the middle of a recording that begins anew, an hour earlier.
         assert change(Transition.TRANSITION_ACTIVATE)
         connect(listener, process, prime=False)
-        z = sound(250)[1].tolist()
+        z = healthy(250)[1].tolist()
         begin = time.time_ns() - 3600 * 10**9
         for k, row in enumerate(z):
             for j in (0, 1):
@@ -255,7 +255,7 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
                 stamp += 20_000_000
             return stamp
 
-        z = sound(200, rate=50.0)[1].tolist()
+        z = healthy(200, rate=50.0)[1].tolist()
         end = play(z, origin)
         assert wait(lambda: len(listener.fused) > 150)
         assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - end) < 10**9

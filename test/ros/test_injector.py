@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from ros.harness import DEEP, RATE, TWO_IMUS, Process, listening, parameter_file, sound, wait
+from ros.harness import DEEP, RATE, TWO_IMUS, Process, healthy, listening, parameter_file, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -36,7 +36,7 @@ def injector(tmp_path_factory):
         listener.create_subscription(DiagnosticArray, "/diagnostics", lambda m: said.append(m.status[0]), 10)
         try:
             assert wait(lambda: all(p.get_subscription_count() for p in listener.outputs)), process.said()
-            assert wait(lambda: (listener.play(sound(5)[1]), all(out))[1])
+            assert wait(lambda: (listener.play(healthy(5)[1]), all(out))[1])
             yield listener, out, said
         finally:
             assert process.end() == 0, process.said()
@@ -60,7 +60,7 @@ def rest(out: list[list[bytes]]) -> None:
 
 
 def test_off_it_passes_every_byte(injector) -> None:
-    z = sound(50)[1]
+    z = healthy(50)[1]
     stamps, out = flow(injector, z)
     template = ImuTemplate("imu")
     for j in range(2):
@@ -74,7 +74,7 @@ def test_on_it_strikes_as_the_same_faults_do_offline(injector) -> None:
     result = listener.set("injector_node", faults=faults)
     assert result.successful, result.reason
     assert listener.call(Trigger, "injector_node/start", Trigger.Request()).success
-    z = sound(200)[1]
+    z = healthy(200)[1]
     stamps, out = flow(injector, z)
     assert wait(lambda: said[-1].level == DiagnosticStatus.WARN and "INJECTING" in said[-1].message)
     names = [f"imu_{k}.{axis}" for k in (1, 2) for axis in "xyz"]

@@ -18,7 +18,7 @@ import rclpy.executors
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from ros.harness import DEEP, TWO_IMUS, Process, listening, parameter_file, sound, wait
+from ros.harness import DEEP, TWO_IMUS, Process, healthy, listening, parameter_file, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -140,7 +140,7 @@ def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(tmp_path, compi
         process = Process("fdi_node", "--ros-args", "--params-file", str(file), *remapped)
         try:
             assert wait(lambda: listener.outputs[0].get_subscription_count() > 1), process.said()
-            listener.play(sound(1250)[1], triads=(0,))
+            listener.play(healthy(1250)[1], triads=(0,))
             assert listener.says("monitor", "(imu_1/data_raw) and imu_2 (imu_2/data_raw) give the same values")
             assert listener.says("input imu_2", "imu_2 and imu_1 read the same topic /imu_1/data_raw")
             assert listener.says("imu_2.x", "one sensor, no redundancy")

@@ -79,10 +79,10 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
     strikes = [float("inf")]
     autopilot, other = (Autopilot("px4", system=system, boot=boot(), seed=system) for system in (2, 1))
-    sound = autopilot.motion
+    healthy = autopilot.motion
 
     def motion(t: float) -> np.ndarray:
-        z = sound(t)
+        z = healthy(t)
         if t >= strikes[0]:
             z[1, 1] += 0.3
         return z
@@ -119,10 +119,10 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain
     """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
     strikes = [float("inf")]
     autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
-    sound = autopilot.motion
+    healthy = autopilot.motion
 
     def motion(t: float) -> np.ndarray:
-        z = sound(t)
+        z = healthy(t)
         z[0, 1] += 0.3 * (strikes[0] <= t)
         return z
 

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, monitoring, sound, wait
+from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, healthy, monitoring, wait
 from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
@@ -48,7 +48,7 @@ def listener(node) -> Listener:
 
 
 def struck(count: int, start: int, channel: int = Y2, size: float = 0.3, seed: int = 1):
-    omega, z = sound(count, seed)
+    omega, z = healthy(count, seed)
     z[start:, channel] += size
     return omega, z
 
@@ -98,7 +98,7 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(lis
 
 @pytest.mark.parametrize("bad", [math.nan, 1e300])
 def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
-    _, z = sound(200)
+    _, z = healthy(200)
     z[50, 1] = z[100:103, Y2] = bad
     listener.play(z)
     assert wait(lambda: len(listener.fused) == 200)
@@ -109,7 +109,7 @@ def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
 
 
 def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
-    z = sound(50)[1]
+    z = healthy(50)[1]
     stamps = listener.play(z)
     for stamp in (int(stamps[-1]), int(stamps[-5]), int(stamps[-1]) - 10**9):
         listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
@@ -124,7 +124,7 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
 
 
 def test_stamps_at_the_ends_of_their_range_end_nothing(listener) -> None:
-    z = sound(50)[1]
+    z = healthy(50)[1]
     listener.play(z)
     for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
         message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
@@ -140,20 +140,20 @@ def test_the_rate_reaches_subscribers_of_either_kind_and_those_that_come_and_go(
     """The default of rclpy is reliable, sensor data are best effort."""
     reliable: list[bytes] = []
     subscription = listener.create_subscription(Imu, "fused", reliable.append, 100, raw=True)
-    assert wait(lambda: listener.play(sound(5)[1]) is not None and reliable)
+    assert wait(lambda: listener.play(healthy(5)[1]) is not None and reliable)
     time.sleep(0.1)
     reliable.clear()
     listener.clear()
     for _ in range(5):
         passing = listener.create_subscription(Imu, "fused", lambda _: None, DEEP, raw=True)
-        listener.play(sound(20)[1])
+        listener.play(healthy(20)[1])
         listener.destroy_subscription(passing)
     assert wait(lambda: len(reliable) == len(listener.fused) == 100), (len(reliable), len(listener.fused))
     listener.destroy_subscription(subscription)
 
 
 def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
-    z = sound(250)[1]
+    z = healthy(250)[1]
     listener.play(z[:50])
     listener.play(z, triads=[0])
     reports = [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in listener.diagnostics]
@@ -173,14 +173,14 @@ def test_when_all_is_silent_all_is_stale(listener) -> None:
 
 
 def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
-    listener.play(sound(100, size=3.0)[1])
+    listener.play(healthy(100, size=3.0)[1])
     response = listener.trigger("relearn_bias")
     assert not response.success
     assert "in motion" in response.message
-    listener.play(sound(50, size=0.0)[1])
+    listener.play(healthy(50, size=0.0)[1])
     response = listener.trigger("relearn_bias")
     assert response.success, response.message
-    listener.play(sound(650, size=0.0)[1])
+    listener.play(healthy(650, size=0.0)[1])
     assert wait(lambda: listener.value("monitor", "bias") == "learned")
 
 
@@ -226,7 +226,7 @@ class TestParameters:
 
     def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
         assert listener.set(excluded_channels=["imu_1.z"]).successful
-        listener.play(sound(100)[1])
+        listener.play(healthy(100)[1])
         assert listener.says("imu_1.z", "taken out by the operator")
         assert listener.set(excluded_channels=[]).successful
         assert listener.settle()

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
+from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, healthy, monitoring, wait, warmed
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
@@ -27,7 +27,7 @@ from fdi_ros.sources.imus import ImuSource
 def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(tmp_path) -> None:
     # By a node of its own, as what the default learns of noise and delays outlives a reset.
     alike = TWO_IMUS.replaced({"detector.name": "likelihood_ratio"})
-    z = sound(400, 5)[1]
+    z = healthy(400, 5)[1]
     z[150:, 4] += 0.05
     with monitoring(alike, tmp_path) as (listener, _):
         assert listener.settle()
@@ -59,7 +59,7 @@ def test_channels_in_one_array(tmp_path) -> None:
         assert wait(lambda: listener.prime() or not listener.states()[-1].any())
         time.sleep(0.1)
         listener.clear()
-        omega, z = sound(300)
+        omega, z = healthy(300)
         z[150:, 4] += 0.3
         for k, values in enumerate(z.tolist()):
             listener.send_channels(values)
@@ -113,7 +113,7 @@ def listener(tmp_path):
 
 def test_a_clock_offset_is_named_and_lived_with_and_so_is_a_gap(listener) -> None:
     offset = 40_000_000
-    listener.play(sound(500)[1], skew=-offset)
+    listener.play(healthy(500)[1], skew=-offset)
     said = listener.says("input imu_2", "behind the other inputs'")
     assert wait(lambda: len(listener.fused) > 450)
     # Ten samples behind; nine where the one of the other unit came after it.
@@ -126,16 +126,16 @@ def test_a_clock_offset_is_named_and_lived_with_and_so_is_a_gap(listener) -> Non
     time.sleep(1.0)
     assert listener.settle()
     listener.clear()
-    listener.play(sound(500)[1])
+    listener.play(healthy(500)[1])
     for name in ("imu_1", "imu_2"):
         assert wait(lambda name=name: listener.status(f"input {name}").message == "delivers")
         assert listener.status(f"input {name}").level == DiagnosticStatus.OK
 
 
 def test_a_clock_far_from_now_is_named(listener) -> None:
-    listener.play(sound(20)[1])
+    listener.play(healthy(20)[1])
     # The time begins anew when both units agree on it.
-    start, z = time.time_ns() - 3600 * 10**9, sound(1100)[1]
+    start, z = time.time_ns() - 3600 * 10**9, healthy(1100)[1]
     z[300:, 4] += 0.3
 
     def send(rows: range) -> None:

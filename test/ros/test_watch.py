@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from ros.harness import ROOT, TWO_IMUS, Listener, Process, listening, parameter_file, sound, wait
+from ros.harness import ROOT, TWO_IMUS, Listener, Process, healthy, listening, parameter_file, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -225,7 +225,7 @@ def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> Non
         file = str(parameter_file(TWO_IMUS, tmp_path))
         monitor = Process("fdi_node", "--ros-args", "-r", "__ns:=/drone", "-r", "fused:=rate", "--params-file", file)
         try:
-            z = sound(50)[1]
+            z = healthy(50)[1]
             # The node starts within this time, too.
             assert wait(lambda: listener.play(z) is not None and "6 of 6 channels healthy" in path.read_text(), 240)
             assert "| fused rate +" in path.read_text()
