@@ -232,15 +232,16 @@ def degraded(status: Status) -> dict[str, str]:
     }
 
 
-def _format_units(status: Status, late: Sequence[UnitStatus]) -> list[str]:
+def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[str]:
     """Say what is wrong with units as a whole; the setting that takes delays off stands with the last of those late."""
+    late = [unit for unit in status.units if unit.name in worse]
     words = [
         f"{first} and {second} give the same values: one sensor, no redundancy; the second is left out;"
         " look at topics and remappings"
         for first, second in status.copies
     ]
     words += [_format_frozen(unit) for unit in status.units if unit.frozen]
-    words += [degraded(status)[unit.name] for unit in late]
+    words += [f"{unit.name} as a whole: {'; '.join(worse[unit.name])}" for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
             round(before + (unit.delay if unit in late else 0.0), 5)
@@ -302,7 +303,7 @@ def _no_sample(status: Status, silent: float) -> str:
     return f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
 
 
-def _whole(status: Status, worse: Mapping[str, object], silent: float | None) -> tuple[Level, str]:
+def _whole(status: Status, worse: Mapping[str, Sequence[str]], silent: float | None) -> tuple[Level, str]:
     if silent is not None:
         return Level.STALE, _no_sample(status, silent)
     total = len(status.channels)
@@ -311,9 +312,8 @@ def _whole(status: Status, worse: Mapping[str, object], silent: float | None) ->
     alive = sum(not channel.is_left_out for channel in status.channels)
     undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
     reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
-    late = [unit for unit in status.units if unit.name in worse]
     about = [channel.name for channel in status.channels if channel.name in worse]
-    words = [status.note, *_format_units(status, late), f"degraded: {', '.join(about)}" if about else ""]
+    words = [status.note, *_format_units(status, worse), f"degraded: {', '.join(about)}" if about else ""]
     note = "".join(f"; {one}" for one in words if one)
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"

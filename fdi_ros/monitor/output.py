@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate
-from fdi_ros.core.records import OutputRow
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
@@ -192,21 +190,6 @@ class Output:
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    @classmethod
-    def from_arrays(cls, n: int, events: Sequence[Event] = (), **fields: Any) -> Output:
-        """Output made of arrays, named as the attributes; the covariance as (N, 3, 3)."""
-        rows = allocate(OutputRow, len(fields["stamp"]))
-        for name, values in fields.items():
-            if name == "covariance":
-                rows[name] = np.reshape(values, (-1, 9))[:, [0, 1, 2, 4, 5, 8]]
-            elif name in ("state", "residual"):
-                rows[name][:, :n] = values
-            else:
-                rows[name] = values
-        if "instant" not in fields:
-            rows["instant"] = rows["stamp"]
-        return cls(rows, n, events)
 
     @property
     def stamp(self) -> NDArray[np.int64]:

@@ -443,20 +443,20 @@ def _format_motion(bias: Any) -> str:
 
 def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
-    outcome = bias["outcome"]
-    if outcome == FIXED:
-        return "fixed" if bias["given"] else "zero"
-    if outcome == LEARNING:
-        return "learning"
-    if outcome == IN_MOTION:
-        return (
-            "not at rest at the start: biases as given, what the channels see of each other is followed; the common"
-            f" bias is unknown to {turn_on:g} rad/s"
-        )
+    outcome = int(bias["outcome"])
+    words = {
+        FIXED: "fixed" if bias["given"] else "zero",
+        LEARNING: "learning",
+        IN_MOTION: "not at rest at the start: biases as given, what the channels see of each other is followed; the"
+        f" common bias is unknown to {turn_on:g} rad/s",
+        LEARNED: "learned",
+        RESTORED: "restored from the state file",
+    }.get(outcome, "")
     if outcome in (LEARNED, RESTORED):
-        words = "learned" if outcome == LEARNED else "restored from the state file"
         missed = [name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))]
         return f"{words}, but not of {', '.join(missed)}" if missed else words
+    if words:
+        return words
     if outcome == TOO_FEW:
         heard = int(bias["heard"]).bit_count()
         return f"refused: {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"

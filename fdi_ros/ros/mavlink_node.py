@@ -59,8 +59,6 @@ PARTING = 4.0
 """So long the end waits on the ground for IMUs to be put back, s."""
 MOST_CALLS = 32
 """Callbacks of a turn of the executor."""
-_LOG_PER_REPORT = 10
-"""Lines of the log between two reports."""
 _SEND_EVERY = 10_000_000
 """What is to be sent is looked for so often, ns."""
 _LARGEST = 1 << 17
@@ -92,7 +90,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._messages = [ImuMessageBytes(name) for name in names]
         self._reporter = Reporter(self.link, self.vehicle, names, [output.topic_name for output in self._outputs])
         self._diagnostics = diagnostics_publisher(self)
-        self._opened = self._lines = 0
+        self._opened = 0
         self._trouble = self.link.trouble
         self._valued = self._due = 0
         self._time = SystemTime()
@@ -198,18 +196,18 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             self._failover.turn(now)
         self.vehicle.tick(now)
         while self.vehicle.events:
-            self._log_line(self.vehicle.events.popleft())
+            self.log.info(self.vehicle.events.popleft())
 
     def _receive(self) -> None:
         received = self.link.receive(time.monotonic_ns())
         if self.link.opened != self._opened:
             self._opened = self.link.opened
             self.vehicle.reopened()
-            self._log_line(f"{self.link.url} is open")
+            self.log.info(f"{self.link.url} is open")
         if self.link.trouble != self._trouble:
             self._trouble = self.link.trouble
             if self._trouble:
-                self._log_line(f"{self.link.url} is not open: {self._trouble}")
+                self.log.info(f"{self.link.url} is not open: {self._trouble}")
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
@@ -276,19 +274,12 @@ class AutopilotNode(parameters.CheckedParameters, Node):
 
     def _report(self) -> None:
         self._called = True
-        if self._lines > _LOG_PER_REPORT:
-            self.get_logger().warning(f"and {self._lines - _LOG_PER_REPORT} more lines")
-        self._lines = 0
+        self.log.begin_period()
         now, hardware = time.monotonic_ns(), self.config.hardware_id
         lines = self._reporter.lines(prefix_of(self), hardware, now)
         if self._failover is not None:
             lines.append(StatusLine(*self._failover.status(f"{prefix_of(self)}failover", now), hardware, ()))
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
-
-    def _log_line(self, words: str) -> None:
-        self._lines += 1
-        if self._lines <= _LOG_PER_REPORT:
-            self.get_logger().info(words)
 
     def destroy_node(self) -> None:
         """Close the link too."""

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config
+from fdi_ros.core.records import OutputRow
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
@@ -79,3 +81,16 @@ def seconds(event: Event) -> float:
 def states_of(pipeline: Pipeline, output: Output, name: str) -> set[ChannelState]:
     """Every state a channel was in."""
     return {ChannelState(s) for s in np.unique(output.state[:, pipeline.channel_names.index(name)])}
+
+
+def output_of(n: int, events: Sequence[Event] = (), **fields: object) -> Output:
+    """An output made of arrays, named as its attributes; the covariance as (N, 3, 3)."""
+    rows = allocate(OutputRow, len(fields["stamp"]))
+    for name, values in {"instant": fields["stamp"], **fields}.items():
+        if name == "covariance":
+            rows[name] = np.reshape(values, (-1, 9))[:, [0, 1, 2, 4, 5, 8]]
+        elif name in ("state", "residual"):
+            rows[name][:, :n] = values
+        else:
+            rows[name] = values
+    return Output(rows, n, events)

@@ -10,10 +10,10 @@ import pytest
 from bag.recordings import STORE
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from monitor.streams import output_of
 
 from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, Encoder, encode_diagnostics
-from fdi_ros.monitor.output import Output
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9)
 lines = st.builds(
@@ -43,7 +43,7 @@ def test_a_time_that_no_header_holds_is_moved_to_its_end(now: int) -> None:
 
 def test_a_sample_gives_a_rate_where_there_is_one_and_always_its_integrity() -> None:
     covariance = np.arange(18.0).reshape(2, 3, 3)
-    output = Output.from_arrays(
+    output = output_of(
         4,
         stamp=[10**9, 2 * 10**9],
         rate=[[1.0, 2.0, 3.0], [np.nan] * 3],

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from monitor.streams import output_of
 
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
@@ -49,7 +50,7 @@ def outputs(geometry, states, errors=None, time=None, rate=0.0):
         Event(int(stamp[k]), int(i), S(before[k, i]), S(states[k, i]), Reason.DISAGREES, (int(i),), 0.0, int(k))
         for k, i in np.argwhere(states != before)
     ]
-    return time, Output.from_arrays(
+    return time, output_of(
         n,
         events,
         stamp=stamp,

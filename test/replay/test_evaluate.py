@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from monitor.streams import output_of
 from replay.summaries import summary_of
 
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.monitor.output import Event, Output
+from fdi_ros.monitor.output import Event
 from fdi_ros.replay.evaluate import Evaluation, Rms
 from fdi_ros.replay.words import fault_sections, sentences, verdict
 from fdi_ros.report.verdict import Severity
@@ -38,7 +39,7 @@ def scored(faults, *events, seconds=40, step=40):
         mine = tuple(e for e in events if k <= round(e.stamp * 1e-9) < k + step)
         second = np.arange(k, min(k + step, seconds))
         rate = np.column_stack([second, second % 5, 0 * second])
-        evaluation.add(Output.from_arrays(6, mine, stamp=second * 10**9, rate=rate), np.zeros((len(second), 3)))
+        evaluation.add(output_of(6, mine, stamp=second * 10**9, rate=rate), np.zeros((len(second), 3)))
     return evaluation.scores()
 
 

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from monitor.streams import output_of
 from replay.summaries import summary_of
 
 from fdi_ros.cli import command_line
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.monitor.output import Output
 from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.replay.page import Report, marks
 from fdi_ros.replay.summary import (
@@ -351,7 +351,7 @@ def outputs(geometry, rows, spike):
         rate, covariance = random.normal(size=(count, 3)), np.broadcast_to(1e-4 * np.eye(3), (count, 3, 3))
         figures = {"rate": rate, "covariance": covariance, "residual": residual, "threshold": 6.0, "valid": True}
         figures["statistic"] = np.abs(random.normal(size=count))
-        yield Output.from_arrays(geometry.n, stamp=1_000_000 * np.arange(first, first + count), **figures)
+        yield output_of(geometry.n, stamp=1_000_000 * np.arange(first, first + count), **figures)
 
 
 def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
