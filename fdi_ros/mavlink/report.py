@@ -18,7 +18,7 @@ from fdi_ros.mavlink.clock import MS, NS
 from fdi_ros.mavlink.imu import MESSAGES, RESOLUTION, numbers
 from fdi_ros.mavlink.link import Link
 from fdi_ros.mavlink.streams import ENOUGH
-from fdi_ros.mavlink.vehicle import Vehicle
+from fdi_ros.mavlink.vehicle import UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 LOSSY = 0.05
@@ -67,14 +67,8 @@ class Reporter:
             words.append(f"{lost} of {lost + heard} messages lost")
         if more := [str(unit + 1) for unit in sorted(vehicle.units) if unit >= len(self._names)]:
             words.append(f"no topic for IMU {', '.join(more)} of the autopilot")
-        words += [
-            f"{recent[kind]} {said}"
-            for kind, said in (
-                ("bad", "pieces that are no message"),
-                ("unsigned", "messages without a valid signature"),
-            )
-            if recent.get(kind)
-        ]
+        odd = {"bad": "pieces that are no message", "unsigned": "messages without a valid signature"}
+        words += [f"{recent[kind]} {text}" for kind, text in odd.items() if recent.get(kind)]
         return (Level.WARN if words else Level.OK), "; ".join([who, *words])
 
     def _link_values(self, now: int) -> tuple[tuple[str, str], ...]:
@@ -102,34 +96,28 @@ class Reporter:
 
     def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle
-        track = vehicle.units.get(unit)
+        track, answer = vehicle.units.get(unit), vehicle.streams.answer_to(self._message(unit))
         if track is None:
             if unit in vehicle.magnetometers:
                 return Level.ERROR, "the autopilot has no such IMU: only its magnetometer comes"
-            number = self._message(unit)
-            said = f"; request: {vehicle.streams.answer_to(number)}" if number is not None else ""
-            return (Level.ERROR if vehicle.in_reach else Level.STALE), f"nothing of this unit yet{said}"
+            return (Level.ERROR if vehicle.in_reach else Level.STALE), f"nothing of this unit yet; request: {answer}"
         rate, asked = track.rate(now), vehicle.settings.rate
         if not rate:
             return Level.STALE, f"silent for {(now - track.last) / NS:.1f} s"
-        number = self._message(unit)
         words = f"{rate:.1f} Hz of {asked:g} asked for"
-        if rate < ENOUGH * asked:
-            said = vehicle.streams.answer_to(number) if number is not None else "not asked for"
-            return Level.WARN, f"{words}; request: {said}"
-        return Level.OK, words
+        return (Level.WARN, f"{words}; request: {answer}") if rate < ENOUGH * asked else (Level.OK, words)
 
     def _unit_values(self, unit: int, now: int) -> tuple[tuple[str, str], ...]:
         vehicle, number = self._vehicle, self._message(unit)
-        track = vehicle.units.get(unit)
+        track = vehicle.units.get(unit, UnitTrack())
         return (
             ("topic", self._topics[unit]),
             ("message", MESSAGES[number].name if number is not None else "none"),
-            ("rate (Hz)", f"{track.rate(now):.1f}" if track else "0.0"),
+            ("rate (Hz)", f"{track.rate(now):.1f}"),
             ("asked for (Hz)", f"{vehicle.settings.rate:g}"),
-            ("samples", str(track.received if track else 0)),
-            ("times repeated", str(track.repeated if track else 0)),
-            ("times impossible", str(track.impossible if track else 0)),
+            ("samples", str(track.received)),
+            ("times repeated", str(track.repeated)),
+            ("times impossible", str(track.impossible)),
         )
 
 

@@ -114,7 +114,6 @@ class Streams:
                 wanted.tries = 0
                 self._enqueue(number)
 
-    def answer_to(self, number: int) -> str:
+    def answer_to(self, number: int | None) -> str:
         """Return what the autopilot says to the request of a message."""
-        wanted = self._wanted.get(number)
-        return "not asked for" if wanted is None else wanted.answer
+        return self._wanted[number].answer if number in self._wanted else "not asked for"

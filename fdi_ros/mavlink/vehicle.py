@@ -484,7 +484,7 @@ class Vehicle:
             of = [message.unit] if message.unit >= 0 else list(self.units) or [0]
             if message.unit in self.magnetometers:
                 continue
-            found.append((number, min(self.units[k].rate(now) if k in self.units else 0.0 for k in of)))
+            found.append((number, min(self.units.get(k, UnitTrack()).rate(now) for k in of)))
         return found
 
     def send_text(self, severity: int, text: str) -> None:

@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from inspect import Parameter, Signature
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
@@ -49,14 +50,10 @@ def names() -> dict[str, dict[str, list[str]]]:
 class Given:
     """Stands for a class of launch or launch_ros: takes the parameters that the class takes, and keeps them."""
 
-    parameters: tuple[str, ...] = ()
-    keywords: frozenset[str] = frozenset()
+    signature: Signature
 
     def __init__(self, *arguments: object, **keywords: object) -> None:
-        name = type(self).__name__
-        assert len(arguments) <= len(self.parameters), f"{name}: {arguments}"
-        assert keywords.keys() <= self.keywords, f"{name} has no {keywords.keys() - self.keywords}"
-        self.given = dict(zip(self.parameters, arguments, strict=False)) | keywords
+        self.given = self.signature.bind_partial(*arguments, **keywords).arguments
 
     def perform(self, context: Context) -> str:
         return context.values[self.given["variable_name"]]
@@ -75,12 +72,15 @@ def load(names, monkeypatch):
     """Load a launch file, and run its function with the defaults and some other values: its nodes by name."""
     classes: dict[str, type[Given]] = {}
 
-    def stand_in(name: str) -> type[Given]:
+    def parameters_of(name: str) -> dict[str, None]:
         own = next(held[name] for held in names.values() if held.get(name))
         further = FORWARD.get(name, ("Action",)) if "kwargs" in own else ()
-        keywords = {*own, *(word for other in further for word in stand_in(other).keywords)}
-        made = type(name, (Given,), {"parameters": tuple(own), "keywords": frozenset(keywords) - {"kwargs"}})
-        return classes.setdefault(name, made)
+        every = dict.fromkeys([*own, *(word for other in further for word in parameters_of(other))])
+        return {word: None for word in every if word != "kwargs"}
+
+    def stand_in(name: str) -> type[Given]:
+        signature = Signature([Parameter(word, Parameter.POSITIONAL_OR_KEYWORD) for word in parameters_of(name)])
+        return classes.setdefault(name, type(name, (Given,), {"signature": signature}))
 
     for module, held in names.items():
         made = ModuleType(module)
