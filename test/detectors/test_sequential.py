@@ -19,7 +19,7 @@ from vehicles import vehicle
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Verdict
-from fdi_ros.detectors.case import SIZES, SMALLEST, STEP_LIMIT
+from fdi_ros.detectors.evidence import SIZES, SMALLEST, STEP_LIMIT
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output
