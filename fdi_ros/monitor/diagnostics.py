@@ -339,9 +339,10 @@ def _reach(detect: int, isolate: int, alive: int, undecided: bool) -> str:
         return "no further fault would be seen"
     if undecided:
         return "while it is undecided which is faulty, no further fault would be isolated"
-    seen = "any further fault would be seen" if detect == alive else f"a fault would be seen on {detect} of {alive}"
-    named = {0: "but not isolated", alive: "and isolated"}.get(isolate, f"and isolated on {isolate} of {alive}")
-    return f"{seen} {named}"
+    if isolate == alive:
+        return "a further fault would be isolated"
+    seen = "a further fault would be seen" if detect == alive else f"a fault would be seen on {detect} of {alive}"
+    return f"{seen} " + (f"and isolated on {isolate} of {alive}" if isolate else "but not isolated")
 
 
 def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:

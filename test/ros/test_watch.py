@@ -54,7 +54,7 @@ def picture() -> Picture:
     seen.update_channels(healthy)
     faulty = channel("imu_2.y", "FAULTY", Level.ERROR, WORDS, residual=-0.149, bias=0.0021, std=0.0003)
     seen.update_channels(healthy | {"imu_2.y": faulty})
-    seen.whole = whole("11 of 12 channels healthy; any further fault would be seen and isolated")
+    seen.whole = whole("11 of 12 channels healthy; a further fault would be isolated")
     seen.inputs = [StatusLine(Level.STALE, "imu_3", "silent for 1.2 s")]
     # Fresh, however long this machine takes to draw it.
     seen.heard = dict.fromkeys(("fused", "diagnostics"), math.inf)
