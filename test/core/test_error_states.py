@@ -208,6 +208,11 @@ def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None
     np.testing.assert_allclose(out, slope * (1e-9 * stamps[-1] - max(late, 0.0)), atol=1e-8)
 
 
+def test_no_two_kinds_share_a_signal() -> None:
+    signals = [signal for kind in ERROR_KINDS for signal in kind.signals]
+    assert sorted(signals) == list(range(SIGNALS))
+
+
 def test_a_hole_is_not_bridged() -> None:
     stamps = [*range(0, 300_000_000, 10_000_000), 390_000_000]
     *_, (found, out) = restamped((0.0, 0.025), ((stamp, np.arange(6.0), ALL) for stamp in stamps))
