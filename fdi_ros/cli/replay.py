@@ -64,9 +64,9 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
+    from fdi_ros.mavlink.failover import failover_text
     from fdi_ros.monitor.build import build_geometry
     from fdi_ros.replay.check import failures, parse_check
-    from fdi_ros.replay.failover import failover_text
     from fdi_ros.replay.page import Report
     from fdi_ros.replay.run import replay
     from fdi_ros.replay.summary import as_json

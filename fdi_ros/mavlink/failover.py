@@ -4,20 +4,23 @@
 """Failover of ArduPilot: what its parameters and the monitor say goes to the policy, and what that decides is done.
 
 INS_USE, INS_USE2, INS_USE3 outlive the autopilot's power, so what is out of use by our hand stands in a file. It is
-written right after the parameter is sent: the disk may take longer than the vehicle has.
+written right after the parameter is sent: the disk may take longer than the vehicle has. `failover_text` asks the same
+policy about a recorded flight.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.clock import NS
-from fdi_ros.mavlink.failover_policy import YOUNG, FailoverState, FailoverUnit, Known, decide, objection
+from fdi_ros.mavlink.clock import MS, NS
+from fdi_ros.mavlink.failover_policy import HEALED, YOUNG, FailoverState, FailoverUnit, Known, decide, objection
 from fdi_ros.mavlink.imu import ARDUPILOT
 from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
@@ -27,6 +30,10 @@ from fdi_ros.system import trusted_file
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
 """States of a channel that is not used at all; under doubt for a moment are also healthy ones."""
+_STEP = 20 * MS
+"""The policy is asked so often while a declaration is young, ns."""
+_BEFORE = NS + HEALED
+"""Time of the policy at the start of a recording, ns."""
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS
 """Parameters are read in turn so often, ns; what was said longer ago counts as not known."""
 SILENT, ABSENT = NS // 2, 5 * NS
@@ -245,3 +252,68 @@ class Failover:
         known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
         against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]
         return (Level.OK, name, "ready") if "" in against else (Level.WARN, name, f"no failover: {against[0]}")
+
+
+class DeclaredChange(Protocol):
+    """A change of state in a recording."""
+
+    @property
+    def at_s(self) -> float:
+        """Since the start of the recording, s."""
+
+    @property
+    def channel(self) -> str:
+        """Name of the channel."""
+
+    @property
+    def state(self) -> str:
+        """Its new state."""
+
+
+def failover_text(events: Sequence[DeclaredChange], channels: Sequence[str]) -> str:
+    """Say what failover would have done in a recorded flight: armed, all IMUs in use, parameters set at once.
+
+    Parameters
+    ----------
+    events
+        All changes of state of a recording, in order.
+    channels
+        Names of the channels, three for each IMU.
+
+    Returns
+    -------
+    One line; empty where failover would not run.
+    """
+    count = len(channels) // 3
+    if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:
+        return ""
+    declarations, states, state = Declarations(count), [float(ChannelState.UNCHECKED)] * len(channels), FailoverState()
+    use, done, waiting = [True] * count, [], deque(events)
+    for now in _policy_times(events):
+        # Between two changes the monitor was heard all the time.
+        declarations.heard = now - 1
+        while waiting and _policy_time(waiting[0]) <= now:
+            event = waiting.popleft()
+            states[channels.index(event.channel)] = float(ChannelState[event.state])
+        declarations.hear(states, now)
+        stale = [ChannelState.STALE in states[3 * k : 3 * k + 3] for k in range(count)]
+        units = tuple(FailoverUnit(use[k], now, *declarations.of(k), delivers=not stale[k]) for k in range(count))
+        state, actions = decide(state, Known(units, linked=True, armed=True, monitored=True), now)
+        for action in actions:
+            if action.kind == "set":
+                use[action.unit] = action.use
+            else:
+                words = TEXTS[action.kind][1] + action.why
+                done.append(f"{format_imu(action.unit, channels)} {words} at {(now - _BEFORE) / NS:.1f} s")
+    return f"failover, if armed: {'; '.join(done) or 'nothing to do'}"
+
+
+def _policy_time(event: DeclaredChange) -> int:
+    return _BEFORE + round(event.at_s * NS)
+
+
+def _policy_times(events: Sequence[DeclaredChange]) -> list[int]:
+    """Return when the policy is asked: at every change, and while what was declared is young, ns."""
+    declared = [_policy_time(event) for event in events if event.state == ChannelState.FAULTY.name]
+    young = (at + k * _STEP for at in declared for k in range(YOUNG // _STEP + 3))
+    return sorted({*map(_policy_time, events), *young})

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.failover import Failover
+from fdi_ros.mavlink.failover import Failover, failover_text
 from fdi_ros.mavlink.failover_policy import (
     HEALED,
     SETTLED,
@@ -24,7 +24,6 @@ from fdi_ros.mavlink.failover_policy import (
     decide,
     objection,
 )
-from fdi_ros.replay.failover import failover_text
 from fdi_ros.replay.summary import StateChange
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 from mavlink.conversation import Conversation

@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="the log is that of a node")
 
 from fdi_ros.monitor.output import ChannelState, Event, Reason
 from fdi_ros.monitor.status import ApartStatus
-from fdi_ros.ros.changes import QUIET, ChangeLog
+from fdi_ros.ros.running import QUIET, ChangeLog
 
 OK, UNCHECKED, SUSPECT = ChannelState.OK, ChannelState.UNCHECKED, ChannelState.SUSPECT
 AMBIGUOUS, FAULTY = ChannelState.AMBIGUOUS, ChannelState.FAULTY
