@@ -80,7 +80,7 @@ def main() -> None:
     lines = [
         "# Results",
         "",
-        "What follows *Settings from a recording* is made by `python docs/make_results.py`. Figures come from the seed",
+        "What follows *Settings from a recording* is made by `python docs/make_results.py`. Figures come from the seed "
         "of each study, shares are in percent; `--json` and `--report` of a study have more, with 95 % intervals.",
         "",
         f"fdi_ros {fdi_ros.__version__}, NumPy {np.__version__}, Python {platform.python_version()}.",
