@@ -3,7 +3,8 @@
 
 """What a verb is, and the arguments that several verbs take.
 
-This module, and each verb's own until the verb runs, import no NumPy and no Numba: help and usage errors come at once.
+This module, and each verb's own until the verb runs, import no NumPy and no Numba: usage errors come at once, and help
+without the compiler.
 """
 
 from __future__ import annotations
@@ -14,18 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fdi_ros.detectors import DETECTORS
 from fdi_ros.system.installation import resolve, shipped_files
-
-DETECTORS = (
-    *("sequential", "likelihood_ratio", "cusum", "guaranteed", "recursive", "projector", "determinant"),
-    *("max_residual", "rate_deviation", "mean_square_residual", "mean_abs_residual"),
-)
-"""Names of the detectors, as the registry has them: the one that flies first."""
-FAULT_KINDS = (
-    *("bias", "drift", "scale", "stuck", "dropout", "intermittent", "noise", "spike", "saturation", "sign", "delay"),
-    *("oscillation", "triad_loss"),
-)
-"""Kinds of faults, as the registry has them."""
 
 
 class Verb(NamedTuple):
@@ -67,20 +58,28 @@ def add_part(parser: ArgumentParser) -> None:
 
 
 def add_fault(parser: ArgumentParser, meaning: str) -> None:
-    """Take faults."""
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="'KEY=VALUE ...'",
-        help=f"{meaning}; kinds: {', '.join(FAULT_KINDS)}",
-    )
+    """Take faults; their kinds, which need NumPy, are looked up when the help is printed."""
+    added = parser.add_argument("--fault", action="append", default=[], metavar="'KEY=VALUE ...'")
+    added.help = f"{meaning}; kinds: %(kinds)s"
+    vars(added)["kinds"] = _FaultKinds()
+
+
+class _FaultKinds:
+    def __str__(self) -> str:
+        from fdi_ros.faults.kinds import FAULT_KINDS
+
+        return ", ".join(FAULT_KINDS)
+
+
+def detector_names() -> str:
+    """List the detectors for a help, the one that flies first."""
+    return ", ".join(reversed(DETECTORS))
 
 
 def add_detector(parser: ArgumentParser) -> None:
     """Take a detector."""
     parser.add_argument(
-        "--detector", metavar="NAME", help=f"use this detector instead of the configured one: {', '.join(DETECTORS)}"
+        "--detector", metavar="NAME", help=f"use this detector instead of the configured one: {detector_names()}"
     )
 
 

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from fdi_ros import __version__
-from fdi_ros.cli.arguments import DETECTORS
 from fdi_ros.cli.compile import COMPILE
 from fdi_ros.cli.fleet import FLEET
 from fdi_ros.cli.montecarlo import MONTECARLO
@@ -34,6 +33,7 @@ from fdi_ros.cli.settings import GEOMETRY, SHIPPED
 from fdi_ros.cli.signals import STOPPED, Stop, heeded
 from fdi_ros.cli.sweep import SWEEP
 from fdi_ros.cli.watch import WATCH
+from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.system.installation import PROGRESS, require, resolve, there
 from fdi_ros.system.limits import LINE

@@ -8,7 +8,8 @@ from __future__ import annotations
 import time
 from argparse import ArgumentParser, Namespace
 
-from fdi_ros.cli.arguments import DETECTORS, Verb, add_results
+from fdi_ros.cli.arguments import Verb, add_results, detector_names
+from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
 
 
@@ -17,7 +18,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
         "--detector",
         nargs="+",
         metavar="NAME",
-        help=f"for these detectors; default: for all: {', '.join(DETECTORS)}",
+        help=f"for these detectors; default: for all: {detector_names()}",
     )
     add_results(parser)
 
@@ -27,7 +28,6 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.cli.ahead import bar_of, compile_now
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.compiling.compiled import INTERPRETED, folder
-    from fdi_ros.detectors import DETECTORS, detector_class
 
     if INTERPRETED:
         raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")

@@ -23,6 +23,7 @@ from fdi_ros.cli.arguments import (
     add_report,
     add_results,
 )
+from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.installation import BAGS, WORKERS, resolve
 
@@ -96,7 +97,6 @@ def _plan(arguments: Namespace) -> Plan:
 def _configs(arguments: Namespace) -> dict[str, Config]:
     """Return the configs to be tried by name: the one given, and those to compare it with."""
     from fdi_ros.config.config import Config
-    from fdi_ros.detectors import DETECTORS
     from fdi_ros.monitor.build import build_geometry
 
     own = Config.from_file(arguments.config)

@@ -147,7 +147,7 @@ class Config:
     @property
     def has_units(self) -> bool:
         """Whether three-axis units arrive, each on a topic of its own, with the settings of ``imus``."""
-        return INPUTS[self.input] == "imus"
+        return INPUTS[self.input].section == "imus"
 
     @property
     def imu_names(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
 
@@ -171,9 +171,18 @@ _PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}
 _PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}
 """One value per triad, or none."""
 
-INPUTS = {"channels": "channels", "imus": "imus"}
-"""Kinds of input, each with the section of its settings: ``channels`` for messages of all channels, ``imus`` for
-messages of three-axis units. How each is read: `fdi_ros.sources`."""
+
+class Input(NamedTuple):
+    """One kind of input."""
+
+    section: str
+    """Of its settings: ``channels`` for messages of all channels, ``imus`` for messages of three-axis units."""
+    source: str
+    """Module in `fdi_ros.sources`, and class there, that reads it."""
+
+
+INPUTS = {"channels": Input("channels", "channels:ChannelsSource"), "imus": Input("imus", "imus:ImuSource")}
+"""Kinds of input by the value of the parameter ``input``."""
 
 
 @dataclass(frozen=True)

@@ -1,36 +1,37 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which channels disagree: one file per method of a paper, one line per method in the registry."""
+"""Which channels disagree: one file per method of a paper, one row per method in `DETECTORS`.
+
+The table names classes without importing them: help and completion need the names alone, a monitor one class.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import pkgutil
+from typing import TYPE_CHECKING, Any
 
-from fdi_ros.detectors.base import Detector, Verdict, accepted_options
-from fdi_ros.detectors.papers.cusum import Cusum
-from fdi_ros.detectors.papers.guaranteed import Guaranteed
-from fdi_ros.detectors.papers.identification import Determinant, Projector, Recursive
-from fdi_ros.detectors.papers.likelihood_ratio import LikelihoodRatio
-from fdi_ros.detectors.papers.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
-from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.errors import DetectorError
-from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
 
-DETECTORS: dict[str, type[Detector]] = {
-    "mean_abs_residual": MeanAbsResidual,
-    "mean_square_residual": MeanSquareResidual,
-    "rate_deviation": RateDeviation,
-    "max_residual": MaxResidual,
-    "projector": Projector,
-    "recursive": Recursive,
-    "determinant": Determinant,
-    "guaranteed": Guaranteed,
-    "likelihood_ratio": LikelihoodRatio,
-    "cusum": Cusum,
-    "sequential": Sequential,
+if TYPE_CHECKING:
+    from fdi_ros.detectors.base import Detector
+    from fdi_ros.model.geometry import Geometry
+    from fdi_ros.model.noise import NoiseModel
+
+DETECTORS = {
+    "mean_abs_residual": "papers.residual_search:MeanAbsResidual",
+    "mean_square_residual": "papers.residual_search:MeanSquareResidual",
+    "rate_deviation": "papers.residual_search:RateDeviation",
+    "max_residual": "papers.residual_search:MaxResidual",
+    "projector": "papers.identification:Projector",
+    "recursive": "papers.identification:Recursive",
+    "determinant": "papers.identification:Determinant",
+    "guaranteed": "papers.guaranteed:Guaranteed",
+    "likelihood_ratio": "papers.likelihood_ratio:LikelihoodRatio",
+    "cusum": "papers.cusum:Cusum",
+    "sequential": "sequential:Sequential",
 }
+"""Modules, in this package, and classes of the detectors by name; the one that flies last."""
 
 
 def detector_class(name: str) -> type[Detector]:
@@ -43,7 +44,8 @@ def detector_class(name: str) -> type[Detector]:
     """
     if name not in DETECTORS:
         raise DetectorError(f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}")
-    return DETECTORS[name]
+    found: type[Detector] = pkgutil.resolve_name(f"{__name__}.{DETECTORS[name]}")
+    return found
 
 
 def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options: Any) -> Detector:
@@ -67,12 +69,11 @@ def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options:
     ConfigError
         If an option is out of its range.
     """
+    from fdi_ros.detectors.base import accepted_options
+
     method = detector_class(name)
     for option in options:
         if option not in accepted_options(method):
             known = ", ".join(accepted_options(method)) or "none"
             raise DetectorError(f"detector {name} has no option {option!r}, expected one of: {known}")
     return method(geometry, noise, **options)
-
-
-__all__ = ["DETECTORS", "Detector", "Verdict", "accepted_options", "create_detector", "detector_class"]

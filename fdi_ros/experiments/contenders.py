@@ -27,8 +27,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
-from fdi_ros.detectors.base import Verdict
+from fdi_ros.detectors import DETECTORS, create_detector, detector_class
+from fdi_ros.detectors.base import Detector, Verdict, accepted_options
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
@@ -87,7 +87,7 @@ NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
 
 Method = Detector | ChiSquare
 
-METHODS: dict[str, Any] = {**DETECTORS, ChiSquare.name: ChiSquare}
+METHODS: dict[str, Any] = {**{name: detector_class(name) for name in DETECTORS}, ChiSquare.name: ChiSquare}
 """All that a study can compare."""
 
 

@@ -3,10 +3,10 @@
 
 """Kinds of faults: one class each, with the numbers it takes and what it does to the channels it strikes.
 
-A new kind is a class here, listed in `FAULT_KINDS`. The first line of its docstring says what it does. Options are
-fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`, or, where it
-depends on the samples before or on chance, in `FaultKind.strike`. A random kind draws one number per active sample and
-channel, so that the cut of a stream into blocks changes no draw.
+A new kind is a class here: its name makes it one of `FAULT_KINDS`. The first line of its docstring says what it does.
+Options are fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`,
+or, where it depends on the samples before or on chance, in `FaultKind.strike`. A random kind draws one number per
+active sample and channel, so that the cut of a stream into blocks changes no draw.
 """
 
 from __future__ import annotations
@@ -41,6 +41,10 @@ Memory = dict[str, Any]
 """What a fault keeps of the samples before; empty at the start of a stream."""
 
 
+FAULT_KINDS: dict[str, type[FaultKind]] = {}
+"""Every kind of fault by name."""
+
+
 class FaultKind(ABC):
     """One kind of fault with its options, validated; a frozen dataclass.
 
@@ -55,6 +59,10 @@ class FaultKind(ABC):
     """Size in simulated flights unless they set one: well above the noise, well below what needs no monitor."""
     whole_unit: ClassVar[bool] = False
     """Whether it strikes the three channels of a unit, and nothing less."""
+
+    def __init_subclass__(cls) -> None:
+        if "name" in vars(cls):
+            FAULT_KINDS[cls.name] = cls
 
     def __post_init__(self) -> None:
         for name, option in self.options().items():
@@ -285,24 +293,3 @@ class TriadLoss(FaultKind):
     def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Do as a dropout with missing=1."""
         Dropout(missing=1).strike(samples, memory, random)
-
-
-FAULT_KINDS: dict[str, type[FaultKind]] = {
-    kind.name: kind
-    for kind in (
-        Bias,
-        Drift,
-        Scale,
-        Stuck,
-        Dropout,
-        Intermittent,
-        Noise,
-        Spike,
-        Saturation,
-        Sign,
-        Delay,
-        Oscillation,
-        TriadLoss,
-    )
-}
-"""Every kind of fault by name."""

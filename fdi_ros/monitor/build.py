@@ -20,7 +20,8 @@ from fdi_ros.core.decision import RETURN_MEAN
 from fdi_ros.core.records import Core
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import mask_of, whole_set
-from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
+from fdi_ros.detectors import create_detector, detector_class
+from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

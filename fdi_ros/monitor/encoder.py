@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,9 +14,10 @@ from fdi_ros.core.messages import LAST_STAMP, ChannelsTemplate, ImuTemplate, fil
 from fdi_ros.monitor.diagnostics import StatusLine
 from fdi_ros.monitor.output import Output
 
+Template = ImuTemplate | ChannelsTemplate
 
-@dataclass(frozen=True)
-class OutputTopic:
+
+class Topic(NamedTuple):
     """One topic that a monitor publishes."""
 
     name: str
@@ -25,17 +26,56 @@ class OutputTopic:
     """Of its messages: ``sensor_msgs/msg/Imu``."""
 
 
-FUSED = OutputTopic("fused", "sensor_msgs/msg/Imu")
-INTEGRITY = OutputTopic("~/integrity", "std_msgs/msg/Float64MultiArray")
-DIAGNOSTICS = OutputTopic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-OUTPUTS = (FUSED, INTEGRITY, DIAGNOSTICS)
-"""All that a node publishes and an output bag holds."""
+@dataclass(frozen=True, eq=False)
+class SampleOutput:
+    """What is said of each sample on a topic of its own."""
+
+    topic: Topic
+    make: Callable[[str, int], Template]
+    """Makes a message to be filled, from the frame_id of the rate and the number of channels n."""
+    fill: Callable[[Template, Any, int, int], None]
+    """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
+    needs_rate: bool = False
+    """Whether it is of samples with a fused rate alone."""
+    on_demand: bool = False
+    """Whether the node leaves it out while nobody subscribes."""
+    by_path: bool = False
+    """Whether the live sample path fills it, by the same function."""
+
+
+def _fill_fused(out: Template, row: Any, n: int, shift: int) -> None:
+    fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"])
+
+
+def _fill_integrity(out: Template, row: Any, n: int, shift: int) -> None:
+    fill_integrity(out.bytes, out.at, row, n)
+
+
+FUSED = SampleOutput(
+    Topic("fused", "sensor_msgs/msg/Imu"),
+    lambda frame_id, n: ImuTemplate(frame_id),
+    _fill_fused,
+    needs_rate=True,
+    by_path=True,
+)
+"""Fused rate and its covariance."""
+INTEGRITY = SampleOutput(
+    Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
+    lambda frame_id, n: ChannelsTemplate(n + 5),
+    _fill_integrity,
+    on_demand=True,
+    by_path=True,
+)
+"""Statistic, threshold, states of the channels, protection level."""
+OUTPUTS = (FUSED, INTEGRITY)
+"""All that is said of samples, live and in an output bag."""
+DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 
 class Message(NamedTuple):
     """One message to be published or recorded."""
 
-    topic: OutputTopic
+    topic: Topic
     stamp: int
     """Of what it is about, ns."""
     data: bytes
@@ -44,8 +84,6 @@ class Message(NamedTuple):
 
 class Encoder:
     """Makes messages of the output of a monitor.
-
-    Live, compiled code fills `fused` and `integrity` in place by the same functions that are used here.
 
     Parameters
     ----------
@@ -57,32 +95,27 @@ class Encoder:
 
     def __init__(self, frame_id: str, n: int) -> None:
         self.n = n
-        self.fused = ImuTemplate(frame_id)
-        """Fused rate and its covariance."""
-        self.integrity = ChannelsTemplate(n + 5)
-        """Statistic, threshold, states of the channels, protection level."""
+        self.templates = {output: output.make(frame_id, n) for output in OUTPUTS}
 
-    def fill_integrity(self, row: Any) -> None:
-        """Write the integrity of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
-        fill_integrity(self.integrity.bytes, self.integrity.at, row, self.n)
+    def fill(self, output: SampleOutput, row: Any, shift: int = 0) -> None:
+        """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
+        output.fill(self.templates[output], row, self.n, shift)
 
-    def encode(self, output: Output, shift: int = 0) -> Iterator[Message]:
-        """Encode what is said of samples: of each its fused rate, if there is one, and its integrity.
+    def encode(self, results: Output, shift: int = 0) -> Iterator[Message]:
+        """Encode what is said of samples: of each its fused rate, if there is one, and all else.
 
         Parameters
         ----------
-        output
+        results
             Of the samples.
         shift
             To be taken off their stamps to have those of the messages, ns.
         """
-        for row in output.rows:
-            stamp = int(row["stamp"])
-            if row["valid"]:
-                fill_imu(self.fused.bytes, self.fused.at, int(row["instant"]) - shift, row["rate"], row["covariance"])
-                yield Message(FUSED, stamp, self.fused.bytes.tobytes())
-            self.fill_integrity(row)
-            yield Message(INTEGRITY, stamp, self.integrity.bytes.tobytes())
+        for row in results.rows:
+            for output, template in self.templates.items():
+                if row["valid"] or not output.needs_rate:
+                    self.fill(output, row, shift)
+                    yield Message(output.topic, int(row["stamp"]), template.bytes.tobytes())
 
 
 def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> Message:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.encoder import Encoder
+from fdi_ros.monitor.encoder import FUSED, INTEGRITY, Encoder, SampleOutput
 from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import SOURCES, Source, source_of
@@ -136,9 +136,10 @@ class Receiver:
         """Why the last malformed message of each topic was refused."""
         self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
-        self.fused, self.integrity = self.encoder.fused.bytes, self.encoder.integrity.bytes
-        """Bytes of the messages to be published about the last sample."""
-        self.live["fused_at"], self.live["integrity_at"] = self.encoder.fused.at, self.encoder.integrity.at
+        self.messages = {output: template.bytes for output, template in self.encoder.templates.items()}
+        """Bytes of what is to be published about the last sample."""
+        fused, integrity = self.encoder.templates[FUSED], self.encoder.templates[INTEGRITY]
+        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
         self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         pipeline.prepare()
@@ -149,11 +150,18 @@ class Receiver:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
         pipeline, detector = self.pipeline, self.pipeline.detector
         self._detector = detector
-        self._records = (
-            *pipeline.path,
-            *(self.aligner, self.live, self._events, self.fused, self.integrity),
-        )
+        messages = self.messages[FUSED], self.messages[INTEGRITY]
+        self._records = (*pipeline.path, *(self.aligner, self.live, self._events), *messages)
         self._process: Callable[[], int] = partial(process, *self._records)
+        if others := [output for output in self.messages if not output.by_path]:
+            self._process = partial(self._process_and_fill, self._process, others)
+
+    def _process_and_fill(self, compiled: Callable[[], int], others: Sequence[SampleOutput]) -> int:
+        """Work a sample, and fill the messages that compiled code does not."""
+        flags = compiled()
+        for output in others:
+            self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
+        return flags
 
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take a message of an input topic; stamp: when it arrived, ns; 0: not known."""
@@ -172,7 +180,7 @@ class Receiver:
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
         self.pipeline.supply()
-        self.encoder.fill_integrity(self.pipeline.core[0]["last"])
+        self.encoder.fill(INTEGRITY, self.pipeline.core[0]["last"])
 
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""
@@ -223,7 +231,7 @@ class Receiver:
         with reported("the way from message to message"):
             kind.take(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
             process(*aside)
-            self.encoder.fill_integrity(aside[0][0]["last"])
+            self.encoder.fill(INTEGRITY, aside[0][0]["last"])
             is_live(self.aligner[0], 0)
             are_parted(self.aligner[0])
             clear_declarations(aside[0])

@@ -157,7 +157,10 @@ class OutputBag(Sink):
         source = source_of(self._config)
         names = [name if name.startswith("/") else f"/{name}" for name in source.topics]
         self._inputs = [self._topic(name, source.type) for name in names]
-        self._outputs = {topic: self._topic(_full_name(topic.name), topic.type) for topic in OUTPUTS}
+        self._outputs = {
+            topic: self._topic(_full_name(topic.name), topic.type)
+            for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
+        }
         return self
 
     def __exit__(

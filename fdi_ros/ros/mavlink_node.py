@@ -133,8 +133,9 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         path = Path(params["failover_file"] or home / name)
         if not params["failover_file"]:
             home.mkdir(parents=True, exist_ok=True)
-        declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
-        heard = self.create_subscription(message_class(INTEGRITY.type), declarations, self._on_integrity, 10, raw=True)
+        declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
+        kind = message_class(INTEGRITY.topic.type)
+        heard = self.create_subscription(kind, declarations, self._on_integrity, 10, raw=True)
         self._sole = [heard.topic_name, *(output.topic_name for output in self._outputs)]
         """Topics that must have one publisher: names as they are after remapping."""
         self.create_service(Trigger, "~/restore", self._on_restore)

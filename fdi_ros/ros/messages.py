@@ -16,9 +16,10 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from fdi_ros.core.path import HAS_RATE, WORKED
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, encode_diagnostics
+from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, encode_diagnostics
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -30,7 +31,7 @@ DEPTH = 256
 drops some."""
 REPORT_PERIOD = 1.0
 """From one regular report of a node to the next, s."""
-OVERRIDABLE = (FUSED.name, INTEGRITY.name)
+OVERRIDABLE = tuple(output.topic.name for output in OUTPUTS)
 """Topics whose QoS may be overridden."""
 
 
@@ -53,19 +54,23 @@ class Publishers:
     def __init__(self, node: Node) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
         self._node = node
-        self.fused, self.integrity = (
-            node.create_publisher(
-                message_class(topic.type), topic.name, output_qos(), qos_overriding_options=overriding
+        self._of_samples = {
+            output: node.create_publisher(
+                message_class(output.topic.type), output.topic.name, output_qos(), qos_overriding_options=overriding
             )
-            for topic in (FUSED, INTEGRITY)
-        )
+            for output in OUTPUTS
+        }
         self.diagnostics = diagnostics_publisher(node)
-        self.has_integrity_subscriber = False
-        """Whether there was a subscriber to the integrity at the last check: if not, it is not published."""
+        self.count_subscribers()
 
     def count_subscribers(self) -> None:
-        """Check whether there are subscribers."""
-        self.has_integrity_subscriber = self.integrity.get_subscription_count() > 0
+        """Check which outputs are wanted: with a subscriber, or published whether there is one or not."""
+        self.wanted = [
+            (HAS_RATE if output.needs_rate else WORKED, output, publisher)
+            for output, publisher in self._of_samples.items()
+            if not output.on_demand or publisher.get_subscription_count() > 0
+        ]
+        """Each with the flag of the samples that it is published of."""
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
         """Publish diagnostics at the clock time now, ns."""
@@ -73,7 +78,7 @@ class Publishers:
 
     def destroy(self) -> None:
         """Take the topics down."""
-        for publisher in (self.fused, self.integrity, self.diagnostics):
+        for publisher in (*self._of_samples.values(), self.diagnostics):
             self._node.destroy_publisher(publisher)
 
 

@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.path import HAS_EVENTS, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe, format_apart
 from fdi_ros.monitor.output import ChannelState, Event, Events, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
@@ -352,11 +352,10 @@ class Running:
         while result:
             if result & SUPPLY:
                 receiver.supply()
-            if result & HAS_RATE:
-                publishers.fused.publish(receiver.fused.tobytes())
+            for flag, output, publisher in publishers.wanted:
+                if result & flag:
+                    publisher.publish(receiver.messages[output].tobytes())
             if result & WORKED:
-                if publishers.has_integrity_subscriber:
-                    publishers.integrity.publish(receiver.integrity.tobytes())
                 self._latencies.append(time.perf_counter_ns() - begun)
             if result & HAS_EVENTS:
                 self.supervisor.report_events(receiver.events)

@@ -24,7 +24,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import Array
-from fdi_ros.monitor.encoder import OUTPUTS
+from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.agreement import LEAST_ROTATION
@@ -112,7 +112,7 @@ def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
 
 _CLOCKS = 1.0
 """s by which clocks differ: less may be the time that messages take."""
-_OF_A_MONITOR = {output.name.rpartition("/")[2] for output in OUTPUTS}
+_OF_A_MONITOR = {topic.name.rpartition("/")[2] for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)}
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 """Kinds of input, first those with stamps."""
 NEEDED = ", or ".join(kind.needed() for kind in _PREFERRED)

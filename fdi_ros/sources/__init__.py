@@ -1,20 +1,20 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What arrives: one kind of input a file, one line a registry entry."""
+"""What arrives: one kind of input a file, named in a row of `fdi_ros.config.settings.INPUTS`."""
 
 from __future__ import annotations
 
+import pkgutil
+
 from fdi_ros.config.config import Config
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.config.settings import INPUTS
 from fdi_ros.sources.source import Source
 
 SOURCES: dict[str, type[Source]] = {
-    "channels": ChannelsSource,
-    "imus": ImuSource,
+    name: pkgutil.resolve_name(f"{__name__}.{row.source}") for name, row in INPUTS.items()
 }
-"""By the value of the parameter ``input``; the settings that each reads: `fdi_ros.config.settings.INPUTS`."""
+"""By the value of the parameter ``input``."""
 
 
 def source_of(config: Config) -> Source:

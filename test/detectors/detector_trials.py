@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors import DETECTORS, Detector
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.detectors.base import Detector
 
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in sorted(DETECTORS)),

@@ -5,9 +5,11 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from faults.examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,21 +20,7 @@ from fdi_ros.model.samples import Block
 
 NAMES = ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x", "imu_2.y", "imu_2.z")
 RATE = 100.0
-EXAMPLES = {
-    "bias": "channel=imu_2.y kind=bias size=0.2 start=1 stop=3",
-    "drift": "channel=imu_2.y kind=drift size=0.05 start=1 stop=3",
-    "scale": "channel=imu_2.y kind=scale size=0.3 start=1 stop=3",
-    "stuck": "channel=imu_2.y kind=stuck start=1 stop=3",
-    "dropout": "channel=imu_2.y kind=dropout start=1 stop=3",
-    "intermittent": "channel=imu_2.y kind=intermittent size=0.2 period=0.3 duty=0.4 start=1 stop=3",
-    "noise": "channel=imu_2.y kind=noise size=0.1 start=1 stop=3",
-    "spike": "channel=imu_2.y kind=spike size=0.5 rate=20 start=1 stop=3",
-    "saturation": "channel=imu_2.y kind=saturation size=0.4 start=1 stop=3",
-    "sign": "channel=imu_2.y kind=sign start=1 stop=3",
-    "delay": "channel=imu_2.y kind=delay size=7 start=1 stop=3",
-    "oscillation": "channel=imu_2.y kind=oscillation size=0.2 frequency=3 start=1 stop=3",
-    "triad_loss": "channel=imu_2 kind=triad_loss start=1 stop=3",
-}
+EXAMPLES = examples("imu_2.y", "imu_2", 1.0, 3.0)
 
 
 def stream(rows=500, seed=0):
@@ -41,8 +29,8 @@ def stream(rows=500, seed=0):
     return Block(stamp, random.normal(0, 1, (rows, 6)))
 
 
-def inject(text, block):
-    injector = Injector([parse_fault(text)], NAMES)
+def inject(fault, block):
+    injector = Injector([parse_fault(fault) if isinstance(fault, str) else fault], NAMES)
     return injector.apply(block), injector
 
 
@@ -62,7 +50,7 @@ def test_ground_truth_covers_all_that_is_changed(kind):
         changed |= ~faulty.received
     assert not changed[~struck].any()
     assert changed[struck].any()
-    columns = [3, 4, 5] if kind == "triad_loss" else [4]
+    columns = [3, 4, 5] if FAULT_KINDS[kind].whole_unit else [4]
     _, active = during(block)
     np.testing.assert_array_equal(struck[:, columns], np.repeat(active[:, None], len(columns), axis=1))
 
@@ -70,19 +58,20 @@ def test_ground_truth_covers_all_that_is_changed(kind):
 def test_each_kind_does_what_it_says():
     block = stream()
     time, active = during(block)
-    true = block.z[active, 4]
-    since = time[active] - 1
+    true, since = block.z[active, 4], time[active] - 1
+    kinds = {name: fault.kind for name, fault in EXAMPLES.items()}
+    rest = np.mod(since, kinds["intermittent"].period) / kinds["intermittent"].period
     expected = {
-        "bias": true + 0.2,
-        "drift": true + 0.05 * since,
-        "scale": true * 1.3,
+        "bias": true + kinds["bias"].size,
+        "drift": true + kinds["drift"].size * since,
+        "scale": true * (1 + kinds["scale"].size),
         "stuck": np.full(len(true), block.z[~active & (time < 1), 4][-1]),
         "dropout": np.full(len(true), np.nan),
-        "intermittent": true + 0.2 * (np.mod(since, 0.3) < 0.4 * 0.3),
-        "saturation": np.clip(true, -0.4, 0.4),
+        "intermittent": true + kinds["intermittent"].size * (rest < kinds["intermittent"].duty),
+        "saturation": np.clip(true, -kinds["saturation"].size, kinds["saturation"].size),
         "sign": -true,
-        "delay": block.z[np.flatnonzero(active) - 7, 4],
-        "oscillation": true + 0.2 * np.sin(2 * np.pi * 3 * since),
+        "delay": block.z[np.flatnonzero(active) - kinds["delay"].size, 4],
+        "oscillation": true + kinds["oscillation"].size * np.sin(2 * np.pi * kinds["oscillation"].frequency * since),
     }
     for kind, values in expected.items():
         faulty, _ = inject(EXAMPLES[kind], block)
@@ -104,8 +93,8 @@ def test_random_kinds_have_the_stated_strength():
 
 def test_seed_gives_the_same_faults_and_another_seed_others():
     block = stream()
-    text = EXAMPLES["noise"]
-    first, again, other = (inject(t, block)[0].z for t in (text, text, f"{text} seed=1"))
+    fault = EXAMPLES["noise"]
+    first, again, other = (inject(one, block)[0].z for one in (fault, fault, replace(fault, seed=2)))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
@@ -120,7 +109,7 @@ def test_missing_is_not_delivered_and_nan_is():
     block = stream()
     _, active = during(block)
     assert inject(EXAMPLES["dropout"], block)[0].received is None
-    missing = inject(EXAMPLES["dropout"] + " missing=1", block)[0]
+    missing = inject(f"{EXAMPLES['dropout']}".replace("missing=0", "missing=1"), block)[0]
     np.testing.assert_array_equal(missing.received[:, 4], ~active)
     lost = inject(EXAMPLES["triad_loss"], block)[0]
     np.testing.assert_array_equal(lost.received[:, 3:], np.repeat(~active[:, None], 3, axis=1))
@@ -144,7 +133,7 @@ def test_several_faults_at_once_act_one_after_the_other():
 def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
     block = stream(400)
     block.z[50:60, 4] = np.nan
-    faults = [parse_fault(EXAMPLES[kind]) for kind in kinds]
+    faults = [EXAMPLES[kind] for kind in kinds]
     whole = Injector(faults, NAMES).apply(block)
     edges = list(range(401)) if one_by_one else sorted({0, 400, *cuts})
     injector = Injector(faults, NAMES)
@@ -157,8 +146,7 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_says_itself_in_words_that_read_back(kind):
-    fault = parse_fault(EXAMPLES[kind])
-    assert parse_fault(str(fault)) == fault
+    assert parse_fault(str(EXAMPLES[kind])) == EXAMPLES[kind]
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,15 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from bag.recordings import ARRAY
 from monitor.streams import SIGMA, START, config, parallel, stream, struck
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor import encoder
+from fdi_ros.monitor.encoder import FUSED, INTEGRITY, Encoder, SampleOutput, Topic
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
@@ -36,9 +39,9 @@ class Ear:
             if flags & SUPPLY:
                 self.receiver.supply()
             if flags & HAS_RATE:
-                self.fused.append(self.receiver.fused.tobytes())
+                self.fused.append(self.receiver.messages[FUSED].tobytes())
             if flags & WORKED:
-                self.integrity.append(self.receiver.integrity.tobytes())
+                self.integrity.append(self.receiver.messages[INTEGRITY].tobytes())
             if flags & HAS_EVENTS:
                 self.events += self.receiver.events
             if flags & MALFORMED:
@@ -55,6 +58,27 @@ def messages(block, units):
     for stamp, row in zip(block.stamp.tolist(), block.z.reshape(len(block), units, 3).tolist(), strict=True):
         for unit in range(units):
             yield unit, template.fill(stamp + unit * 500_000, row[unit], (0.0,) * 9)
+
+
+def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch):
+    def fill(out, row, n, shift):
+        out.fill([row["statistic"], int(row["stamp"]) - shift])
+
+    ratio = SampleOutput(Topic("~/more", ARRAY), lambda frame_id, n: ChannelsTemplate(2), fill)
+    monkeypatch.setattr(encoder, "OUTPUTS", (*encoder.OUTPUTS, ratio))
+    pipeline = Pipeline(parallel(2))
+    block, ear, live = stream(pipeline.geometry, 40), Ear(pipeline), []
+    for unit, data in messages(block, 2):
+        samples = len(ear.integrity)
+        ear.take(unit, data)
+        if len(ear.integrity) > samples:
+            live.append(ear.receiver.messages[ratio].tobytes())
+    results = Pipeline(parallel(2)).process(block)
+    written = [said.data for said in Encoder("body", 6).encode(results) if said.topic is ratio.topic]
+    assert len(live) >= 38
+    stamps = [float(stamp) for stamp in block.stamp]
+    assert [ChannelsSource.parse(data, 2)[1][1] for data in written] == stamps
+    assert {ChannelsSource.parse(data, 2)[1][1] for data in live} <= set(stamps)
 
 
 @pytest.mark.parametrize("units", [2, 3, 4])

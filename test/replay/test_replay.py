@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from bag import recordings
 from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
+from faults.examples import SCENARIO, examples
 
 from fdi_ros.bag import samples as samples_module
 from fdi_ros.config.config import Config
@@ -27,21 +28,6 @@ from fdi_ros.replay.run import Request, Sink, replay
 from fdi_ros.replay.words import noisy_lines, sentences, verdict
 from fdi_ros.report.verdict import Severity
 
-FAULTS = {
-    "bias": "channel=g5 kind=bias size=0.2",
-    "drift": "channel=g5 kind=drift size=0.2",
-    "scale": "channel=g5 kind=scale size=0.5",
-    "stuck": "channel=g5 kind=stuck size=0.3",
-    "dropout": "channel=g5 kind=dropout",
-    "intermittent": "channel=g5 kind=intermittent size=0.2 period=0.4",
-    "noise": "channel=g5 kind=noise size=0.3",
-    "spike": "channel=g5 kind=spike size=0.5 rate=60",
-    "saturation": "channel=g5 kind=saturation size=0.05",
-    "sign": "channel=g5 kind=sign",
-    "delay": "channel=g5 kind=delay size=40",
-    "oscillation": "channel=g5 kind=oscillation size=0.2 frequency=4",
-    "triad_loss": "channel=g4,g5,g6 kind=triad_loss",
-}
 FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0
 """In this part of the bundled flight every channel moves."""
 UNCALIBRATED = {
@@ -86,7 +72,7 @@ def sound(root, flight):
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound):
-    fault = parse_fault(f"{FAULTS[kind]} start={BEGIN} stop={STOP} seed=3")
+    fault = examples("g5", "g4,g5,g6", BEGIN, STOP)[kind]
     config, faulty = cone(root, **UNCALIBRATED), Keep()
     summary = replay(Request(flight, config, (fault,), start=FIRST, end=END), [faulty])
     stamp = faulty.stacked("stamp")
@@ -113,7 +99,7 @@ def check(found, fault):
 
 
 def test_every_detector_is_scored_on_every_kind(root, flight):
-    faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
+    faults = load_scenario(SCENARIO)
     assert {fault.kind.name for fault in faults} == set(FAULT_KINDS)
     assert max(fault.stop for fault in faults) < 60.0, "the flight ends before"
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
@@ -163,7 +149,7 @@ def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
 
 def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
-    request = Request(flight, config, load_scenario(root / "config" / "scenarios" / "every_kind.yaml"))
+    request = Request(flight, config, load_scenario(SCENARIO))
     results = []
     for together in (50, 777, 16384):
         monkeypatch.setattr(samples_module, "_TOGETHER", together)

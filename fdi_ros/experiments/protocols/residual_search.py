@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors import DETECTORS, create_detector
+from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.experiments.contenders import (
     BOUND,
@@ -185,7 +185,7 @@ class ResidualSearch(TrialProtocol[Cell]):
         return {
             name: create_detector(name, self._geometry, self._noise, tolerance="paper")
             for name in self._contenders.running
-            if "tolerance" in accepted_options(DETECTORS[name])
+            if "tolerance" in accepted_options(detector_class(name))
         }
 
     def _draw(self, rng: np.random.Generator, count: int, selection: str, rate: Array | None = None) -> Trials:
