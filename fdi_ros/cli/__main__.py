@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 
-from fdi_ros.cli.signals import STOPPED, heeded
+from fdi_ros.cli import STOPPED, heeded
 
 
 def fdi() -> int:

@@ -9,7 +9,6 @@ import io
 import logging
 import multiprocessing
 import os
-import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.cli.outputs import CompileBar
+from fdi_ros.cli.outputs import bar_of
 from fdi_ros.compiling.compiled import LOG, allocate, compilations, missing
 from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS
@@ -28,22 +27,13 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
-from fdi_ros.system.installation import BAGS, PROGRESS, there
-
-Task = tuple[Any, ...]
-"""A function and its arguments."""
+from fdi_ros.system.installation import BAGS, there
 
 
 def compile_for_workers(arguments: Namespace) -> None:
     """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
     if arguments.scheduler is None and missing():
         compile_now(view=bar_of(arguments))
-
-
-def bar_of(arguments: Namespace) -> View | None:
-    """Return what shows the share compiled; None: there is no terminal, or it is to be quiet."""
-    shown = sys.stderr.isatty() and not arguments.quiet and all(map(there, PROGRESS))
-    return CompileBar(sys.stderr) if shown else None
 
 
 def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
@@ -54,7 +44,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
     Functions that had to be compiled.
     """
     # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
-    parts: list[Task] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
+    parts: list[tuple[Any, ...]] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
     # Spawned: forking a process that has threads can hang.
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
         running = [pool.submit(_quietly, part) for part in parts]
@@ -68,7 +58,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
         return sum(part.result() for part in running)
 
 
-def _quietly(part: Task) -> int:
+def _quietly(part: tuple[Any, ...]) -> int:
     """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
     level, before = LOG.level, compilations()
     LOG.setLevel(logging.ERROR)

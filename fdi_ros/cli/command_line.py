@@ -24,18 +24,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from fdi_ros import __version__
-from fdi_ros.cli.compile import COMPILE
-from fdi_ros.cli.fleet import FLEET
-from fdi_ros.cli.montecarlo import MONTECARLO
+from fdi_ros.cli import STOPPED, Stop, heeded
+from fdi_ros.cli.many import FLEET, MONTECARLO
 from fdi_ros.cli.recording import CALIBRATE, CONVERT, INSPECT, SETUP
-from fdi_ros.cli.replay import REPLAY
-from fdi_ros.cli.settings import GEOMETRY, SHIPPED
-from fdi_ros.cli.signals import STOPPED, Stop, heeded
-from fdi_ros.cli.sweep import SWEEP
-from fdi_ros.cli.watch import WATCH
+from fdi_ros.cli.replay import REPLAY, SWEEP
+from fdi_ros.cli.settings import COMPILE, GEOMETRY, SHIPPED, WATCH
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
-from fdi_ros.system.installation import PROGRESS, require, resolve, there
+from fdi_ros.system.installation import require, resolve
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -182,11 +178,10 @@ def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextMan
     """Show whatever a verb has to compile; what has no results, `fdi watch`, does not wait for the compiler."""
     if "quiet" not in given:
         return contextlib.nullcontext()
-    from fdi_ros.cli.outputs import CompileBar
+    from fdi_ros.cli.outputs import bar_of
     from fdi_ros.compiling.notice import announced
 
-    seen = sys.stderr.isatty() and not given.quiet and all(map(there, PROGRESS))
-    return announced(CompileBar(sys.stderr) if seen else None)
+    return announced(bar_of(given))
 
 
 def _refused(words: str) -> int:

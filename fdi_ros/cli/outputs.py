@@ -11,8 +11,8 @@ import platform
 import re
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
@@ -25,6 +25,7 @@ from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import WORDS, clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.verdict import Severity, with_first_line_coloured
+from fdi_ros.system.installation import PROGRESS, there
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
 from fdi_ros.system.text import shown, visible
@@ -34,11 +35,12 @@ from fdi_ros.system.trusted_file import open_regular
 
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
+_TIMED_FORMAT = "{desc}, {elapsed}"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
 SAID_EVERY = 10.0
 """How often the share done is said where there is no terminal, s."""
 _TICK = 1.0
-"""How often the time of work with no known share done is drawn anew, s."""
+"""How often the time is drawn anew, s."""
 
 
 class Progress:
@@ -52,36 +54,42 @@ class Progress:
         Draw nothing.
     what
         Is done: begins the lines where there is no terminal.
+    timed
+        No share done is known: say what is done, and for how long already.
     """
 
-    def __init__(self, stream: TextIO, quiet: bool = False, what: str = "") -> None:
+    def __init__(self, stream: TextIO, quiet: bool = False, what: str = "", timed: bool = False) -> None:
         from tqdm import tqdm
 
-        self._stream, self._what = stream, what
-        self._share, self._begun = 0.0, clock()
-        self._ended = threading.Event()
-        self._saying = None if quiet or stream.isatty() else threading.Thread(target=self._say, daemon=True)
+        self._stream, self._what = stream, f"{what}: " if what else ""
+        self._share, self._begun, self._compiled = 0.0, clock(), compiling_seconds()
         # None: tqdm asks the stream whether it is a terminal.
-        self._disable = True if quiet else None
-        self._bar = tqdm(total=1.0, file=stream, disable=self._disable, bar_format=_FORMAT, leave=False)
-        self._compiled = compiling_seconds()
+        disable, shown = True if quiet else None, _TIMED_FORMAT if timed else _FORMAT
+        self._bar = tqdm(total=1.0, desc=what, file=stream, disable=disable, bar_format=shown, leave=False)
+        self._ended = threading.Event()
+        self._thread = None if quiet else threading.Thread(target=self._tick, daemon=True)
 
     def __enter__(self) -> Progress:
-        if self._saying is not None:
-            self._saying.start()
+        if self._thread is not None:
+            self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.close()
         self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._bar.close()
 
-    def _say(self) -> None:
-        """Say now and then how much is done, whatever keeps the rest waiting."""
-        while not self._ended.wait(SAID_EVERY):
+    def _tick(self) -> None:
+        """Draw the time anew, or say now and then how much is done, whatever keeps the rest waiting."""
+        while not self._ended.wait(SAID_EVERY if self._bar.disable else _TICK):
             if is_compiling():
                 continue  # That has lines of its own.
+            if not self._bar.disable:
+                self._bar.refresh()
+                continue
             spent, share = clock() - self._begun, self._share
             done = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
             with suppress(OSError, ValueError):
@@ -95,40 +103,6 @@ class Progress:
             self._bar.start_t += self._compiled - before
         self._bar.update(share - self._bar.n)
         self._share = share
-
-    @contextmanager
-    def during(self, words: str) -> Iterator[None]:
-        """Say what goes on, and for how long already, where no share done is known."""
-        from tqdm import tqdm
-
-        self._what = f"{words}: "
-        self._bar.clear()
-        bar = tqdm(
-            desc=words,
-            file=self._stream,
-            disable=self._disable,
-            position=0,  # on the same line as the bar
-            leave=False,
-            bar_format="{desc}, {elapsed}",
-        )
-        ended = threading.Event()
-
-        def tick() -> None:
-            while not ended.wait(_TICK):
-                # Compiling has a bar of its own on this line.
-                if not is_compiling():
-                    bar.refresh()
-
-        thread = threading.Thread(target=tick, daemon=True)
-        if not bar.disable:
-            thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            if thread.is_alive():
-                thread.join()
-            bar.close()
 
 
 class CompileBar:
@@ -161,6 +135,12 @@ class CompileBar:
         """Leave the line to others."""
         if self._bar is not None:
             self._bar.clear()
+
+
+def bar_of(arguments: argparse.Namespace) -> CompileBar | None:
+    """Return what shows the share compiled; None: there is no terminal, or it is to be quiet."""
+    shown = sys.stderr.isatty() and not arguments.quiet and all(map(there, PROGRESS))
+    return CompileBar(sys.stderr) if shown else None
 
 
 # Files and words ------------------------------------------------------------------------------------------------------
@@ -277,14 +257,16 @@ def config_words(arguments: argparse.Namespace) -> str:
     return ", ".join(map(str, arguments.config))
 
 
-def part_words(arguments: argparse.Namespace) -> str:
-    """Name the part of the recording that was read."""
-    return f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}"
-
-
 def versions() -> str:
     """Name the versions that figures may depend on."""
     return f"fdi_ros {__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
+
+
+def about(arguments: argparse.Namespace, config: str, more: Mapping[str, str]) -> dict[str, str]:
+    """Say for a page what was run: of which part of which recording, with which config, and more."""
+    end = "the end" if math.isinf(arguments.end) else f"{arguments.end:g} s"
+    first = {"recording": str(arguments.bag), "part": f"{arguments.start:g} s to {end}", "config": config}
+    return {**first, **more, "versions": versions()}
 
 
 def check_part(arguments: argparse.Namespace) -> None:

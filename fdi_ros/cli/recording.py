@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import sys
-from argparse import SUPPRESS, ArgumentParser, Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -133,7 +133,7 @@ def _setup(arguments: Namespace) -> int:
     check_part(arguments)
     arguments.report = report = arguments.report or arguments.output.with_suffix(".html")
     outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
-    with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
+    with Progress(sys.stderr, arguments.quiet, "looking into the recording", timed=True):
         found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
     said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
     with whole_file(report) as page, whole_file(arguments.output) as path:
@@ -181,7 +181,7 @@ def _calibrate(arguments: Namespace) -> int:
     config = Config.from_file(arguments.config)
     check_part(arguments)
     outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag, *arguments.config])
-    with Progress(sys.stderr, arguments.quiet) as progress, progress.during("fitting axes, biases and noise"):
+    with Progress(sys.stderr, arguments.quiet, "fitting axes, biases and noise", timed=True):
         found = recalibrate(arguments.bag, config, arguments.start, arguments.end, arguments.reference, arguments.proof)
     result = found.calibration
     assert result is not None
@@ -220,9 +220,7 @@ CALIBRATE = Verb(
 
 def _add_convert(parser: ArgumentParser) -> None:
     add_bag(parser)
-    add_file(parser, "--output", "rosbag2 folder to write, with one MCAP file", "DIR")
-    # As it was given before there was --output.
-    parser.add_argument("folder", nargs="?", type=Path, help=SUPPRESS)
+    add_file(parser, "--output", "rosbag2 folder to write, with one MCAP file", "DIR", required=True)
     add_results(parser, force="overwrite a bag made by fdi")
 
 
@@ -232,9 +230,7 @@ def _convert(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
     from fdi_ros.system.result_file import whole_folder
 
-    if (arguments.output is None) == (arguments.folder is None):
-        raise ConfigError("convert needs one folder to write: --output DIR")
-    arguments.output = target = arguments.output or arguments.folder
+    target = arguments.output
     outputs = Outputs(arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER)
     with Recording(arguments.bag) as recording:
         with Progress(sys.stderr, arguments.quiet) as progress, whole_folder(target) as path:

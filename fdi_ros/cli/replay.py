@@ -1,15 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""``fdi replay``: arguments, files, and the words for a terminal."""
+"""A recording through the monitor: ``fdi replay``, as it is or with faults; ``fdi sweep``, which faults are found."""
 
 from __future__ import annotations
 
+import math
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fdi_ros.cli.arguments import (
@@ -25,15 +27,21 @@ from fdi_ros.cli.arguments import (
     add_results,
     shipped,
 )
-from fdi_ros.system.installation import BAGS, PROGRESS, resolve
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.errors import ConfigError
+from fdi_ros.system.installation import BAGS, PROGRESS, WORKERS, resolve
 
 if TYPE_CHECKING:
     from fdi_ros.cli.outputs import Outputs
+    from fdi_ros.config.config import Config
+    from fdi_ros.model.geometry import Geometry
+    from fdi_ros.model.samples import Block
     from fdi_ros.replay.run import Request, Sink
     from fdi_ros.replay.summary import Summary
+    from fdi_ros.replay.sweep import Plan, Subject
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
+def _add_replay(parser: ArgumentParser) -> None:
     add_bag(parser)
     add_config(parser, "; default: what fdi inspect writes, where units are mounted alike", required=False, default=[])
     add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
@@ -61,7 +69,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_degrees(parser)
 
 
-def _run(arguments: Namespace) -> int:
+def _replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
     from fdi_ros.mavlink.failover import failover_text
@@ -84,7 +92,7 @@ def _run(arguments: Namespace) -> int:
     unit = unit_of(arguments.degrees)
     report = Report(geometry, request.config.sample_rate, unit) if arguments.report is not None else None
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
-        sinks = _sinks(arguments, request, stack)
+        sinks = _sinks(arguments, request, geometry, stack)
         summary = replay(request, [*sinks, report] if report else sinks, progress.show)
         found = verdict(summary, unit)
         figures = {**as_json(summary), "verdict": {"severity": found.severity.value, "words": verdict(summary).words}}
@@ -92,7 +100,7 @@ def _run(arguments: Namespace) -> int:
         if arguments.check is not None:
             figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
         if report:
-            page = report.html(summary, _about(arguments, request, assumed))
+            page = report.html(summary, _about_replay(arguments, request, assumed))
             stack.enter_context(whole_file(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
@@ -144,13 +152,11 @@ def _request(arguments: Namespace) -> tuple[Request, str]:
     return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request, assumed
 
 
-def _sinks(arguments: Namespace, request: Request, stack: ExitStack) -> list[Sink]:
+def _sinks(arguments: Namespace, request: Request, geometry: Geometry, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
-    from fdi_ros.monitor.build import build_geometry
     from fdi_ros.replay.outputs import CsvFile, OutputBag
     from fdi_ros.system.result_file import whole_file, whole_folder
 
-    geometry = build_geometry(request.config)
     sinks: list[Sink] = []
     if arguments.csv is not None:
         path = stack.enter_context(whole_file(arguments.csv))
@@ -168,21 +174,21 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about(arguments: Namespace, request: Request, assumed: str) -> dict[str, str]:
+def _about_replay(arguments: Namespace, request: Request, assumed: str) -> dict[str, str]:
     """Say what was run, for the report."""
-    from fdi_ros.cli.outputs import config_words, part_words, versions
+    from fdi_ros.cli.outputs import about, config_words
 
     changed = request.config.changed
-    return {
-        "recording": str(request.bag),
-        "part": part_words(arguments),
-        "config": config_words(arguments) or f"none; assumed: {assumed}",
-        "detector": request.config.detector.name,
-        "faults": "; ".join(map(str, request.faults)) or "none",
-        "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
-        "versions": versions(),
-        "settings other than the default": "; ".join(f"{name}: {_written(value)}" for name, value in changed.items()),
-    }
+    return about(
+        arguments,
+        config_words(arguments) or f"none; assumed: {assumed}",
+        {
+            "detector": request.config.detector.name,
+            "faults": "; ".join(map(str, request.faults)) or "none",
+            "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
+            "settings other than the default": "; ".join(f"{name}: {_written(v)}" for name, v in changed.items()),
+        },
+    )
 
 
 REPLAY = Verb(
@@ -193,7 +199,134 @@ REPLAY = Verb(
         "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
         "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
     ),
-    _add_arguments,
-    _run,
+    _add_replay,
+    _replay,
     (*BAGS, *PROGRESS),
+)
+
+
+# Faults of many sizes -------------------------------------------------------------------------------------------------
+
+
+MOST_TIMES = 1000
+
+
+def _add_sweep(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    add_config(parser)
+    add_fault(
+        parser,
+        "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
+        " scale factors, stuck, dropout",
+    )
+    parser.add_argument("--times", type=int, default=10, metavar="N", help="times per channel and fault; default 10")
+    parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
+    add_detector(parser)
+    parser.add_argument(
+        "--compare",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="other detectors (as of --detector) or parameter files beside it",
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
+    add_part(parser)
+    add_file(parser, "--csv", "write a line for every fault")
+    add_report(parser)
+    add_results(parser)
+
+
+def _sweep(arguments: Namespace) -> int:
+    """Sweep, print the tables, write what was asked for."""
+    from fdi_ros.cli.outputs import Outputs, Progress, about, check_part, config_words
+    from fdi_ros.replay.sweep import sweep
+    from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
+    from fdi_ros.system.result_file import whole_file
+
+    plan = _plan(arguments)
+    check_part(arguments)
+    configs = _configs(arguments)
+    compared = filter(Path.exists, map(resolve, arguments.compare))
+    outputs = Outputs(arguments, ("json", "csv", "report"), [arguments.bag, *arguments.config, *compared])
+    subjects = _subjects(arguments, configs)
+    with Progress(sys.stderr, arguments.quiet, "faults") as progress:
+        results = sweep(subjects, plan, arguments.workers, progress.show)
+    text, figures = sweep_text(results, plan, arguments.bag.name), sweep_figures(results, plan, str(arguments.bag))
+    with ExitStack() as stack:
+        if arguments.csv is not None:
+            path = stack.enter_context(whole_file(arguments.csv))
+            with path.open("w", newline="", encoding="utf-8") as file:
+                write_csv(file, results, plan)
+        tried = {
+            "compared with": ", ".join(arguments.compare) or "nothing",
+            "faults": "; ".join(swept.words for swept in plan.faults),
+            "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
+        }
+        head = about(arguments, config_words(arguments), tried)
+        return outputs.finish(text, figures, lambda: sweep_page(results, plan, arguments.bag.name, head))
+
+
+def _plan(arguments: Namespace) -> Plan:
+    from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, parse_swept
+    from fdi_ros.system.jobs import worker_count
+
+    swept = tuple(one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text))
+    if not 1 <= arguments.times <= MOST_TIMES:
+        raise ConfigError(f"--times is {arguments.times}, expected 1 to {MOST_TIMES}")
+    if not (math.isfinite(arguments.within) and arguments.within > 0):
+        raise ConfigError(f"--within is {arguments.within:g} s, expected more than 0")
+    worker_count(arguments.workers)
+    if arguments.seed < 0:
+        raise ConfigError(f"--seed is {arguments.seed}, expected 0 or more")
+    return Plan(tuple(dict.fromkeys(swept)), arguments.times, arguments.within, arguments.seed)
+
+
+def _configs(arguments: Namespace) -> dict[str, Config]:
+    """Return the configs to be tried by name: the one given, and those to compare it with."""
+    from fdi_ros.config.config import Config
+    from fdi_ros.monitor.build import build_geometry
+
+    own = Config.from_file(arguments.config)
+    own = own.replaced({"detector.name": arguments.detector}) if arguments.detector else own
+    by_detector = arguments.compare and all(other in DETECTORS for other in arguments.compare)
+    found = {own.detector.name if by_detector else ", ".join(file.name for file in arguments.config): own}
+    names = build_geometry(own).channel_names
+    for other in arguments.compare:
+        if other in DETECTORS:
+            found[other] = own.replaced({"detector.name": other})
+            continue
+        file = resolve(other)
+        if not file.exists():
+            raise ConfigError(f"--compare {other}: no such file, and no detector; there are: {', '.join(DETECTORS)}")
+        found[other] = Config.from_file(file)
+        if build_geometry(found[other]).channel_names != names:
+            raise ConfigError(f"--compare {other}: its channels are not those of --config: {', '.join(names)}")
+    return found
+
+
+def _subjects(arguments: Namespace, configs: dict[str, Config]) -> list[Subject]:
+    """Read the recording as each config aligns it; what aligns alike is read once."""
+    from fdi_ros.bag.samples import read_block
+    from fdi_ros.replay.sweep import Subject
+
+    read: dict[object, Block] = {}
+    subjects = []
+    for name, config in configs.items():
+        key = (config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout)
+        if key not in read:
+            read[key] = read_block(arguments.bag, config, arguments.start, arguments.end)
+        subjects.append(Subject(name, config, read[key]))
+    return subjects
+
+
+SWEEP = Verb(
+    "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
+    (
+        "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
+        "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1' --compare likelihood_ratio cusum",
+    ),
+    _add_sweep,
+    _sweep,
+    (*BAGS, *WORKERS),
 )

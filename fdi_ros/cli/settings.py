@@ -1,19 +1,21 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""``fdi geometry``: what a mounting can do, before it flies; ``fdi shipped``: where the shipped files are."""
+"""Without a recording: ``fdi geometry``, ``fdi shipped`` (files), ``fdi compile``, ``fdi watch`` (a live monitor)."""
 
 from __future__ import annotations
 
 import difflib
 import json
 import re
+import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from functools import partial
 
-from fdi_ros.cli.arguments import Verb, add_degrees, add_report, add_results
-from fdi_ros.errors import ConfigError
+from fdi_ros.cli.arguments import Verb, add_degrees, add_flag, add_report, add_results, detector_names
+from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.system.installation import resolve, shipped_files
 
 MADE = "diagnostics.yaml"
@@ -130,4 +132,62 @@ SHIPPED = Verb(
     ("fdi shipped", "fdi shipped two_imus.yaml"),
     _add_shipped,
     _shipped,
+)
+
+
+def _add_compile(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--detector",
+        nargs="+",
+        metavar="NAME",
+        help=f"for these detectors; default: for all: {detector_names()}",
+    )
+    add_results(parser)
+
+
+def _compile(arguments: Namespace) -> int:
+    """Compile, and say how long it took and where the results are kept."""
+    from fdi_ros.cli.ahead import compile_now
+    from fdi_ros.cli.outputs import Outputs, bar_of
+    from fdi_ros.compiling.compiled import INTERPRETED, folder
+
+    if INTERPRETED:
+        raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")
+    names = arguments.detector or list(DETECTORS)
+    for name in names:
+        detector_class(name)
+    outputs = Outputs(arguments, ("json",))
+    begun = time.perf_counter()
+    new = compile_now(names, bar_of(arguments))
+    took = time.perf_counter() - begun
+    what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
+    figures = {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())}
+    return outputs.finish(f"{what} {folder()}\n", figures)
+
+
+COMPILE = Verb(
+    "compile now what else is compiled when it is first used, for images and CI",
+    ("fdi compile", "fdi compile --detector sequential"),
+    _add_compile,
+    _compile,
+)
+
+
+def _add_watch(parser: ArgumentParser) -> None:
+    parser.add_argument("--node", default="", metavar="/NS/NAME", help="the monitor; default: the only one running")
+    add_flag(parser, "--plain", "line by line, as where the output is no terminal")
+
+
+def _watch(arguments: Namespace) -> int:
+    """Show a monitor until interrupted."""
+    from fdi_ros.ros.watch import watch
+
+    return watch(arguments.node, arguments.plain)
+
+
+WATCH = Verb(
+    "show a running monitor: residuals, states, rates and events as they come",
+    ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
+    _add_watch,
+    _watch,
 )

@@ -115,7 +115,12 @@ _CLOCKS = 1.0
 _OF_A_MONITOR = {topic.name.rpartition("/")[2] for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)}
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 """Kinds of input, first those with stamps."""
-NEEDED = ", or ".join(kind.needed() for kind in _PREFERRED)
+NEEDED = ", or ".join(
+    f"two {kind.type.rpartition('/')[2]} topics"
+    if kind.stamped
+    else f"one array of {kind.value_counts.start} to {kind.value_counts.stop - 1} values"
+    for kind in _PREFERRED
+)
 _NAMED = 8
 """Topics that are named with what is wrong with them."""
 
@@ -128,8 +133,8 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
     possible = [report for report in reports if not _unusable(report)]
     for kind in _PREFERRED:
         alike = [report for report in possible if report.kind is kind]
-        if len(alike) >= kind.fewest:
-            return alike[: kind.most]
+        if len(alike) >= kind.topic_counts.start:
+            return alike[: kind.topic_counts.stop - 1]
     return []
 
 

@@ -166,7 +166,7 @@ def _update_values(
     """Decode what could be angular rates."""
     if not report.channels:
         report.announced = kind.announced(buffer, offset, length)
-        report.channels = report.announced if kind.fits(report.announced) else 0
+        report.channels = report.announced if report.announced in kind.value_counts else 0
         report.segments, report.repeats = NoiseSegments(report.channels), Repeats(report.channels)
         report.recent = np.zeros((0, report.channels))
         report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)

@@ -11,7 +11,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core import messages
 from fdi_ros.core.messages import (
     ENCAPSULATION,
     FIRST_OWN,
@@ -94,6 +93,7 @@ class ChannelsSource(ArraySource):
     """The values of std_msgs/Float64MultiArray messages."""
 
     type = "std_msgs/msg/Float64MultiArray"
+    called = "an array"
     place = staticmethod(_place)
     decode_into = staticmethod(_decode_into)
     take = staticmethod(_take)
@@ -103,7 +103,7 @@ class ChannelsSource(ArraySource):
         """Explain in one line what is wrong with a message in which count values were expected."""
         size, order = len(data), byte_order(data)
         if code < FIRST_OWN:
-            return messages.explain(code, data, "an array")
+            return super().explain(code, data, count)
         if code == _DIMENSIONS:
             (dimensions,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION)
             return f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"

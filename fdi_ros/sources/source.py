@@ -46,9 +46,12 @@ class Source(ABC):
     stamped: ClassVar[bool]
     """Whether messages carry the stamp of their measurement, and those of several units are aligned by it; else they
     are stamped when they arrive, and each is a sample of all channels."""
-    fewest: ClassVar[int]
-    most: ClassVar[int]
-    """Topics that a monitor takes."""
+    topic_counts: ClassVar[range]
+    """Numbers of topics that a monitor takes."""
+    value_counts: ClassVar[range]
+    """Numbers of values that a message may have to be the gyros of a monitor."""
+    called: ClassVar[str]
+    """A message in words: ``an Imu``."""
 
     # Compiled, per kind -------------------------------------------------------------------------------------------
 
@@ -86,29 +89,19 @@ class Source(ABC):
     # Messages -----------------------------------------------------------------------------------------------------
 
     @classmethod
-    @abstractmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
         """Explain in one line what is wrong with a message in which count values were expected."""
+        return explain(code, data, cls.called)
 
     @classmethod
-    @abstractmethod
     def announced(cls, buffer: Bytes, offset: Int, length: Int) -> int:
         """Return how many values the first readable one of k messages says that it has; 0: none is readable."""
+        return cls.value_counts.start
 
     @classmethod
-    @abstractmethod
-    def fits(cls, count: int) -> bool:
-        """Whether messages of so many values can be the gyros of a monitor."""
-
-    @classmethod
-    @abstractmethod
-    def needed(cls) -> str:
-        """Say which topics a monitor needs at least."""
-
-    @classmethod
-    @abstractmethod
     def value_names(cls, count: int) -> list[str]:
         """Names of the values of one message."""
+        return list("xyz") if cls.stamped else [f"value {k + 1}" for k in range(count)]
 
     @classmethod
     def decode(cls, buffer: Bytes, offset: Int, length: Int, count: int) -> Decoded:
@@ -200,18 +193,10 @@ class Source(ABC):
 
 
 class UnitSource(Source):
-    """One topic per three-axis unit: messages with a std_msgs/Header, aligned by their stamps; settings ``imus``.
+    """One topic per three-axis unit: messages with a std_msgs/Header, aligned by their stamps; settings ``imus``."""
 
-    Parameters
-    ----------
-    config
-        Settings of the monitor.
-    """
-
-    called: ClassVar[str]
-    """A message in words: ``an Imu``."""
     stamped = True
-    fewest, most = 2, MAX_UNITS
+    topic_counts, value_counts = range(2, MAX_UNITS + 1), range(3, 4)
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
@@ -221,59 +206,13 @@ class UnitSource(Source):
         self.delays = imus.delays or (0.0,) * count
         self.mounts = list(np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3)))
 
-    @classmethod
-    def explain(cls, code: int, data: bytes, count: int) -> str:
-        """Explain in one line what is wrong with a message."""
-        return explain(code, data, cls.called)
-
-    @classmethod
-    def announced(cls, buffer: Bytes, offset: Int, length: Int) -> int:
-        """Return how many values each message has."""
-        return 3
-
-    @classmethod
-    def fits(cls, count: int) -> bool:
-        """Whether it is three."""
-        return count == 3
-
-    @classmethod
-    def needed(cls) -> str:
-        """Say how many topics a monitor needs at least."""
-        return f"two {cls.type.rpartition('/')[2]} topics"
-
-    @classmethod
-    def value_names(cls, count: int) -> list[str]:
-        """Names of the axes of a unit."""
-        return ["x", "y", "z"]
-
 
 class ArraySource(Source):
-    """One topic: messages of all channels, stamped when they arrive; settings ``channels``.
-
-    Parameters
-    ----------
-    config
-        Settings of the monitor.
-    """
+    """One topic: messages of all channels, stamped when they arrive; settings ``channels``."""
 
     stamped = False
-    fewest, most = 1, 1
+    topic_counts, value_counts = range(1, 2), range(MIN_CHANNELS, MAX_CHANNELS + 1)
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.names, self.timeout = config.topics, config.health.stale_timeout
-
-    @classmethod
-    def fits(cls, count: int) -> bool:
-        """Whether a monitor can have so many channels."""
-        return MIN_CHANNELS <= count <= MAX_CHANNELS
-
-    @classmethod
-    def needed(cls) -> str:
-        """Say which topic a monitor needs."""
-        return f"one array of {MIN_CHANNELS} to {MAX_CHANNELS} values"
-
-    @classmethod
-    def value_names(cls, count: int) -> list[str]:
-        """Places of the values in a message."""
-        return [f"value {k + 1}" for k in range(count)]

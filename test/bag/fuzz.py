@@ -386,7 +386,7 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
         return [verb, str(folder / "config.yaml")]
     words = [verb, str(source)]
     if verb == "convert":
-        return [*words, str(folder / "out" / "bag")]
+        return [*words, "--output", str(folder / "out" / "bag")]
     if verb == "inspect":
         return words + ["--write", str(folder / "out" / "made.yaml")] * (draw.random() < 0.7)
     words += ["--config", str(folder / "config.yaml")]

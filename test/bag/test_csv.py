@@ -179,7 +179,7 @@ def test_every_verb_reads_a_table(tmp_path, fdi):
     config = tmp_path / "made.yaml"
     assert "/imu_1" in fdi("inspect", path, "--output", config).out
     assert fdi("replay", path, "--config", config, "--check", "declared=0").code == 0
-    assert fdi("convert", path, tmp_path / "bag").code == 0
+    assert fdi("convert", path, "--output", tmp_path / "bag").code == 0
     assert fdi("replay", tmp_path / "bag", "--config", config, "--check", "declared=0").code == 0
     assert (
         fdi("sweep", path, "--config", config, "--fault", "kind=bias size=0.3", "--json", tmp_path / "sweep.json").code

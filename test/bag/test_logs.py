@@ -350,7 +350,7 @@ def test_a_log_gives_the_verdicts_of_the_bag_made_of_it_and_of_one_written_direc
     config = tmp_path / "made.yaml"
     assert fdi("inspect", path, "--write", config, "--quiet").code == 0
     assert Config.from_file(config).topics == ("/imu_0", "/imu_1", "/imu_2")
-    assert fdi("convert", path, tmp_path / "converted", "--quiet").code == 0
+    assert fdi("convert", path, "--output", tmp_path / "converted", "--quiet").code == 0
     sent = [
         (name, int(at), data)
         for name, (stamp, _, all_data) in messages(path)[0].items()
@@ -372,7 +372,7 @@ def test_a_log_gives_the_verdicts_of_the_bag_made_of_it_and_of_one_written_direc
 )
 def test_a_log_too_slow_is_refused_with_the_setting_that_helps(tmp_path, kind, vehicle, words, refused):
     path = log(tmp_path, kind, units(rate=10.0), **vehicle)
-    for verb in (["inspect", path], ["convert", path, tmp_path / "bag"]):
+    for verb in (["inspect", path], ["convert", path, "--output", tmp_path / "bag"]):
         said = refused(*verb)
         assert f"has {kind} of 3 IMUs at 10 Hz; needed: two IMUs or more, each by itself, at 20 Hz or more" in said
         assert words in said
@@ -569,7 +569,7 @@ def test_any_recording_can_be_converted(tmp_path, fdi, refused):
     sent = [("/b", 10**18 + k, data) for k, data in enumerate(messages(log(tmp_path, "IMU"))[0]["/imu_0"][2])]
     text = [("/text", 10**18, b"\0\1\0\0\1\0\0\0\0")]
     bag = write_bag(tmp_path / "bag", sent + text, StoragePlugin.SQLITE3, types={"/text": "std_msgs/msg/String"})
-    words = ["convert", bag, tmp_path / "out"]
+    words = ["convert", bag, "--output", tmp_path / "out"]
     assert fdi(*words).out.startswith("/b: 800 messages\n")
     with Recording(tmp_path / "out") as recording:
         assert [topic.name for topic in recording.topics] == ["/b"]
@@ -578,7 +578,7 @@ def test_any_recording_can_be_converted(tmp_path, fdi, refused):
     # It is replaced only if asked for, and only what fdi has made.
     assert "--force" in refused(*words)
     assert fdi(*words, "--force", "--quiet").code == 0
-    assert "holds more than a recording made by fdi" in refused("convert", tmp_path / "out", bag, "--force")
+    assert "holds more than a recording made by fdi" in refused("convert", tmp_path / "out", "--output", bag, "--force")
 
 
 @pytest.mark.parametrize(("kind", "write"), [("sensor_gyro", log), ("SCALED_IMU", None)])
@@ -670,7 +670,7 @@ def test_a_default_log_shows_a_bias_and_no_more_than_that_is_said(tmp_path, monk
         replayed = fdi("replay", path, "--config", config, "--check", check)
         assert replayed.code == 0, replayed
         assert "A COARSE CHECK" in replayed.out
-    assert "A COARSE CHECK" in fdi("convert", path, tmp_path / "bag").out
+    assert "A COARSE CHECK" in fdi("convert", path, "--output", tmp_path / "bag").out
 
 
 def test_a_ulog_that_ends_in_its_header_is_refused_in_one_line(tmp_path, refused):

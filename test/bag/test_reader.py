@@ -352,7 +352,7 @@ def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi):
     path = write_ros1(
         tmp_path / "bag.bag", sorted(messages + others, key=lambda m: m[1]), types={"/text": "std_msgs/msg/String"}
     )
-    assert fdi("convert", path, tmp_path / "out").code == 0
+    assert fdi("convert", path, "--output", tmp_path / "out").code == 0
     for recording in (path, tmp_path / "out"):
         stamp, values, samples = read(recording)
         np.testing.assert_array_equal(values, z)

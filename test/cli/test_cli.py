@@ -286,15 +286,6 @@ def test_every_help_has_examples_that_can_be_typed_and_all_choices(capsys, verb)
     assert not [choice for choice in CHOICES.get(verb, ()) if choice not in said]
 
 
-def test_convert_writes_where_output_says_and_as_before(fdi, refused, flight, tmp_path):
-    for words in (("--output", tmp_path / "a"), (tmp_path / "b",)):
-        assert fdi("convert", flight, *words, "--quiet") == (0, "", "")
-    assert (tmp_path / "a" / "a.mcap").exists()
-    assert (tmp_path / "b" / "b.mcap").exists()
-    for words in ((), (tmp_path / "c", "--output", tmp_path / "d")):
-        assert refused("convert", flight, *words) == "fdi: convert needs one folder to write: --output DIR\n"
-
-
 def test_csv_has_a_line_for_every_sample(tmp_path, replay):
     replay("--csv", tmp_path / "s.csv", "--end", 10)
     with (tmp_path / "s.csv").open() as file:
@@ -333,10 +324,11 @@ from fdi_ros.cli import ahead
 from fdi_ros.cli.command_line import main
 from fdi_ros.compiling import compiled
 from fdi_ros.detectors import DETECTORS
+from fdi_ros.monitor.receiver import warm_detector
 
 ahead.warm_path()
 for name in DETECTORS:
-    ahead.warm_detector(name)
+    warm_detector(name)
 ahead.warm_verbs()
 forms = lambda: {(one.py_func.__qualname__, form) for one in compiled._dispatchers for form in one.signatures}
 before = forms()
@@ -673,7 +665,7 @@ def test_a_terminal_sees_a_bar_that_is_wiped_in_the_end():
 
 
 def test_what_has_no_share_done_says_what_it_is_and_for_how_long():
-    with Progress(stream := Terminal()) as progress, progress.during("fitting"):
+    with Progress(stream := Terminal(), what="fitting", timed=True):
         pass
     assert "fitting, 00:00" in stream.getvalue()
     assert "\n" not in stream.getvalue()
@@ -681,7 +673,7 @@ def test_what_has_no_share_done_says_what_it_is_and_for_how_long():
 
 def test_where_there_is_no_terminal_a_line_says_now_and_then_how_much_is_done(monkeypatch):
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
-    with Progress(stream := io.StringIO(), what="power: ") as progress:
+    with Progress(stream := io.StringIO(), what="power") as progress:
         progress.show(0.25)
         while "25%" not in stream.getvalue():
             time.sleep(0.01)
@@ -694,8 +686,6 @@ def test_where_there_is_no_terminal_a_line_says_now_and_then_how_much_is_done(mo
 
 def test_nothing_else_sees_anything():
     for stream, quiet in ((io.StringIO(), False), (Terminal(), True)):
-        with Progress(stream, quiet) as progress:
+        with Progress(stream, quiet, timed=True) as progress:
             progress.show(0.5)
-            with progress.during("fitting"):
-                pass
         assert stream.getvalue() == ""

@@ -167,7 +167,7 @@ def test_names_are_shown_and_not_obeyed(flight: Path, config: Path, tmp_path: Pa
         ["replay", bag, "--config", own, *some, "--report", out / "replay.html", "--csv", out / f"{NAME}.csv"],
         ["sweep", bag, "--config", own, "--times", "2", "--report", out / "sweep.html"],
         ["geometry", own],
-        ["convert", bag, out / NAME],
+        ["convert", bag, "--output", out / NAME],
         ["replay", bag / "nothing", "--config", own],
         ["replay", bag, "--config", tmp_path / f"{NAME}.txt"],
     ]

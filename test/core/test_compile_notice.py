@@ -133,7 +133,7 @@ def test_garbage_is_collected_less_often_only_while_anything_is_compiled(before,
 @pytest.mark.usefixtures("compiled")
 def test_nothing_is_missing_once_all_is_compiled(root) -> None:
     # In a process of its own: tests compile functions, too.
-    count = "import fdi_ros.cli.compile; from fdi_ros.compiling.notice import missing; print(missing())"
+    count = "import fdi_ros.cli.settings; from fdi_ros.compiling.notice import missing; print(missing())"
     done = subprocess.run([sys.executable, "-c", count], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout == "0\n"
 

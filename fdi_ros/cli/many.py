@@ -1,22 +1,22 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""``fdi fleet``: many recordings, two tables and one page."""
+"""Work for many processes: ``fdi fleet``, many recordings; ``fdi montecarlo``, many simulated trials."""
 
 from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser, Namespace
 
-from fdi_ros.cli.arguments import Verb, add_config, add_file, add_results, add_workers
-from fdi_ros.errors import BagError, FdiError
-from fdi_ros.system.installation import BAGS, WORKERS
+from fdi_ros.cli.arguments import Verb, add_config, add_file, add_report, add_results, add_workers, shipped
+from fdi_ros.errors import BagError, FdiError, StudyError
+from fdi_ros.system.installation import BAGS, WORKERS, resolve
 from fdi_ros.system.text import shown, storable
 
 PAGE = "fleet.html"
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
+def _add_fleet(parser: ArgumentParser) -> None:
     parser.add_argument("paths", nargs="+", metavar="PATH", help="recordings, and folders with recordings")
     add_config(parser, "; default: of each recording what fdi inspect writes for it", required=False, default=[])
     add_file(parser, "--output", "folder for the tables and the page", "DIR", required=True)
@@ -30,7 +30,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_results(parser, force="begin anew where the folder holds a run with other settings")
 
 
-def _run(arguments: Namespace) -> int:
+def _fleet(arguments: Namespace) -> int:
     """Judge them, write tables and page, print what needs a person."""
     from fdi_ros.cli.ahead import compile_for_workers
     from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_target, config_words, versions
@@ -54,7 +54,7 @@ def _run(arguments: Namespace) -> int:
     tables = Tables(folder, {"config": parameters, "calibrate": arguments.calibrate}, arguments.force)
     compile_for_workers(arguments)
     try:
-        with Progress(sys.stderr, arguments.quiet, "flights: ") as progress:
+        with Progress(sys.stderr, arguments.quiet, "flights") as progress:
             judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, progress.show)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
@@ -83,7 +83,45 @@ def _run(arguments: Namespace) -> int:
 FLEET = Verb(
     "judge many recordings: tables of flights and episodes, and a page of what needs a person",
     ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
-    _add_arguments,
-    _run,
+    _add_fleet,
+    _fleet,
     (*BAGS, *WORKERS, "pyarrow", "scipy"),
+)
+
+
+def _add_montecarlo(parser: ArgumentParser) -> None:
+    parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help=f"what to run; shipped: {shipped('studies')}")
+    parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
+    add_workers(parser)
+    add_report(parser, "write curves and tables as one page")
+    add_results(parser)
+
+
+def _montecarlo(arguments: Namespace) -> int:
+    """Run the study; print its headline table."""
+    from fdi_ros.cli.ahead import compile_for_workers
+    from fdi_ros.cli.outputs import Outputs, Progress
+    from fdi_ros.experiments.montecarlo import load_study, run_study
+    from fdi_ros.experiments.report import headline, report
+    from fdi_ros.system.jobs import cluster_of
+    from fdi_ros.system.result_file import plain
+
+    if arguments.scheduler is not None and arguments.workers is not None:
+        raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
+    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
+    outputs = Outputs(arguments, ("report", "json"), [arguments.study])
+    study = load_study(arguments.study, arguments.trials, arguments.seed)
+    compile_for_workers(arguments)
+    with Progress(sys.stderr, arguments.quiet, study.name) as progress:
+        result = run_study(study, arguments.workers, cluster, progress.show)
+    return outputs.finish(f"{headline(result)}\n", plain(result), lambda: report(result))
+
+
+MONTECARLO = Verb(
+    "compare detectors over many simulated trials",
+    ("fdi montecarlo power.yaml --trials 200 --report power.html",),
+    _add_montecarlo,
+    _montecarlo,
+    WORKERS,
 )
