@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.config.nodes import NODES
-from fdi_ros.config.settings import REQUIRED, Field
+from fdi_ros.config.settings import NODES, REQUIRED, Field
 from fdi_ros.experiments.montecarlo import SCHEMAS
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"

@@ -17,9 +17,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.config.nodes import ALL_NODES, MONITOR
 from fdi_ros.config.settings import (
+    ALL_NODES,
     INPUTS,
+    MONITOR,
     BiasConfig,
     ChannelsConfig,
     DecisionConfig,
@@ -283,45 +284,42 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
     return parameters_in(read_yaml(path, "config", ConfigError), f"config {path}")
 
 
-def parameters_in(document: Any, called: str) -> dict[str, Any]:
+def parameters_in(document: Any, called: str, ros: bool = False) -> dict[str, Any]:
     """Parameters of the monitor in what a ROS 2 parameter file holds, as `read_parameter_file` returns them.
+
+    Parameters
+    ----------
+    document
+        What the file holds.
+    called
+        Its name, for errors.
+    ros
+        Those of ROS and of the node itself, instead of the settings.
 
     Raises
     ------
     ConfigError
-        If it is no parameter file; called is its name there.
+        If it is no parameter file.
     """
     if not isinstance(document, dict):
         raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")
-    ours = _monitors(document)
-    if not ours:
+    # Of what two give, the last wins.
+    monitors = sorted(filter(is_monitor, document), key=lambda node: node != "/**")
+    if not monitors:
         names = ", ".join(map(str, document))
         raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
     flat: dict[str, Any] = {}
-    for node in ours:
+    for node in monitors:
         body = document[node]
         if not isinstance(body, dict) or not isinstance(body.get("ros__parameters"), dict):
             raise ConfigError(f"{called}: {node} has no ros__parameters")
         _flatten(body["ros__parameters"], "", flat)
-    return {name: value for name, value in flat.items() if not is_ros_parameter(name)}
-
-
-def ros_parameters_in(document: Mapping[Any, Any]) -> dict[str, Any]:
-    """Parameters of ROS and of the node itself in what a parameter file holds for the monitor."""
-    flat: dict[str, Any] = {}
-    for node in _monitors(document):
-        _flatten(document[node]["ros__parameters"], "", flat)
-    return {name: value for name, value in flat.items() if is_ros_parameter(name)}
+    return {name: value for name, value in flat.items() if is_ros_parameter(name) == ros}
 
 
 def is_monitor(node: object) -> bool:
     """Whether the parameters of a node, as named in a parameter file, are those of the monitor."""
     return node == "/**" or str(node).rpartition("/")[2] == "fdi_node"
-
-
-def _monitors(document: Mapping[Any, Any]) -> list[Any]:
-    """Names of the monitor in a parameter file: of what two give, the last wins."""
-    return sorted(filter(is_monitor, document), key=lambda node: node != "/**")
 
 
 def is_ros_parameter(name: str) -> bool:

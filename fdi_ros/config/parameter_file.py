@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from fdi_ros.config.config import PARAMETERS, Config, is_monitor, parameters_in, ros_parameters_in
+from fdi_ros.config.config import PARAMETERS, Config, is_monitor, parameters_in
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.yaml_file import parse_yaml, read_yaml
 
@@ -97,7 +97,7 @@ def with_parameters(
     for file in files:
         document = read_yaml(file, "config", ConfigError)
         given |= parameters_in(document, f"config {file}")
-        ros |= ros_parameters_in(document)
+        ros |= parameters_in(document, f"config {file}", ros=True)
         monitors |= set(filter(is_monitor, document))
         _update(others, {node: body for node, body in document.items() if not is_monitor(node)})
     # As checked: of a number that is written as a text the number.

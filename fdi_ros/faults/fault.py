@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.config.settings import setting
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import FAULT_KINDS, ChannelSamples, FaultKind, Memory
+from fdi_ros.faults.kinds import FAULT_KINDS, ChannelSamples, FaultKind, Memory, check_fields
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -39,20 +40,16 @@ class Fault:
     """A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas."""
     kind: FaultKind
     """What it does, with its options."""
-    start: float = 0.0
-    stop: float = math.inf
-    """Seconds from the first sample; active where start <= t < stop."""
-    seed: int = 0
-    """Of the random kinds."""
+    start: float = setting(0.0, "from here on, since the first sample", "s", 0.0, 1e12)
+    stop: float = setting(math.inf, "and before this", "s", 0.0)
+    seed: int = setting(0, "of the random kinds", "", 0)
 
     def __post_init__(self) -> None:
-        name = self.kind.name
-        if not (math.isfinite(self.start) and self.start >= 0):
-            raise FaultError(f"fault {name}: start is {self.start:g} s, expected 0 or more")
+        check_fields(self, f"fault {self.kind.name}")
         if not self.stop > self.start:
-            raise FaultError(f"fault {name}: stop is {self.stop:g} s, expected more than start {self.start:g} s")
-        if self.seed < 0:
-            raise FaultError(f"fault {name}: seed is {self.seed}, expected 0 or more")
+            raise FaultError(
+                f"fault {self.kind.name}: stop is {self.stop:g} s, expected more than start {self.start:g} s"
+            )
 
     @property
     def size(self) -> float | None:
@@ -88,12 +85,11 @@ class Fault:
         return " ".join(words + [f"{name}={value:.12g}" for name, value in options.items() if value is not None])
 
 
-_OWN = ("channel", "kind", "start", "stop", "seed")
-_KEYS = (*_OWN, *dict.fromkeys(name for kind in FAULT_KINDS.values() for name in kind.options()))
-"""All that a fault may be given: the options of all kinds too."""
+_KEYS = ("channel", "kind", "start", "stop", "seed")
+"""What every fault may be given, besides the options of its kind."""
 
 
-def create_kind(name: str, /, **options: float | None) -> FaultKind:
+def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
     """Build a kind of fault by name.
 
     Parameters
@@ -114,7 +110,7 @@ def create_kind(name: str, /, **options: float | None) -> FaultKind:
     taken = kind.options()
     for option in given:
         if option not in taken:
-            raise FaultError(f"fault {name} takes no {option}, only: {', '.join((*_OWN, *taken))}")
+            raise FaultError(f"fault {name} takes no {option}, only: {', '.join((*_KEYS, *taken))}")
     return kind(**{option: given.get(option, field.default) for option, field in taken.items()})
 
 
@@ -126,27 +122,12 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
     FaultError
         If a name is unknown or a value does not fit.
     """
-    for name in items:
-        if name not in _KEYS:
-            raise FaultError(f"fault has unknown key {name!r}, expected one of: {', '.join(_KEYS)}")
     for name in ("channel", "kind"):
         if not isinstance(items.get(name), str) or not items[name]:
             raise FaultError(f"fault needs {name}, got: {dict(items)}")
-    numbers = {name: _number(name, value) for name, value in items.items() if name not in ("channel", "kind")}
-    when = {name: numbers.pop(name) for name in ("start", "stop", "seed") if name in numbers}
-    return Fault(items["channel"], create_kind(items["kind"], **numbers), **when)
-
-
-def _number(name: str, value: Any) -> Any:
-    try:
-        number = float(value)
-        if name == "seed":
-            number = int(str(value))
-    except (TypeError, ValueError) as error:
-        raise FaultError(f"fault: {name} is {value!r}, expected a number") from error
-    if math.isnan(number):
-        raise FaultError(f"fault: {name} is {value!r}, expected a number")
-    return number
+    when = {name: items[name] for name in _KEYS[2:] if name in items}
+    options = {name: value for name, value in items.items() if name not in _KEYS}
+    return Fault(items["channel"], create_kind(items["kind"], **options), **when)
 
 
 def parse_fault(text: str) -> Fault:
@@ -202,10 +183,6 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
     return tuple(faults)
 
 
-def _named(fault: Fault) -> str:
-    return f"fault {fault.kind.name} on {fault.channel}"
-
-
 class Injector:
     """Injects faults into a stream of blocks, in the order of the list.
 
@@ -233,7 +210,7 @@ class Injector:
         self._random = [np.random.default_rng([fault.seed, k]) for k, fault in enumerate(self.faults)]
 
     def time(self, stamp: NDArray[np.int64]) -> Array:
-        """Seconds since the first sample, (N,), of stamps (N,) ns."""
+        """Seconds since the first sample, of stamps, ns."""
         if self.start_stamp is None:
             raise FaultError("no sample has been seen yet: the time of a fault has no origin")
         return np.asarray((stamp - self.start_stamp) * 1e-9)
@@ -251,71 +228,21 @@ class Injector:
             truth[:, struck] |= column[:, None]
         return truth
 
-    def check_start(self, start: float, first: int, learned: float) -> None:
-        """Refuse faults that begin before they can be found.
-
-        Parameters
-        ----------
-        start
-            Beginning of the part that is read, s.
-        first
-            Stamp of its first sample, ns.
-        learned
-            Time from then on over which biases are learned, s.
-
-        Raises
-        ------
-        FaultError
-            Naming the first time that is allowed.
-        """
-        least, why = start, "there the part that is read begins"
-        if learned > 0:
-            least, why = float(self.time(np.array([first]))[0]) + learned, "until then the biases are learned"
-        for fault in self.faults:
-            if fault.start < least:
-                raise FaultError(
-                    f"{_named(fault)} starts at {fault.start:g} s, expected at least {least:.12g} s: {why}"
-                )
-
-    def check_gap(self, before: int, after: int) -> None:
-        """Refuse faults that begin where nothing is recorded.
-
-        Parameters
-        ----------
-        before, after
-            Stamps of the last sample before the gap and of the first after it, ns.
+    def refuse_between(self, low: float, high: float, why: str) -> None:
+        """Refuse faults that begin where they cannot be found: after low and before high, s since the first sample.
 
         Raises
         ------
         FaultError
             Naming the times that are allowed.
         """
-        last, first = self.time(np.array([before, after])).tolist()
+        allowed = [f"at most {low:.12g} s"] if low >= 0 else []
+        allowed += [f"at least {high:.12g} s"] if high < math.inf else []
         for fault in self.faults:
-            if last < fault.start < first:
+            if low < fault.start < high:
                 raise FaultError(
-                    f"{_named(fault)} starts at {fault.start:g} s, in a gap of the recording: expected at most"
-                    f" {last:.12g} s, or at least {first:.12g} s"
-                )
-
-    def check_end(self, last: int) -> None:
-        """Refuse faults that begin after the last sample.
-
-        Parameters
-        ----------
-        last
-            Its stamp, ns.
-
-        Raises
-        ------
-        FaultError
-            Naming the last time that is allowed.
-        """
-        most = float(self.time(np.array([last]))[0])
-        for fault in self.faults:
-            if fault.start > most:
-                raise FaultError(
-                    f"{_named(fault)} starts at {fault.start:g} s, expected at most {most:.12g} s, the last sample"
+                    f"fault {fault.kind.name} on {fault.channel} starts at {fault.start:g} s,"
+                    f" expected {' or '.join(allowed)}: {why}"
                 )
 
     def apply(self, block: Block) -> Block:

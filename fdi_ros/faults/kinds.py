@@ -41,6 +41,22 @@ Memory = dict[str, Any]
 """What a fault keeps of the samples before; empty at the start of a stream."""
 
 
+def check_fields(owner: Any, called: str) -> None:
+    """Check the fields of a frozen dataclass that are declared with `setting`, and give them their types.
+
+    Raises
+    ------
+    FaultError
+        If one is missing or out of range.
+    """
+    for name, field in fields_of(owner).items():
+        value = getattr(owner, name)
+        if value is REQUIRED:
+            raise FaultError(f"{called} needs {name}" + (f" in {field.unit}" if field.unit else ""))
+        if value is not None or field.default is not None:
+            object.__setattr__(owner, name, check(field, value, f"{called}: {name}", FaultError))
+
+
 FAULT_KINDS: dict[str, type[FaultKind]] = {}
 """Every kind of fault by name."""
 
@@ -65,16 +81,10 @@ class FaultKind(ABC):
             FAULT_KINDS[cls.name] = cls
 
     def __post_init__(self) -> None:
-        for name, option in self.options().items():
-            value = getattr(self, name)
-            if value is REQUIRED:
-                raise FaultError(f"fault {self.name} needs {name}" + (f" in {option.unit}" if option.unit else ""))
-            if value is None:
-                continue
-            value = check(option, value, f"fault {self.name}: {name}", FaultError)
-            if value == 0 and name == "size" and self.has_signed_size():
-                raise FaultError(f"fault {self.name}: size is 0{option.unit_suffix}, which changes nothing")
-            object.__setattr__(self, name, value)
+        check_fields(self, f"fault {self.name}")
+        if getattr(self, "size", None) == 0 and self.has_signed_size():
+            unit = self.options()["size"].unit_suffix
+            raise FaultError(f"fault {self.name}: size is 0{unit}, which changes nothing")
 
     @classmethod
     def options(cls) -> dict[str, Field]:

@@ -194,7 +194,8 @@ class Judge(Walk):
 
     def begin_stretch(self, first: int) -> None:
         """Forget what is declared and suspected; what happened in the stretch before is over."""
-        self.injector.check_gap(self.evaluation.last, first)
+        before, after = self.injector.time(np.array([self.evaluation.last, first])).tolist()
+        self.injector.refuse_between(before, after, "between them nothing is recorded")
         super().begin_stretch(first)
         if self._reference is not None:
             self._reference.reset()
@@ -317,7 +318,9 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
-                injector.check_start(request.start, int(block.stamp[0]), config.bias.startup_bias_duration)
+                first, learned = float(injector.time(block.stamp[0])), config.bias.startup_bias_duration
+                why = "until then the biases are learned" if learned > 0 else "there the part that is read begins"
+                injector.refuse_between(-math.inf, first + learned if learned > 0 else request.start, why)
             for piece in judge.pieces(block):
                 for sink in sinks:
                     sink.begin(samples)
@@ -327,7 +330,8 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
             if progress is not None:
                 progress(samples.progress)
         if judge.evaluation.samples:
-            injector.check_end(judge.evaluation.last)
+            last = float(injector.time(np.array(judge.evaluation.last)))
+            injector.refuse_between(last, math.inf, "that is the last sample")
         stream = StreamResult(
             sample_rate=SampleRate(config.sample_rate, judge.rate),
             origin_ns=samples.origin,

@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from fdi_ros.config.nodes import INJECTOR
+from fdi_ros.config.settings import INJECTOR
 from fdi_ros.core.messages import MessageError
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector, load_scenario, parse_fault

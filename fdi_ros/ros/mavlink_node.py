@@ -25,7 +25,7 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import is_plain_name
-from fdi_ros.config.nodes import MAVLINK
+from fdi_ros.config.settings import MAVLINK
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import SystemTime

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.compiling.notice import announced, refused
 from fdi_ros.config.config import Config
-from fdi_ros.config.nodes import MONITOR
+from fdi_ros.config.settings import MONITOR
 from fdi_ros.errors import FdiError
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.monitor.build import alarm_probability

@@ -25,8 +25,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.timer import Timer
 
 from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
-from fdi_ros.config.nodes import ALL_NODES
-from fdi_ros.config.settings import Field, check
+from fdi_ros.config.settings import ALL_NODES, Field, check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.ros.messages import BoundedLog

@@ -22,7 +22,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
-from fdi_ros.config.nodes import PLAYER
+from fdi_ros.config.settings import PLAYER
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.errors import BagError
 from fdi_ros.ros import parameters

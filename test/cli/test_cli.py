@@ -437,7 +437,7 @@ REPLAY = "replay FLIGHT --config CONFIG"
         ),
         (
             f"{REPLAY} --end 9 --fault 'channel=g1 kind=sign start=9'",
-            "fault sign on g1 starts at 9 s, expected at most 8.99 s, the last sample",
+            "fault sign on g1 starts at 9 s, expected at most 8.99 s: that is the last sample",
         ),
         (f"{REPLAY} --check 'false=0 dlay<1'", "'dlay<1' begins with 'dlay', expected one of"),
         (f"{REPLAY} --check 'delay>1'", "'delay>1' is compared by '>', expected delay<NUMBER"),

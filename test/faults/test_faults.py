@@ -156,22 +156,26 @@ def test_a_fault_says_itself_in_words_that_read_back(kind):
         ("channel=imu_1.x kind=wobble", "unknown fault kind 'wobble', expected one of: bias, drift"),
         ("channel=imu_1.x kind=bias", "needs size in rad/s"),
         ("channel=imu_1.x kind=bias size=0", "size is 0"),
-        ("channel=imu_1.x kind=bias size=nan", "size is 'nan', expected a number"),
+        ("channel=imu_1.x kind=bias size=nan", "size is nan rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=inf", "size is inf rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=1000", "size is 1000 rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=big", "size is 'big', expected a number"),
         ("channel=imu_1.x kind=bias size=1 size=2", "size is given twice"),
-        ("channel=imu_1.x kind=bias size=1 colour=red", "unknown key 'colour'"),
+        (
+            "channel=imu_1.x kind=bias size=1 colour=red",
+            "takes no colour, only: channel, kind, start",
+        ),
         ("channel=imu_1.x kind=bias size=1 duty=0.5", "takes no duty, only: channel, kind, start, stop, seed, size"),
-        ("channel=imu_1.x kind=bias size=1 start=-1", "start is -1 s, expected 0 or more"),
+        ("channel=imu_1.x kind=bias size=1 start=-1", "start is -1 s, expected 0 to 1e+12 s"),
         ("channel=imu_1.x kind=bias size=1 start=5 stop=5", "stop is 5 s, expected more than start 5 s"),
-        ("channel=imu_1.x kind=bias size=1 seed=0.5", "seed is '0.5', expected a number"),
-        ("channel=imu_1.x kind=bias size=1 seed=-1", "seed is -1, expected 0 or more"),
+        ("channel=imu_1.x kind=bias size=1 seed=0.5", "seed is 0.5, expected a whole number"),
+        ("channel=imu_1.x kind=bias size=1 seed=-1", "seed is -1, expected 0 to inf"),
         ("channel=imu_1.x kind=delay size=1.5", "size is 1.5 samples, expected a whole number"),
         ("channel=imu_1.x kind=spike size=1 rate=0", "rate is 0 1/s, expected 0.001 to 10000 1/s"),
         ("channel=imu_1 kind=intermittent size=1 duty=2", "duty is 2, expected 0.001 to 0.999"),
         ("channel=imu_1.x kind=triad_loss", "strikes 1 channels, expected 3"),
         ("kind=bias size=1", "needs channel"),
+        ({"channel": "imu_1.x", "kind": "bias", "size": 1, "start": None}, "start is None, expected a number"),
         ("channel=imu_1.x size=1", "needs kind"),
         ("channel=imu_1.x kind bias", "'kind' is not of the form key=value"),
         ("", "needs channel"),
@@ -179,7 +183,7 @@ def test_a_fault_says_itself_in_words_that_read_back(kind):
 )
 def test_a_wrong_fault_is_refused_in_one_line(text, words):
     with pytest.raises(FaultError) as caught:
-        Injector([parse_fault(text)], NAMES)
+        Injector([parse_fault(text) if isinstance(text, str) else fault_from(text)], NAMES)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
