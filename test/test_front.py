@@ -73,7 +73,7 @@ def test_a_fault_is_a_mapping_too_and_settings_a_file(flight: Path, config: fdi_
     result = fdi_ros.replay(flight, root / "config" / "two_imus.yaml", [fault], end=31.0)
     assert result.scores == fdi_ros.replay(flight, config, [FAULT], end=31.0).scores
     assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config
-    with pytest.raises(fdi_ros.FdiError, match="unknown key 'sise'"):
+    with pytest.raises(fdi_ros.FdiError, match="takes no sise, only"):
         fdi_ros.replay(flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}])
 
 

@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-from fdi_ros.monitor.output import ChannelState, Reason
+from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.core.states import ChannelState, Reason
+from fdi_ros.monitor.output import Message, Topic
 from fdi_ros.system.text import plus_minus
 
 if TYPE_CHECKING:
@@ -460,3 +463,38 @@ def _figures(values: Sequence[float]) -> str:
 
 def _stamp(stamp: int) -> str:
     return f"{stamp // 10**9}.{stamp % 10**9:09d}"
+
+
+# As a message ---------------------------------------------------------------------------------------------------------
+
+
+DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+
+
+def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> Message:
+    """Encode diagnostics, stamped at the clock time now, ns; what no header can hold is moved to its end."""
+    # A simulator may say any time.
+    stamp = min(max(now, 0), LAST_STAMP)
+    out = bytearray(struct.pack("<4BiI", 0, 1, 0, 0, *divmod(stamp, 1_000_000_000)))
+    _add_text(out, "")
+    _add_count(out, len(lines))
+    for line in lines:
+        out.append(line.level)
+        for text in (line.name, line.message, line.hardware_id):
+            _add_text(out, text)
+        _add_count(out, len(line.values))
+        for pair in line.values:
+            for text in pair:
+                _add_text(out, text)
+    return Message(DIAGNOSTICS, stamp, bytes(out))
+
+
+def _add_text(out: bytearray, text: str) -> None:
+    data = text.encode() + b"\0"
+    _add_count(out, len(data))
+    out += data
+
+
+def _add_count(out: bytearray, count: int) -> None:
+    # The 4 bytes of encapsulation do not change what is aligned to 4.
+    out += bytes(-len(out) % 4) + struct.pack("<I", count)

@@ -1,17 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the pipeline gives for a block of samples: the figures of each sample, and changes of state as events."""
+"""What the pipeline gives for a block of samples: figures of each sample, changes of state as events, messages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, fill_imu, fill_integrity
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-__all__ = ["ChannelState", "Event", "Events", "Output", "Reason"]
+__all__ = ["ChannelState", "Event", "Output", "Reason"]
 
 _FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 """Where the nine entries of a symmetric (3, 3) matrix stand in its upper triangle."""
@@ -82,49 +83,21 @@ def _cells(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
     return f"{event.stamp / 1e9:.3f}", name, change, format_reason(event, names)
 
 
-class Events(Sequence[Event]):
-    """Changes of state in order, made from their records when they are looked at.
-
-    Parameters
-    ----------
-    rows
-        (E,) records.
-    """
-
-    def __init__(self, rows: NDArray[Any]) -> None:
-        self.rows = rows
-
-    def __repr__(self) -> str:
-        return f"[{', '.join(map(repr, self))}]"
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @overload
-    def __getitem__(self, index: int) -> Event: ...
-    @overload
-    def __getitem__(self, index: slice) -> Events: ...
-    def __getitem__(self, index: int | slice) -> Event | Events:
-        if isinstance(index, slice):
-            return Events(self.rows[index])
-        return _event(self.rows[index])
-
-    def __iter__(self) -> Iterator[Event]:
-        return map(_event, self.rows)
-
-
-def _event(row: Any) -> Event:
-    mask = int(row["group"])
-    return Event(
-        stamp=int(row["stamp"]),
-        channel=int(row["channel"]),
-        before=ChannelState(row["before"]),
-        after=ChannelState(row["after"]),
-        reason=REASONS[row["reason"]],
-        group=members(mask),
-        error=float(row["error"]),
-        row=int(row["row"]),
-    )
+def events_of(rows: NDArray[Any]) -> list[Event]:
+    """Return changes of state in order, from their records (E,)."""
+    return [
+        Event(
+            stamp=int(row["stamp"]),
+            channel=int(row["channel"]),
+            before=ChannelState(row["before"]),
+            after=ChannelState(row["after"]),
+            reason=REASONS[row["reason"]],
+            group=members(int(row["group"])),
+            error=float(row["error"]),
+            row=int(row["row"]),
+        )
+        for row in rows
+    ]
 
 
 class Output:
@@ -245,3 +218,109 @@ class Output:
     def level(self) -> Array:
         """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
         return self.rows["level"]
+
+
+# As messages: one encoder for the live node and for the output bag ----------------------------------------------------
+
+
+Template = ImuTemplate | ChannelsTemplate
+
+
+class Topic(NamedTuple):
+    """One topic that a monitor publishes."""
+
+    name: str
+    """As the node publishes it, before it is remapped."""
+    type: str
+    """Of its messages: ``sensor_msgs/msg/Imu``."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleOutput:
+    """What is said of each sample on a topic of its own."""
+
+    topic: Topic
+    make: Callable[[str, int], Template]
+    """Makes a message to be filled, from the frame_id of the rate and the number of channels n."""
+    fill: Callable[[Template, Any, int, int], None]
+    """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
+    needs_rate: bool = False
+    """Whether it is of samples with a fused rate alone."""
+    on_demand: bool = False
+    """Whether the node leaves it out while nobody subscribes."""
+    by_path: bool = False
+    """Whether the live sample path fills it, by the same function."""
+
+
+def _fill_fused(out: Template, row: Any, n: int, shift: int) -> None:
+    fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"])
+
+
+def _fill_integrity(out: Template, row: Any, n: int, shift: int) -> None:
+    fill_integrity(out.bytes, out.at, row, n)
+
+
+FUSED = SampleOutput(
+    Topic("fused", "sensor_msgs/msg/Imu"),
+    lambda frame_id, n: ImuTemplate(frame_id),
+    _fill_fused,
+    needs_rate=True,
+    by_path=True,
+)
+"""Fused rate and its covariance."""
+INTEGRITY = SampleOutput(
+    Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
+    lambda frame_id, n: ChannelsTemplate(n + 5),
+    _fill_integrity,
+    on_demand=True,
+    by_path=True,
+)
+"""Statistic, threshold, states of the channels, protection level."""
+OUTPUTS = (FUSED, INTEGRITY)
+"""All that is said of samples, live and in an output bag."""
+
+
+class Message(NamedTuple):
+    """One message to be published or recorded."""
+
+    topic: Topic
+    stamp: int
+    """Of what it is about, ns."""
+    data: bytes
+    """Serialised."""
+
+
+class Encoder:
+    """Makes messages of the output of a monitor.
+
+    Parameters
+    ----------
+    frame_id
+        Of the fused rate.
+    n
+        Number of channels.
+    """
+
+    def __init__(self, frame_id: str, n: int) -> None:
+        self.n = n
+        self.templates = {output: output.make(frame_id, n) for output in OUTPUTS}
+
+    def fill(self, output: SampleOutput, row: Any, shift: int = 0) -> None:
+        """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
+        output.fill(self.templates[output], row, self.n, shift)
+
+    def encode(self, results: Output, shift: int = 0) -> Iterator[Message]:
+        """Encode what is said of samples: of each its fused rate, if there is one, and all else.
+
+        Parameters
+        ----------
+        results
+            Of the samples.
+        shift
+            To be taken off their stamps to have those of the messages, ns.
+        """
+        for row in results.rows:
+            for output, template in self.templates.items():
+                if row["valid"] or not output.needs_rate:
+                    self.fill(output, row, shift)
+                    yield Message(output.topic, int(row["stamp"]), template.bytes.tobytes())

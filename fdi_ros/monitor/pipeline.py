@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import Any
 
@@ -34,7 +34,7 @@ from fdi_ros.monitor.build import (
     suit_detector,
 )
 from fdi_ros.monitor.integrity import Integrity
-from fdi_ros.monitor.output import Events, Output
+from fdi_ros.monitor.output import Event, Output, events_of
 from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.system.text import html_table
 
@@ -269,9 +269,9 @@ class Pipeline:
         return samples
 
 
-def _joined(parts: list[NDArray[Any]], first: int) -> Events | tuple[()]:
+def _joined(parts: list[NDArray[Any]], first: int) -> Sequence[Event]:
     if not parts:
         return ()
-    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    rows = np.concatenate(parts)
     rows["row"] -= first
-    return Events(rows)
+    return events_of(rows)

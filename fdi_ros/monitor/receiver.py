@@ -27,8 +27,7 @@ from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.encoder import FUSED, INTEGRITY, Encoder, SampleOutput
-from fdi_ros.monitor.output import Events
+from fdi_ros.monitor.output import FUSED, INTEGRITY, Encoder, Event, SampleOutput, events_of
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import SOURCES, Source, source_of
 
@@ -188,9 +187,9 @@ class Receiver:
         self.errors[unit] = self.source.explain(code, data, self.pipeline.geometry.n)
 
     @property
-    def events(self) -> Events:
+    def events(self) -> list[Event]:
         """Changes of state that the last sample brought."""
-        return Events(self._events[: self.live["events"][0]].copy())
+        return events_of(self._events[: self.live["events"][0]])
 
     @property
     def shift(self) -> int:

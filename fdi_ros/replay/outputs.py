@@ -22,9 +22,8 @@ from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block, Int
-from fdi_ros.monitor.diagnostics import InputStatus, describe
-from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, Encoder, encode_diagnostics
-from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, InputStatus, describe, encode_diagnostics
+from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.sources import source_of

@@ -25,8 +25,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector, load_scenario, parse_fault
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.monitor.encoder import encode_diagnostics
+from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue

@@ -34,8 +34,8 @@ from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
-from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine
-from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
+from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import (
     REPORT_PERIOD,

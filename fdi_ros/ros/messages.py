@@ -18,8 +18,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.core.path import HAS_RATE, WORKED
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, encode_diagnostics
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine, encode_diagnostics
+from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 

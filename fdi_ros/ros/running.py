@@ -21,7 +21,7 @@ from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.path import HAS_EVENTS, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe, format_apart
-from fdi_ros.monitor.output import ChannelState, Event, Events, format_reason
+from fdi_ros.monitor.output import ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
@@ -178,7 +178,7 @@ class Supervisor:
             self.report()
             self._count_anew(now)
 
-    def report_events(self, events: Events) -> None:
+    def report_events(self, events: Sequence[Event]) -> None:
         """Log and report changes of state, as far as there are not too many."""
         in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
         pair = self._receiver.pipeline.status().apart if in_sets else None

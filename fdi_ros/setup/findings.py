@@ -24,7 +24,8 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import Array
-from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS
+from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.agreement import LEAST_ROTATION

@@ -15,9 +15,8 @@ from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor import encoder
-from fdi_ros.monitor.encoder import FUSED, INTEGRITY, Encoder, SampleOutput, Topic
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor import output
+from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState, Encoder, SampleOutput, Topic
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.sources.channels import ChannelsSource
@@ -65,7 +64,7 @@ def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch
         out.fill([row["statistic"], int(row["stamp"]) - shift])
 
     ratio = SampleOutput(Topic("~/more", ARRAY), lambda frame_id, n: ChannelsTemplate(2), fill)
-    monkeypatch.setattr(encoder, "OUTPUTS", (*encoder.OUTPUTS, ratio))
+    monkeypatch.setattr(output, "OUTPUTS", (*output.OUTPUTS, ratio))
     pipeline = Pipeline(parallel(2))
     block, ear, live = stream(pipeline.geometry, 40), Ear(pipeline), []
     for unit, data in messages(block, 2):

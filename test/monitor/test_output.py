@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import output_of
 
-from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, OUTPUTS, Encoder, encode_diagnostics
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine, encode_diagnostics
+from fdi_ros.monitor.output import FUSED, INTEGRITY, OUTPUTS, Encoder
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9)
 lines = st.builds(
