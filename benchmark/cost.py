@@ -72,7 +72,7 @@ def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
 
     def take(k: int) -> None:
         for unit, message in enumerate(messages[k]):
-            told = receiver.take(unit, message)
+            told = receiver.receive(unit, message)
             while told:
                 if told & SUPPLY:
                     receiver.supply()

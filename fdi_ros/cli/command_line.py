@@ -171,7 +171,14 @@ def _failure(error: Exception) -> int:
     if isinstance(error, OSError):
         where = f" {error.filename}" if error.filename else ""
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
-    return _failed(error)
+    with contextlib.suppress(OSError):
+        traceback.print_exception(error)
+        print(
+            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
+            " above and the command, to the maintainers named in its package.xml",
+            file=sys.stderr,
+        )
+    return DEFECT
 
 
 def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
@@ -194,18 +201,6 @@ def _refused(words: str) -> int:
         # An error quotes what it refuses, which may come from anywhere.
         print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
     return 2
-
-
-def _failed(error: Exception) -> int:
-    """Report a defect of ours: where it happened, then one line on what it is; return the exit code."""
-    with contextlib.suppress(OSError):
-        traceback.print_exception(error)
-        print(
-            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
-            " above and the command, to the maintainers named in its package.xml",
-            file=sys.stderr,
-        )
-    return DEFECT
 
 
 def _let_go_of_output() -> None:

@@ -287,14 +287,14 @@ def _configs(arguments: Namespace) -> dict[str, Config]:
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.build import build_geometry
 
-    own = Config.from_file(arguments.config)
-    own = own.replaced({"detector.name": arguments.detector}) if arguments.detector else own
+    config = Config.from_file(arguments.config)
+    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
     by_detector = arguments.compare and all(other in DETECTORS for other in arguments.compare)
-    found = {own.detector.name if by_detector else ", ".join(file.name for file in arguments.config): own}
-    names = build_geometry(own).channel_names
+    found = {config.detector.name if by_detector else ", ".join(file.name for file in arguments.config): config}
+    names = build_geometry(config).channel_names
     for other in arguments.compare:
         if other in DETECTORS:
-            found[other] = own.replaced({"detector.name": other})
+            found[other] = config.replaced({"detector.name": other})
             continue
         file = resolve(other)
         if not file.exists():

@@ -50,12 +50,7 @@ class Field:
 
 
 def setting(
-    default: Any,
-    description: str,
-    unit: str = "",
-    low: float = -math.inf,
-    high: float = math.inf,
-    **about: Any,
+    default: Any, description: str, unit: str = "", low: float = -math.inf, high: float = math.inf, **about: Any
 ) -> Any:
     """Declare a field of a dataclass; parameters as of `Field`."""
     metadata = {"description": description, "unit": unit, "low": low, "high": high, **about}
@@ -337,12 +332,7 @@ class DetectorConfig:
         0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0, runtime=True
     )
     run_length: float = setting(
-        0.0,
-        "sequential, cusum: samples to a false alarm; 0: the other rates",
-        "samples",
-        0.0,
-        1e15,
-        runtime=True,
+        0.0, "sequential, cusum: samples to a false alarm; 0: the other rates", "samples", 0.0, 1e15, runtime=True
     )
 
 

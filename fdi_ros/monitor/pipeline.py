@@ -225,26 +225,19 @@ class Pipeline:
         if self._in_flight:
             self.prepare()
 
-    def _advance(
-        self, samples: NDArray[Any], rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool
-    ) -> int:
-        """Work rows from one on until all is done, something must be prepared, or after an event; return the next."""
-        row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
-        if count:
-            events.append(self._events[:count].copy())
-        if waits:
-            self.supply()
-            # The level of the row before was not known; otherwise this changes nothing.
-            rows["level"][row - 1] = self.core["last"]["level"][0]
-        return row
-
     def _parts(self, samples: NDArray[Any], stop: bool) -> Iterator[Output]:
-        """Work samples in one part, or in parts that stop at a sample with events."""
+        """Process samples in one part, or in parts that stop at a sample with events."""
         rows = allocate(OutputRow, len(samples))
         events: list[NDArray[Any]] = []
         first = row = 0
         while row < len(rows):
-            row = self._advance(samples, rows, row, events, stop)
+            row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
+            if count:
+                events.append(self._events[:count].copy())
+            if waits:
+                self.supply()
+                # The level of the row before was not known; otherwise this changes nothing.
+                rows["level"][row - 1] = self.core["last"]["level"][0]
             if (events and stop) or row == len(rows):
                 yield Output(rows[first:row], self.geometry.n, _joined(events, first), self.channel_names)
                 first, events = row, []

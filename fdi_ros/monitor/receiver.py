@@ -114,7 +114,7 @@ _NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
 class Receiver:
     """Takes messages, aligns those of several units, and has the pipeline work the samples.
 
-    `take` and `go_on` work one sample at most; what they return says whether its messages are to
+    `receive` and `go_on` work one sample at most; what they return says whether its messages are to
     be published, and whether to go on (`fdi_ros.core.path`).
 
     Parameters
@@ -162,12 +162,12 @@ class Receiver:
             self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
         return flags
 
-    def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
-        """Take a message of an input topic; stamp: when it arrived, ns; 0: not known."""
+    def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
+        """Take in a message of an input topic; stamp: when it arrived, ns; 0: not known."""
         if self.pipeline.detector is not self._detector:
             self._update_detector()
         # Bytes: arrays of what can be written would be compiled once more.
-        flags = self.source.take(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+        flags = self.source.receive(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
         return self._process() if flags & MORE else flags
 
     def go_on(self) -> int:
@@ -228,7 +228,7 @@ class Receiver:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
         aside: Any = tuple(one.copy() for one in self._records)
         with reported("the way from message to message"):
-            kind.take(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
+            kind.receive(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
             process(*aside)
             self.encoder.fill(INTEGRITY, aside[0][0]["last"])
             is_live(self.aligner[0], 0)

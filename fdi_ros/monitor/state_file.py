@@ -34,7 +34,7 @@ from fdi_ros.system import trusted_file
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
 """What a state file begins with."""
-LONGEST = 1 << 20
+MAX_BYTES = 1 << 20
 """Bytes of a state file at most; what is longer is damaged."""
 PLAUSIBLE = 5.0
 """An error is believed up to so many of the standard deviations that it had beforehand, beside its walk since."""
@@ -182,7 +182,7 @@ class StateFile:
         self._check_ours(self.path)
         self._check_ours(self._old)
         try:
-            refusal = self._restore_from(json.loads(trusted_file.read(self.path, LONGEST).decode()), pipeline)
+            refusal = self._restore_from(json.loads(trusted_file.read(self.path, MAX_BYTES).decode()), pipeline)
         except FileNotFoundError:
             self.is_rejected = False
             self.words = f"no state taken from {self.path}: there is none yet"

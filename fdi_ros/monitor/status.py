@@ -194,20 +194,6 @@ class Status:
         return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.turn_on_std > 0
 
 
-@dataclass(frozen=True)
-class Capability:
-    """What one set of channels can do."""
-
-    detectable: Mask
-    """(n,): a fault of the channel would be seen."""
-    isolable: Mask
-    """(n,): a fault of the channel would be seen and named."""
-    note: str
-    """Why a channel is not, in words; empty if nothing is limited."""
-    rests_on: str = ""
-    """What no data can tell, and every name rests on; empty: nothing beyond one fault at a time."""
-
-
 def status_of(
     core: Any, subsets: NDArray[Any], names: Sequence[str], detector: Detector, integrity: Integrity, config: Config
 ) -> Status:
@@ -227,8 +213,8 @@ def status_of(
     n, last, begun = len(names), core["last"], bool(core["samples"])
     state = core["state"][:n]
     repeated = [is_in(i, int(core["copies"]["channels"])) for i in range(n)]
-    capability = capability_of(detector, ~(np.isin(state, LOST) | repeated))
-    seen = capability.detectable & (state != ChannelState.UNCHECKED)
+    detectable, isolable, note, rests_on = _capability(detector, ~(np.isin(state, LOST) | repeated))
+    seen = detectable & (state != ChannelState.UNCHECKED)
     well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
@@ -245,10 +231,10 @@ def status_of(
         withheld=begun and bool(core["now"]["withheld"]) and not core["now"]["learned_from"],
         all_repeat=begun and bool(core["now"]["all_repeat"]),
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
-        can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
+        can_isolate=tuple(names[i] for i in np.flatnonzero(isolable & seen).tolist()),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
         bias_state=_format_bias(core["bias"], names, float(settings["turn_on"])),
-        note=capability.note,
+        note=note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["now"]["fused"]) & well)
         if valid
@@ -260,7 +246,7 @@ def status_of(
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
         turn_on_std=float(settings["turn_on"]),
         errors=_errors(detector, names, begun),
-        names_rest_on=capability.rests_on,
+        names_rest_on=rests_on,
         copies=_copies(core, detector, config),
         apart=_apart(detector, core, names),
     )
@@ -294,28 +280,31 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     )
 
 
-def capability_of(detector: Detector, mask: Mask) -> Capability:
-    """Return what the channels marked in mask (n,) can do with a detector."""
+def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
+    """Return what the channels marked in mask (n,) can do with a detector.
+
+    Returns
+    -------
+    Channels whose fault would be seen, and those whose fault would be isolated, (n,); why others would not, in words;
+    what no data can tell, and every isolation rests on.
+    """
     nothing = np.zeros(len(mask), dtype=bool)
     names = detector.geometry.channel_names
     try:
         reduced = detector.geometry.subset(mask)
     except GeometryError:
-        return Capability(nothing, nothing, _too_little(int(mask.sum())))
+        return nothing, nothing, _too_little(int(mask.sum())), ""
     bits = mask_of(np.flatnonzero(mask))
     method = detector.fewer(bits)
     if method is None:
-        return Capability(nothing, nothing, detector.refusals[bits])
+        return nothing, nothing, detector.refusals[bits], ""
     detectable, isolable = nothing.copy(), nothing.copy()
     detectable[mask], isolable[mask] = reduced.detectable, method.isolable
-    blind = [names[i] for i in np.flatnonzero(mask & ~detectable)]
-    vague = [names[i] for i in np.flatnonzero(detectable & ~isolable)]
-    notes = []
-    if blind:
-        notes.append(f"a fault of {', '.join(blind)} would not be seen")
-    if vague:
-        notes.append(f"a fault of {', '.join(vague)} would be seen but not isolated")
-    return Capability(detectable, isolable, "; ".join(notes), assumption_words(reduced))
+    blind = ", ".join(names[i] for i in np.flatnonzero(mask & ~detectable))
+    vague = ", ".join(names[i] for i in np.flatnonzero(detectable & ~isolable))
+    notes = [f"a fault of {blind} would not be seen"] if blind else []
+    notes += [f"a fault of {vague} would be seen but not isolated"] if vague else []
+    return detectable, isolable, "; ".join(notes), assumption_words(reduced)
 
 
 def _too_little(left: int) -> str:

@@ -342,7 +342,7 @@ class Running:
     def _take(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
         # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
-        result = self.receiver.take(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
+        result = self.receiver.receive(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
         if result:
             self._publish(result, begun, inlet, data)
 

@@ -82,11 +82,11 @@ def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int,
 
 
 @compiled
-def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
-    own = live[0]
+def _receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    monitor = live[0]
     if not 0 <= inlet < aligner[0].n:
         return 0
-    return receive_arrived(own, _read(data, 0, len(data), own.channels, own.sample.z), stamp)
+    return receive_arrived(monitor, _read(data, 0, len(data), monitor.channels, monitor.sample.z), stamp)
 
 
 class ChannelsSource(ArraySource):
@@ -96,7 +96,7 @@ class ChannelsSource(ArraySource):
     called = "an array"
     place = staticmethod(_place)
     decode_into = staticmethod(_decode_into)
-    take = staticmethod(_take)
+    receive = staticmethod(_receive)
 
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:

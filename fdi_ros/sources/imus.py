@@ -32,7 +32,7 @@ def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int,
 
 
 @compiled
-def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+def _receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
     if not 0 <= inlet < aligner[0].n:
         return 0
     measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
@@ -46,4 +46,4 @@ class ImuSource(UnitSource):
     called = "an Imu"
     place = staticmethod(_place)
     decode_into = staticmethod(_decode_into)
-    take = staticmethod(_take)
+    receive = staticmethod(_receive)

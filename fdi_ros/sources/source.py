@@ -67,8 +67,8 @@ class Source(ABC):
 
     @staticmethod
     @abstractmethod
-    def take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
-        """Take one live message.
+    def receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+        """Take in one live message.
 
         Parameters
         ----------

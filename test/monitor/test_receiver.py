@@ -33,7 +33,7 @@ class Ear:
         self.fused, self.integrity, self.events = [], [], []
 
     def take(self, inlet, data, stamp=0):
-        flags = self.receiver.take(inlet, data, stamp)
+        flags = self.receiver.receive(inlet, data, stamp)
         while flags:
             if flags & SUPPLY:
                 self.receiver.supply()
@@ -202,7 +202,7 @@ def test_nothing_grows_while_messages_come():
     ear = Ear(pipeline)
     block = Block(START + STEP * np.arange(10_000), np.random.default_rng(0).normal(0, SIGMA, (10_000, 6)))
     sent = list(messages(block, 2))
-    take = ear.receiver.take
+    take = ear.receiver.receive
     for unit, data in sent[:2000]:
         take(unit, data)
     tracemalloc.start()

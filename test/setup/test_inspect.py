@@ -15,7 +15,7 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_m
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.setup.findings import candidates
+from fdi_ros.setup.findings import NEEDED, candidates
 from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
 from fdi_ros.setup.starting_config import starting_config, starting_config_of
 
@@ -179,7 +179,7 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi):
     made = tmp_path / "c.yaml"
     code, _, said = fdi("inspect", path, "--write", made, "--json", tmp_path / "j")
     assert (code, said.count("\n")) == (2, 1)
-    assert f"{made} is not written: bag.mcap NEEDS two Imu topics, or one array of 4 to 12 values" in said
+    assert f"{made} is not written: bag.mcap NEEDS {NEEDED}" in said
     for words in (
         "usable: only /good",
         "/nan: no message in which all values are finite and below 1e+06 rad/s",
