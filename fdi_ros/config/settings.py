@@ -211,12 +211,7 @@ class ImusConfig:
         **_PER_TRIAD,
     )
     delays: tuple[float, ...] = setting(
-        (),
-        "by how much the stamps of each triad are late (its values were measured that much earlier); empty: none",
-        "s",
-        -0.1,
-        0.1,
-        **_PER_TRIAD,
+        (), "delay of each triad: measured that much before its stamp; empty: none", "s", -0.1, 0.1, **_PER_TRIAD
     )
     max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
     timeout: float = setting(0.1, "a unit silent for so long is not waited for; its input is STALE", "s", 0.001, 10.0)
@@ -273,18 +268,10 @@ class BiasConfig:
         (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, per="channel", other_lengths=(0,)
     )
     turn_on_std: float = setting(
-        0.02,
-        "standard deviation of a channel's bias from one start to the next, where it is not learned",
-        "rad/s",
-        0.0,
-        1.0,
+        0.02, "standard deviation of a bias from one start to the next, where it is not learned", "rad/s", 0.0, 1.0
     )
     max_drift: float = setting(
-        0.1,
-        "the bias of a channel is followed in flight up to this far; beyond, the channel has drifted",
-        "rad/s",
-        0.0,
-        10.0,
+        0.1, "a bias is followed in flight up to this far; beyond, the channel has drifted", "rad/s", 0.0, 10.0
     )
     startup_bias_duration: float = setting(
         0.0, "average each channel over this long at rest at the start and subtract it; 0: off", "s", 0.0, 600.0

@@ -183,14 +183,6 @@ def test_what_nothing_checks_gives_a_rate_and_is_not_called_healthy(out, uncheck
     assert words in status.note
 
 
-def test_below_three_independent_axes_there_is_no_rate():
-    pipeline = Pipeline(parallel(2))
-    faults = [f"channel={name} kind=dropout start=0" for name in ("imu_1.x", "imu_2.x")]
-    output = pipeline.process(struck(stream(pipeline.geometry, 100), faults, pipeline.channel_names))
-    assert not output.valid.any()
-    assert not pipeline.status().has_rate
-
-
 def test_a_detector_that_cannot_run_on_the_channels_left_says_so():
     pipeline = Pipeline(config(detector__name="determinant", geometry__preset="cone", geometry__cone_channels=5))
     run(pipeline, 500, "channel=g2 kind=bias size=0.5 start=1")

@@ -283,12 +283,6 @@ class TestWriting:
         true = STORE.deserialize_cdr(ImuTemplate("a").fill(stamp, [0.0] * 3, [0.0] * 9), IMU).header.stamp
         assert (true.sec, true.nanosec) == divmod(stamp, 10**9)
 
-    @given(st.lists(numbers, min_size=1, max_size=14))
-    def test_filled_channels_read_back(self, values) -> None:
-        data = ChannelsTemplate(len(values)).fill(values)
-        assert same(parse_channels(data, len(values)), values)
-        assert same(STORE.deserialize_cdr(data, ARRAY).data, values)
-
     def test_a_template_refuses_another_number_of_values(self) -> None:
         with pytest.raises(ValueError, match="reshape"):
             ChannelsTemplate(3).fill([1.0, 2.0])
