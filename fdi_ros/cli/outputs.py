@@ -235,16 +235,20 @@ class Outputs:
         figures: Mapping[str, Any] | None = None,
         html: Callable[[], str] | None = None,
         severity: Severity | None = None,
+        **others: Callable[[Path], None],
     ) -> int:
-        """Write page and figures where they were asked for, say the text, confirm; return the exit code.
+        """Write page, figures and other files where they were asked for, all or none, and say the text.
 
-        `severity` is that of the first line of the text, where that is a verdict.
+        `severity` is that of the first line of the text, where that is a verdict; `others` write the files of other
+        options, by name. Returns the exit code.
         """
+        if html is not None:
+            others["report"] = lambda path: _write_page(path, html())
         with ExitStack() as stack:
-            if html is not None and "report" in self._targets:
-                # It takes its place last: where one of both cannot be written, there is neither.
-                page = stack.enter_context(whole_file(self._targets["report"]))
-                page.write_text(html(), encoding="utf-8", errors="replace")
+            # They take their places at the end: where one cannot be written, there is none.
+            for name, write in others.items():
+                if name in self._targets:
+                    write(stack.enter_context(whole_file(self._targets[name])))
             if figures is not None:
                 write_json(self._targets.get("json"), figures)
         self.say(text, severity)
@@ -255,6 +259,10 @@ class Outputs:
 def config_words(arguments: argparse.Namespace) -> str:
     """Name the parameter files that were read."""
     return ", ".join(map(str, arguments.config))
+
+
+def _write_page(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", errors="replace")
 
 
 def versions() -> str:

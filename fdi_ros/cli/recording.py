@@ -27,8 +27,10 @@ from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
 if TYPE_CHECKING:
+    from fdi_ros.cli.outputs import Outputs
     from fdi_ros.setup.inspect import TopicReport
     from fdi_ros.setup.result import Calibration
+    from fdi_ros.setup.run import SetupResult
 
 
 def _add_inspect(parser: ArgumentParser) -> None:
@@ -123,27 +125,32 @@ def _add_settings(parser: ArgumentParser) -> None:
 def _setup(arguments: Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
+    from fdi_ros.setup.run import set_up
+
+    check_part(arguments)
+    arguments.report = arguments.report or arguments.output.with_suffix(".html")
+    outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
+    with Progress(sys.stderr, arguments.quiet, "looking into the recording", timed=True):
+        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
+    origin = shown(f"made by fdi setup from {arguments.bag.name}; {arguments.report.name} says how.", LINE)
+    return _write_found(arguments, outputs, found, f"# {origin}\n{found.text}")
+
+
+def _write_found(arguments: Namespace, outputs: Outputs, found: SetupResult, config: str, more: str = "") -> int:
+    """Write config, page and figures, and say what was found."""
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.pipeline import Pipeline
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
-    from fdi_ros.setup.run import set_up
-    from fdi_ros.system.result_file import whole_file, write_json
 
-    check_part(arguments)
-    arguments.report = report = arguments.report or arguments.output.with_suffix(".html")
-    outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
-    with Progress(sys.stderr, arguments.quiet, "looking into the recording", timed=True):
-        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
-    said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
-    with whole_file(report) as page, whole_file(arguments.output) as path:
-        origin = shown(f"made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
-        path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
+    def write(path: Path) -> None:
+        path.write_text(config, encoding="utf-8")
         # What the node would refuse is not written.
-        Pipeline.from_config(Config.from_file(path))
-        write_json(arguments.json, setup_figures(found, str(arguments.bag)))
-        page.write_text(setup_page(found, *said), encoding="utf-8")
-    return outputs.finish(setup_text(found, *said), severity=verdict(found).severity)
+        Pipeline(Config.from_file(path))
+
+    said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
+    text, figures = setup_text(found, *said) + more, setup_figures(found, str(arguments.bag))
+    return outputs.finish(text, figures, lambda: setup_page(found, *said), verdict(found).severity, output=write)
 
 
 SETUP = Verb(
@@ -172,11 +179,8 @@ def _calibrate(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
     from fdi_ros.config.config import Config
     from fdi_ros.config.parameter_file import with_parameters
-    from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.calibrate import REPLACED
-    from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
     from fdi_ros.setup.run import recalibrate
-    from fdi_ros.system.result_file import whole_file
 
     config = Config.from_file(arguments.config)
     check_part(arguments)
@@ -185,16 +189,10 @@ def _calibrate(arguments: Namespace) -> int:
         found = recalibrate(arguments.bag, config, arguments.start, arguments.end, arguments.reference, arguments.proof)
     result = found.calibration
     assert result is not None
-    with whole_file(arguments.output) as path:
-        settings = {} if found.kept else result.settings
-        origin = _calibration_origin(arguments, result, found.kept)
-        text = with_parameters(arguments.config, settings, origin, found.remarks, REPLACED if settings else ())
-        path.write_text(text, encoding="utf-8")
-        Config.from_file(path)
-    said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
-    words = f"{setup_text(found, *said)}set: {', '.join(settings) or 'nothing'}\n"
-    figures = setup_figures(found, str(arguments.bag))
-    return outputs.finish(words, figures, lambda: setup_page(found, *said), verdict(found).severity)
+    settings = {} if found.kept else result.settings
+    origin = _calibration_origin(arguments, result, found.kept)
+    text = with_parameters(arguments.config, settings, origin, found.remarks, REPLACED if settings else ())
+    return _write_found(arguments, outputs, found, text, f"set: {', '.join(settings) or 'nothing'}\n")
 
 
 def _calibration_origin(arguments: Namespace, result: Calibration, kept: str) -> str:

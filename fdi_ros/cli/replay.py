@@ -242,7 +242,6 @@ def _sweep(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress, about, check_part, config_words
     from fdi_ros.replay.sweep import sweep
     from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
-    from fdi_ros.system.result_file import whole_file
 
     plan = _plan(arguments)
     check_part(arguments)
@@ -253,18 +252,18 @@ def _sweep(arguments: Namespace) -> int:
     with Progress(sys.stderr, arguments.quiet, "faults") as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
     text, figures = sweep_text(results, plan, arguments.bag.name), sweep_figures(results, plan, str(arguments.bag))
-    with ExitStack() as stack:
-        if arguments.csv is not None:
-            path = stack.enter_context(whole_file(arguments.csv))
-            with path.open("w", newline="", encoding="utf-8") as file:
-                write_csv(file, results, plan)
-        tried = {
-            "compared with": ", ".join(arguments.compare) or "nothing",
-            "faults": "; ".join(swept.words for swept in plan.faults),
-            "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
-        }
-        head = about(arguments, config_words(arguments), tried)
-        return outputs.finish(text, figures, lambda: sweep_page(results, plan, arguments.bag.name, head))
+    tried = {
+        "compared with": ", ".join(arguments.compare) or "nothing",
+        "faults": "; ".join(swept.words for swept in plan.faults),
+        "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
+    }
+    head = about(arguments, config_words(arguments), tried)
+
+    def write(path: Path) -> None:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            write_csv(file, results, plan)
+
+    return outputs.finish(text, figures, lambda: sweep_page(results, plan, arguments.bag.name, head), csv=write)
 
 
 def _plan(arguments: Namespace) -> Plan:
