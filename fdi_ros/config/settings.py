@@ -9,6 +9,7 @@ is declared with `setting`; its type is the annotation.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -121,39 +122,27 @@ def check_length(field: Field, values: Any, count: int, name: str, error: type[F
 _EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}
 
 
-def _check_one(field: Field, kind: str, value: object, name: str, error: type[FdiError]) -> Any:
+def _check_one(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> Any:
     if kind in ("int", "float"):
-        number = _as_number(value)
-        if number is not None:
-            return _check_number(field, kind, number, name, error)
-    elif isinstance(value, bool if kind == "bool" else str):
-        if field.choices and value not in field.choices:
-            raise error(f"{name} is {value!r}, expected one of: {', '.join(field.choices)}")
-        return value
-    raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
+        return _check_number(field, kind, value, name, error)
+    if not isinstance(value, bool if kind == "bool" else str):
+        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
+    if field.choices and value not in field.choices:
+        raise error(f"{name} is {value!r}, expected one of: {', '.join(field.choices)}")
+    return value
 
 
-def _check_number(field: Field, kind: str, value: float, name: str, error: type[FdiError]) -> float:
-    unit = field.unit_suffix
-    if not field.low <= value <= field.high:
-        raise error(f"{name} is {value:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")
-    if kind == "float":
-        return float(value)
-    if not float(value).is_integer():
-        raise error(f"{name} is {value:g}{unit}, expected a whole number")
-    return int(value)
-
-
-def _as_number(value: object) -> float | None:
-    """Return a number, or what a text says; None if it is none."""
-    if isinstance(value, bool):
-        return None
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return None
-    return value if isinstance(value, (int, float)) else None
+def _check_number(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> float:
+    unit, number = field.unit_suffix, math.nan
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        number = math.nan if isinstance(value, bool) else float(value)
+    if math.isnan(number):
+        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
+    if not field.low <= number <= field.high:
+        raise error(f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")
+    if kind == "int" and not number.is_integer():
+        raise error(f"{name} is {number:g}{unit}, expected a whole number")
+    return int(number) if kind == "int" else number
 
 
 # Sections of the settings: a frozen dataclass each, a ROS parameter a field -------------------------------------------
