@@ -203,8 +203,9 @@ def find_degraded(status: Status) -> dict[str, list[str]]:
     """Say what is used, and worse than it should be, beside what is declared: by channel and by unit."""
     found: dict[str, list[str]] = {}
     for channel in (one for one in status.channels if not one.is_left_out):
+        times = f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
         rows = (
-            (channel.noisy, f"noise {_times(channel.noise)} times noise_std and above the others'"),
+            (channel.noisy, f"noise {times} times noise_std and above the others'"),
             (
                 abs(channel.drift) > NEARLY * status.max_drift > 0,
                 f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g}"
@@ -447,10 +448,6 @@ def _seconds(value: float) -> str:
         return f"{value:.1f} s"
     unit, seconds = next((unit, seconds) for unit, seconds, most in _LONGER if abs(value) <= most)
     return f"{value / seconds:.0f} {unit}"
-
-
-def _times(value: float) -> str:
-    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _figure(value: float) -> str:

@@ -163,8 +163,10 @@ class Integrity:
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
         """Level after one more loss, in the greatest motion, on each axis the worst one to lose, rad/s; inf if none."""
         self.fill_losses(subsets, mask)
-        rest = single_losses(mask)
-        return _axes(self.scale * subsets["level"][rest].max(axis=0)) if rest else NO_LEVEL
+        if not (rest := single_losses(mask)):
+            return NO_LEVEL
+        x, y, z = (self.scale * subsets["level"][rest].max(axis=0)).tolist()
+        return x, y, z
 
     def prepare(self, subsets: NDArray[Any]) -> None:
         """Write the levels for all channels and for every loss of one and two: a fault must not wait for them."""
@@ -207,11 +209,6 @@ class Integrity:
         return ProtectionLevel(level, limit, share)
 
 
-def _axes(level: Array) -> Axes:
-    x, y, z = level.tolist()
-    return x, y, z
-
-
 def _modes(
     sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test_parts: Array
 ) -> _Modes:
@@ -241,16 +238,9 @@ def _joined(modes: list[_Modes]) -> _Modes:
 
 
 def _share(level: Array, share: Array, modes: _Modes) -> Array:
-    """Largest share of each variance in the square of the level, (k, 3), over all modes that the level holds back.
+    """Largest share (k, 3) of each variance in the square of the level (3,), over all modes that it holds back.
 
-    Parameters
-    ----------
-    level
-        (3,)
-    share
-        (3, k) share of each variance in the square of the standard deviation of the fused rate.
-    modes
-        Fault modes.
+    The share given (3, k) is that in the square of the standard deviation of the fused rate.
     """
     for at, limit_share, sigma_share in zip(modes.limit, modes.limit_share, modes.sigma_share, strict=True):
         held = (at <= level)[:, None]
