@@ -126,7 +126,8 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
         if not isinstance(items.get(name), str) or not items[name]:
             raise FaultError(f"fault needs {name}, got: {dict(items)}")
     when = {name: items[name] for name in _KEYS[2:] if name in items}
-    options = {name: value for name, value in items.items() if name not in _KEYS}
+    # A key of a YAML file may be anything.
+    options = {str(name): value for name, value in items.items() if name not in _KEYS}
     return Fault(items["channel"], create_kind(items["kind"], **options), **when)
 
 
