@@ -8,7 +8,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY
 from monitor.streams import SIGMA, START, config, parallel, stream, struck
 
 from fdi_ros.core.alignment import Alignment
@@ -63,7 +62,8 @@ def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch
     def fill(out, row, n, shift):
         out.fill([row["statistic"], int(row["stamp"]) - shift])
 
-    ratio = SampleOutput(Topic("~/more", ARRAY), lambda frame_id, n: ChannelsTemplate(2), fill)
+    topic = Topic("~/more", "std_msgs/msg/Float64MultiArray")
+    ratio = SampleOutput(topic, lambda frame_id, n: ChannelsTemplate(2), fill)
     monkeypatch.setattr(output, "OUTPUTS", (*output.OUTPUTS, ratio))
     pipeline = Pipeline(parallel(2))
     block, ear, live = stream(pipeline.geometry, 40), Ear(pipeline), []
