@@ -50,7 +50,7 @@ from fdi_ros.estimator.blocks import (
     update_rest,
     update_time_offsets,
 )
-from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, fill_signals, predict, prepare_layout, project
+from fdi_ros.estimator.error_states import begin_states, fill_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     LONG_TIME,
@@ -93,10 +93,6 @@ PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
-SCALE_WALK, DELAY_WALK = 1e-6, 1e-4
-"""Per sqrt(s): 0.006 % of scale an hour, by temperature; 0.1 ms of delay in a second, by load."""
-CLOCK_RATE_STD = 1e-4
-"""100 ppm: two quartzes of 50 ppm."""
 SHORT = 1.0 - 1e-9
 """What is shown of the threshold where the sums have reached it, and there is no alarm."""
 
@@ -422,16 +418,8 @@ class Sequential(Detector):
             params["layout"],
             unit,
             len(geometry.units),
-            {
-                "bias_std": noise.bias_std,
-                "bias_walk": walk,
-                "scale_std": np.maximum(noise.scale_std, LEAST_SCALE),
-                "scale_walk": np.array(SCALE_WALK),
-                "delay_std": np.array(delay_std),
-                "delay_walk": np.array(DELAY_WALK),
-                "bias_rate_std": np.array(BIAS_RATE_STD),
-                "clock_rate_std": np.array(CLOCK_RATE_STD),
-            },
+            {"bias": noise.bias_std, "scale": np.maximum(noise.scale_std, LEAST_SCALE), "delay": delay_std},
+            {"bias": walk},
         )
         params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
         params["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)

@@ -23,6 +23,7 @@ from fdi_ros.estimator.error_states import (
     ErrorStates,
     copy_states,
     fill_signals,
+    keep_least_variance,
     predict,
     project,
     subtract_errors,
@@ -351,7 +352,7 @@ def unlearnable(error: float, inside: float, square: float) -> float:
 @compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
     """Variance that each state of the motion keeps at least, into ``kf.taught``; biases have no motion in them."""
-    layout, noise, at, n = params.layout, kf.noise, kf.block_at, params.sensors.n
+    layout, noise, n = params.layout, kf.noise, params.sensors.n
     for r in range(layout.count):
         kf.taught[r] = 0.0
     if kf.rest:
@@ -368,16 +369,15 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
         kf.usual_rate[a] += (kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]) / REST_BLOCKS
         for i in range(n):
             error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
-            kf.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, kf.usual_rate[a])
+            least = unlearnable(error, inside, kf.usual_rate[a])
+            keep_least_variance(layout, i, RATE_X + a, least, kf.taught)
     for i in range(n):
-        place, angular_acceleration = layout.place[i, TURN], at.signals[i, TURN]
-        if place >= 0:
-            # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be
-            # learned in the first seconds of motion.
-            error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / params.length
-            least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), angular_acceleration * angular_acceleration)
-            # A unit learns from that of its axes which turns most.
-            kf.taught[place] = least if kf.taught[place] == 0.0 else min(kf.taught[place], least)
+        # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be learned
+        # in the first seconds of motion.
+        error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / params.length
+        turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
+        least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), turn)
+        keep_least_variance(layout, i, TURN, least, kf.taught)
 
 
 @compiled
@@ -393,8 +393,9 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
         for i in range(n):
             for j in range(n):
                 kf.matrix[i, j] -= kf.block_at.covariance[i, j]
-            for k in range(ONE + 1, SIGNALS):
-                kf.block_at.signals[i, k] = 0.0
+            for k in range(SIGNALS):
+                if layout.by[k] != ONE:
+                    kf.block_at.signals[i, k] = 0.0
         project(layout, kf.states, kf.block_at)
         for i in range(n):
             for j in range(n):

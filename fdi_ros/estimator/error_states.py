@@ -4,8 +4,9 @@
 """What the sensors do wrong: bias, scale, misalignment, delay, and how these change, as one error state.
 
 Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each kind of error is one `StateKind` of the
-table `ERROR_KINDS`: its states enter a channel by a signal each (`fill_signals`): ``y = C x + H w + e`` with row i of
-C the signals of channel i at the places of its states. Some have no signal: they are the rate of change of others.
+table `ERROR_KINDS`: its states enter a channel multiplied by a signal each (`fill_signals`): ``y = C x + H w + e``
+with row i of C the signals of channel i at the places of its states. Some have no signal: they are the rate of change
+of others.
 
 To add a kind of error (an error by acceleration, by temperature): the recipe in docs/architecture.md.
 """
@@ -13,6 +14,7 @@ To add a kind of error (an error by acceleration, by temperature): the recipe in
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -22,12 +24,11 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
 from fdi_ros.model.samples import Array
 
-SIGNALS = 5
-ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(SIGNALS)
-"""By what a state enters a channel: one; the body rate about an axis; the angular acceleration along the channel.
-
-All but the first are of motion, and zero at rest.
-"""
+ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
+"""By what a state is multiplied in a channel: one; the body rate about an axis; the angular acceleration along the
+channel, negative. All but the first are of motion, and zero at rest."""
+GIVEN = math.nan
+"""In the table: whoever uses the states says how large the errors are."""
 
 
 class StateKind(NamedTuple):
@@ -37,29 +38,34 @@ class StateKind(NamedTuple):
     unit: str
     per_unit: bool
     """One for each unit but the first, against which the others are; else one for each channel."""
-    signals: tuple[int, ...]
-    """One state for each; none: one state, which is the rate of change of `feeds`."""
-    prior: str
-    """Name of the prior standard deviation, among those given to `prepare_layout`."""
-    walk: str
-    """Name of the random walk, per sqrt(s); empty: a Gauss-Markov process with `memory`."""
+    by: tuple[int, ...]
+    """By what each of its states is multiplied; none: one state, which is the rate of change of `feeds`."""
+    prior: float
+    """Standard deviation before anything is shown, where `prepare_layout` is given no other."""
+    walk: float = 0.0
+    """Random walk, per sqrt(s), where none other is given."""
     memory: float = 0.0
-    """s, after which a rate of change has faded."""
+    """s, after which a rate of change has faded: a Gauss-Markov process."""
     feeds: str = ""
     """Name of the kind whose rate of change this is."""
 
 
 ERROR_KINDS = (
-    StateKind("bias", "rad/s", False, (ONE,), "bias_std", "bias_walk"),
-    StateKind("scale", "", False, (RATE_X, RATE_Y, RATE_Z), "scale_std", "scale_walk"),
-    StateKind("delay", "s", True, (TURN,), "delay_std", "delay_walk"),
-    StateKind("bias rate", "rad/s^2", False, (), "bias_rate_std", "", 1200.0, "bias"),
-    StateKind("clock rate", "s/s", True, (), "clock_rate_std", "", 7200.0, "delay"),
+    StateKind("bias", "rad/s", False, (ONE,), GIVEN, GIVEN),
+    # 0.006 % of scale an hour, by temperature.
+    StateKind("scale", "", False, (RATE_X, RATE_Y, RATE_Z), GIVEN, 1e-6),
+    # 0.1 ms of delay in a second, by load.
+    StateKind("delay", "s", True, (TURN,), GIVEN, 1e-4),
+    # 6 mrad/s in the 20 min in which a sensor warms up.
+    StateKind("bias rate", "rad/s^2", False, (), 5e-6, memory=1200.0, feeds="bias"),
+    # 100 ppm: two quartzes of 50 ppm.
+    StateKind("clock rate", "s/s", True, (), 1e-4, memory=7200.0, feeds="delay"),
 )
 """Biases stand first; a new kind stands last."""
-BIAS_RATE_STD = 5e-6
-"""rad/s^2: 6 mrad/s in the 20 min in which a sensor warms up."""
-MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.signals), 1) for kind in ERROR_KINDS)
+MULTIPLIERS = tuple(by for kind in ERROR_KINDS for by in kind.by)
+"""Of each signal of a channel, those of all kinds in order."""
+SIGNALS = len(MULTIPLIERS)
+MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.by), 1) for kind in ERROR_KINDS)
 
 States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]
 Places = Annotated[NDArray[np.int64], "i8", (MAX_STATES,)]
@@ -75,6 +81,7 @@ class Layout:
 
     n: Whole  # channels
     count: Whole  # states
+    by: Annotated[NDArray[np.int64], "i8", (SIGNALS,)]  # what each signal is
     place: Entries  # state of each signal of a channel; -1: none
     prior: States  # standard deviation, in the unit of each
     walk: States  # per sqrt(s)
@@ -105,14 +112,20 @@ def places_of(name: str, n: int, units: int) -> list[list[int]]:
     """States of a kind: of each channel, or of each unit but the first, one list."""
     at = 0
     for kind in ERROR_KINDS:
-        owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.signals), 1)
+        owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.by), 1)
         if kind.name == name:
             return [[at + owner * each + k for k in range(each)] for owner in range(owners)]
         at += owners * each
     raise KeyError(name)
 
 
-def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int, std: dict[str, Array]) -> None:
+def prepare_layout(
+    layout: NDArray[np.void],
+    unit: NDArray[np.int64],
+    units: int,
+    priors: Mapping[str, float | Array],
+    walks: Mapping[str, float | Array],
+) -> None:
     """Fill a record of `Layout`.
 
     Parameters
@@ -123,27 +136,29 @@ def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int
         (n,) number of the unit of each channel.
     units
         Number of units.
-    std
-        Priors and walks by the names in `ERROR_KINDS`, scalar or (n,).
+    priors, walks
+        Standard deviations and random walks by the names of kinds, scalar or (n,), that stand in place of the table's.
     """
     n = len(unit)
-    layout["n"], layout["place"], layout["feeds"], layout["delays"] = n, -1, -1, -1
-    count = 0
+    layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = n, MULTIPLIERS, -1, -1, -1
+    count = signals = 0
     for kind in ERROR_KINDS:
-        owners = places_of(kind.name, n, units)
+        owners, own = places_of(kind.name, n, units), slice(signals, signals + len(kind.by))
+        signals = own.stop
+        prior, walk = (
+            np.broadcast_to(given.get(kind.name, usual), max(n, len(owners)))
+            for given, usual in ((priors, kind.prior), (walks, kind.walk))
+        )
         for owner, places in enumerate(owners):
             count += len(places)
-            value = {
-                key: np.broadcast_to(std[key], max(n, len(owners)))[owner] for key in (kind.prior, kind.walk) if key
-            }
-            layout["prior"][places], layout["memory"][places] = value[kind.prior], kind.memory
-            layout["walk"][places] = value.get(kind.walk, 0.0)
+            layout["prior"][places], layout["walk"][places] = prior[owner], walk[owner]
+            layout["memory"][places] = kind.memory
             if kind.feeds:
                 layout["feeds"][places] = places_of(kind.feeds, n, units)[owner]
             if kind.name == "delay":
                 layout["delays"][owner + 1] = places[0]
             for i in np.flatnonzero(unit == owner + 1) if kind.per_unit else [owner]:
-                layout["place"][i, list(kind.signals)] = places[: len(kind.signals)]
+                layout["place"][i, own] = places[: len(kind.by)]
     layout["count"] = count
 
 
@@ -183,9 +198,14 @@ def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
 def fill_signals(layout: Layout, rate: Array, angular_acceleration: Array, signals: Array) -> None:
     """Signals (n, `SIGNALS`) at a body rate (3,) rad/s and an angular acceleration along each channel (n,) rad/s^2."""
     for i in range(layout.n):
-        signals[i, ONE] = 1.0
-        signals[i, RATE_X], signals[i, RATE_Y], signals[i, RATE_Z] = rate[0], rate[1], rate[2]
-        signals[i, TURN] = -angular_acceleration[i]
+        for k in range(SIGNALS):
+            by = layout.by[k]
+            if by == ONE:
+                signals[i, k] = 1.0
+            elif by == TURN:
+                signals[i, k] = -angular_acceleration[i]
+            else:
+                signals[i, k] = rate[by - RATE_X]
 
 
 @compiled
@@ -240,7 +260,7 @@ def update(
 
     Parameters
     ----------
-    layout, own
+    layout, states
         The states.
     at
         Their projection.
@@ -284,6 +304,18 @@ def fill_shares(layout: Layout, states: ErrorStates, at: Projection, information
         elif layout.feeds[r] >= layout.n:
             # The rate of change of a state is learned with it.
             taught[r] = taught[layout.feeds[r]]
+
+
+@compiled
+def keep_least_variance(layout: Layout, i: int, by: int, least: float, taught: Array) -> None:
+    """Let the states that enter channel i multiplied by ``by`` keep a variance, in ``taught`` (states,).
+
+    A unit learns from that of its axes which shows most.
+    """
+    for k in range(SIGNALS):
+        place = layout.place[i, k]
+        if layout.by[k] == by and place >= 0:
+            taught[place] = least if taught[place] == 0.0 else min(taught[place], least)
 
 
 @compiled

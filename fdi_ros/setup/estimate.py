@@ -23,7 +23,6 @@ from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
-    BIAS_RATE_STD,
     ERROR_KINDS,
     ONE,
     SIGNALS,
@@ -71,6 +70,7 @@ LEAST_BLOCKS = 5
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")
+(BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")
 """Kinds of error states, whose signals are linear in these."""
 
 
@@ -339,7 +339,7 @@ class _Pass:
         a = information(variance, axes)
         a[rest] = _at_rest(variance[rest], axes)
         start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -delay[1:], np.zeros(n)])
-        prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
+        prior = np.concatenate([prior, np.full(n, BIAS_RATE.prior)])
         flat = coefficients.reshape(-1, n * BASE)
 
         def summed(moments: Array, cross: Array) -> NormalEquations:
@@ -415,16 +415,15 @@ def coefficients_of(sensors: Priors, axes: Array, scale: Array) -> tuple[Array, 
     """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
-    prior = {"bias_std": sensors.bias_std, "scale_std": scale, "delay_std": sensors.delay_std}
-    names = [name for kind in ERROR_KINDS for name in (kind.prior, kind.walk) if name]
-    prepare_layout(layouts[0], sensors.unit, units, {name: np.asarray(prior.get(name, 0.0)) for name in names})
+    priors: dict[str, float | Array] = {"bias": sensors.bias_std, "scale": scale, "delay": sensors.delay_std}
+    prepare_layout(layouts[0], sensors.unit, units, priors, {})
     signals = np.zeros((BASE, n, SIGNALS))
     zero = np.zeros(3)
     for k in range(BASE):
         rate = np.eye(3)[k - 1] if 1 <= k < 4 else zero
         acceleration = axes[:, k - 4] if k >= 4 else np.zeros(n)
         fill_signals(layouts[0], rate, np.ascontiguousarray(acceleration), signals[k])
-    signals[1:, :, ONE] = 0.0
+    signals[1:, :, layouts[0]["by"] == ONE] = 0.0
     shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}
     coefficients = np.zeros((len(shown), n, BASE))

@@ -36,12 +36,8 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 
-STD = {name: np.array(1e-4) for kind in ERROR_KINDS for name in (kind.prior, kind.walk) if name} | {
-    "bias_std": np.array(0.01),
-    "bias_walk": np.array(1e-3),
-    "scale_std": np.array(0.02),
-    "delay_std": np.array(0.01),
-}
+PRIORS = {"bias": 0.01, "scale": 0.02, "delay": 0.01, "bias rate": 1e-4, "clock rate": 1e-4}
+WALKS = {"bias": 1e-3, "scale": 1e-4, "delay": 1e-4}
 
 
 def random_channels(seed: int, n: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray]:
@@ -85,7 +81,7 @@ def test_information_is_that_of_the_parity_vector(seed: int, n: int, absent: int
 
 def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     layout, states, unit = allocate(Layout), allocate(ErrorStates), np.arange(n) * units // n
-    prepare_layout(layout[0], unit, units, STD)
+    prepare_layout(layout[0], unit, units, PRIORS, WALKS)
     begin_states(layout[0], states[0], np.full(n, 0.01))
     return layout[0], states[0], unit
 
@@ -206,11 +202,6 @@ def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None
     found, out = told[-1]
     assert found == ALL
     np.testing.assert_allclose(out, slope * (1e-9 * stamps[-1] - max(late, 0.0)), atol=1e-8)
-
-
-def test_no_two_kinds_share_a_signal() -> None:
-    signals = [signal for kind in ERROR_KINDS for signal in kind.signals]
-    assert sorted(signals) == list(range(SIGNALS))
 
 
 def test_a_hole_is_not_bridged() -> None:
