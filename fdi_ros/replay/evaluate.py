@@ -19,7 +19,7 @@ from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.replay.episodes import Episode, Story
-from fdi_ros.replay.outcomes import ALONE, OutcomeKind, finite
+from fdi_ros.replay.outcomes import ALONE, finite, outcome_of
 from fdi_ros.replay.size import SQUARED
 from fdi_ros.replay.summary import UNCHECKED_STATES, ChannelResult, FaultEffect, Outcome, Scores, StateChange
 
@@ -51,11 +51,21 @@ class Followed:
         """Of the first declaration that names one of its channels, ns."""
         self._alone: set[str] = set()
         """Channels that were declared by themselves."""
+        self._false: set[str] = set()
+        """States in which healthy channels were declared while it lasted."""
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
         """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
-        active = self.fault.start <= since < self.fault.stop + GRACE
-        return active and not set(channels).isdisjoint(self.outcome.channels)
+        return self.is_active(since) and not set(channels).isdisjoint(self.outcome.channels)
+
+    def is_active(self, since: float) -> bool:
+        """Whether what is declared at a time, s, may come of the fault."""
+        return self.fault.start <= since < self.fault.stop + GRACE
+
+    def add_false(self, change: StateChange) -> None:
+        """Take in a declaration that no fault explains, from the time of this one."""
+        self._false.add(change.state)
+        self._conclude()
 
     def add(self, stamp: int, change: StateChange) -> None:
         """Take in a declaration that this fault explains."""
@@ -63,7 +73,6 @@ class Followed:
         if self.detected_stamp is None:
             self.detected_stamp = stamp
             outcome = replace(outcome, detected_at_s=change.at_s, delay_s=delay, detected_as=change.state)
-            outcome = replace(outcome, outcome=OutcomeKind.AMBIGUOUS.value)
         elif stamp != self.detected_stamp:
             # Other channels that are named later have reasons of their own.
             named = tuple(name for name in named if name in outcome.channels)
@@ -72,8 +81,14 @@ class Followed:
             self._alone.add(change.channel)
             if not outcome.isolated and self._alone >= set(outcome.channels):
                 outcome = replace(outcome, isolated=True, isolated_at_s=change.at_s, isolation_delay_s=delay)
-                outcome = replace(outcome, outcome=OutcomeKind.ISOLATED.value)
         self.outcome = outcome
+        self._conclude()
+
+    def _conclude(self) -> None:
+        one, false = self.outcome, self._false
+        found = one.detected_at_s is not None
+        outcome = outcome_of("FAULTY" in false, one.isolated, found, "AMBIGUOUS" in false)
+        self.outcome = replace(one, outcome=outcome.value)
 
 
 @dataclass
@@ -250,6 +265,9 @@ class Evaluation:
             one.add(event.stamp, change)
         if not explaining and event.declares:
             self._unexplained.append(change)
+            for one in self._faults:
+                if one.is_active(time):
+                    one.add_false(change)
 
     def scores(self) -> Scores:
         """Return the figures."""

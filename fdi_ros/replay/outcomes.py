@@ -36,6 +36,17 @@ class OutcomeKind(str, Enum):
     """A healthy channel was declared by itself."""
 
 
+def outcome_of(false_isolation: bool, isolated: bool, in_set: bool, false_group: bool) -> OutcomeKind:
+    """Return what came of a fault: a healthy channel that was declared counts more than that it was found."""
+    if false_isolation:
+        return OutcomeKind.FALSE_ISOLATION
+    if isolated:
+        return OutcomeKind.ISOLATED
+    if in_set:
+        return OutcomeKind.AMBIGUOUS
+    return OutcomeKind.FALSE_GROUP if false_group else OutcomeKind.MISSED
+
+
 class Scored(NamedTuple):
     """What came of one fault, and when."""
 
@@ -73,14 +84,8 @@ def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: f
         isolated, detected = _first(alone[:, channel], since), _first(alone[:, channel] | own, since)
     soon = since <= within
     others = alone if channel is None else np.delete(alone, channel, axis=1)
-    if others.any():
-        outcome = OutcomeKind.FALSE_ISOLATION
-    elif isolated <= within and channel is not None and alone[:, channel].any():
-        outcome = OutcomeKind.ISOLATED
-    elif own[soon].any():
-        outcome = OutcomeKind.AMBIGUOUS
-    else:
-        outcome = OutcomeKind.FALSE_GROUP if among[soon].any() else OutcomeKind.MISSED
+    found = isolated <= within and isolated < np.inf
+    outcome = outcome_of(bool(others.any()), found, bool(own[soon].any()), bool(among[soon].any()))
     return Scored(outcome, isolated, detected)
 
 

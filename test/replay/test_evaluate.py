@@ -19,6 +19,7 @@ from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event
 from fdi_ros.replay.evaluate import Evaluation, Rms
+from fdi_ros.replay.outcomes import score
 from fdi_ros.replay.words import fault_sections, sentences, verdict
 from fdi_ros.report.verdict import Severity
 
@@ -117,6 +118,24 @@ def test_which_declaration_is_whose_doing(faults, events, found, others):
         assert fault.detected_as == events[0].after.name
         assert fault.isolation_delay_s == (None if found[1] is None else found[1] - fault.start_s)
     assert [(one.channel, one.at_s) for one in scores.declared] == others
+
+
+declared = st.lists(st.tuples(st.integers(10, 39), st.integers(0, 5), st.sampled_from((S.OK, S.FAULTY, S.AMBIGUOUS))))
+
+
+@given(declared)
+def test_what_came_of_a_fault_is_the_same_in_a_replay_and_in_a_sweep(drawn):
+    """By the changes of state, and by the states of all samples."""
+    drawn.sort(key=lambda one: one[0])
+    state, since = np.full((40, 6), S.OK), np.arange(40) - 10.0
+    for second, channel, after in drawn:
+        state[second:, channel] = after
+    # Of several changes at once a sample shows the last.
+    last = {(second, channel): after for second, channel, after in drawn}
+    (fault,) = scored(
+        ["channel=g2 kind=bias size=0.2 start=10"], *(event(*at, after) for at, after in last.items())
+    ).faults
+    assert fault.outcome == score(state == S.FAULTY, state == S.AMBIGUOUS, 1, since).outcome.value
 
 
 def test_the_healthy_channel_that_a_fault_made_faulty_is_named():
