@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from fdi_ros.experiments.montecarlo import StudyResult
 from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.replay.outcomes import Estimate
-from fdi_ros.report.layout import PALETTE, Column, Rows, Section, number, page, table, told
+from fdi_ros.report.layout import PALETTE, Rows, Section, number, page, table
 
 LIMIT = "best possible, approximate"
 """For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the
@@ -22,6 +22,8 @@ SIZE = "fault, standard deviations"
 
 Say = Callable[[Any], str]
 """Words of the figures of a method, or of the limit, in a cell."""
+ByDetector = tuple[str, Mapping[str, Any], Say]
+"""A column of a table: its head, the figures of each detector, and their words; None: there are none."""
 Curve = tuple[Sequence[float], Sequence[Estimate]]
 """x, and for each x a figure with its confidence interval."""
 
@@ -86,34 +88,24 @@ def report(result: StudyResult) -> str:
     return page(f"fdi_ros: {result.title or result.study}", [], sections)
 
 
-def _table(title: str, hint: str, columns: Sequence[Column]) -> Section:
+def _table(title: str, hint: str, columns: Sequence[ByDetector]) -> Section:
+    """Lay out a table with a row for each detector."""
+    names = dict.fromkeys(name for _, figures, _ in columns for name in figures)
+    rows = [(name, *(say(figures.get(name)) for _, figures, say in columns)) for name in names]
+    return _alike_together(title, hint, ("detector", *(head for head, _, _ in columns)), rows)
+
+
+def _alike_together(title: str, hint: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Section:
     """Lay out a table whose first column has the detectors: those of equal figures share a row."""
-    head, rows = told(columns)
     alike: dict[tuple[str, ...], list[str]] = {}
     for name, *words in rows:
         alike.setdefault(tuple(words), []).append(name)
     return Section(title, hint, (head, [(", ".join(names), *words) for words, names in alike.items()]))
 
 
-class Cells(NamedTuple):
-    """One column of a table of detectors."""
-
-    head: str
-    figures: Mapping[str, Any]
-    """By detector."""
-    say: Say
-    limit: Any = None
-    """Figures of the best possible."""
-
-
-def _by_detector(cells: Sequence[Cells]) -> list[Column]:
-    """Columns with a row for each detector, and one for the best possible if a cell has it."""
-    names = list(cells[0].figures)
-    limits = int(any(cell.limit is not None for cell in cells))
-    columns = [Column("", [*names, *[LIMIT] * limits], ("detector",), str)]
-    for head, figures, say, limit in cells:
-        columns.append(Column("", [*(figures[name] for name in names), *[limit] * limits], (head,), say))
-    return columns
+def _with_limit(figures: Mapping[str, Any], limit: Any) -> dict[str, Any]:
+    """Return figures by detector, with those of the best possible last where they are known."""
+    return {**figures, **({} if limit is None else {LIMIT: limit})}
 
 
 def _percent(figure: Estimate | float | None) -> str:
@@ -174,27 +166,30 @@ def _snapshot(group: Group) -> list[Section]:
         return [_rates(group, cell) for cell in group.faults]
     healthy, *faults = group.cells
     limits = [cell["limit"][0] if cell["limit"] else None for cell in faults]
-    cells = [Cells(f"{cell['size']:g}", _firsts(cell), _both, at) for cell, at in zip(faults, limits, strict=True)]
     # The best possible is at the false-alarm rate asked for.
     asked = limits[0] and {"declared": limits[0]["false_alarm"]}
-    cells.insert(0, Cells("healthy", _firsts(healthy), _of("declared"), asked))
+    columns: list[ByDetector] = [("healthy", _with_limit(_firsts(healthy), asked), _of("declared"))]
+    for cell, limit in zip(faults, limits, strict=True):
+        columns.append((f"{cell['size']:g}", _with_limit(_firsts(cell), limit), _both))
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
-    found = [_table(f"One fault, {group.mounting}", hint, _by_detector(cells))]
+    found = [_table(f"One fault, {group.mounting}", hint, columns)]
     ranking = [name for name, at in _firsts(faults[0]).items() if "identified" in at]
     if ranking:
-        named = [{name: _firsts(cell)[name] for name in ranking} for cell in faults]
-        cells = [Cells(f"{c['size']:g}", at, _of("identified")) for c, at in zip(faults, named, strict=True)]
+        columns = []
+        for cell in faults:
+            named = {name: at for name, at in _firsts(cell).items() if name in ranking}
+            columns.append((f"{cell['size']:g}", named, _of("identified")))
         title = f"Largest residual is the right one, {group.mounting}"
-        found.append(_table(title, "Percent, alarm or not.", _by_detector(cells)))
+        found.append(_table(title, "Percent, alarm or not.", columns))
     return found
 
 
 def _rates(group: Group, cell: Figures) -> Section:
-    cells = []
+    columns: list[ByDetector] = []
     for k, alarm in enumerate(group.settings["false_alarms"]):
         figures = {name: points[k] for name, points in cell["methods"].items()}
-        cells.append(Cells(f"{alarm:g}", figures, _of("declared"), cell["limit"] and cell["limit"][k]))
-    return _table(_rates_title(group, cell), "Percent declared, by false-alarm rate.", _by_detector(cells))
+        columns.append((f"{alarm:g}", _with_limit(figures, cell["limit"] and cell["limit"][k]), _of("declared")))
+    return _table(_rates_title(group, cell), "Percent declared, by false-alarm rate.", columns)
 
 
 def _rates_title(group: Group, cell: Figures) -> str:
@@ -213,8 +208,8 @@ def _double(group: Group, cell: Figures) -> Section:
         "suspects, mean": mean,
     }
     title = f"Two faults of {cell['size']:g} standard deviations, {group.mounting}"
-    cells = [Cells(head, _firsts(cell), say) for head, say in words.items()]
-    return _table(title, "Percent; coverage of what was declared.", _by_detector(cells))
+    columns = [(head, _firsts(cell), say) for head, say in words.items()]
+    return _table(title, "Percent; coverage of what was declared.", columns)
 
 
 def _snapshot_curves(group: Group) -> list[Section]:
@@ -246,11 +241,11 @@ def _delay(group: Group) -> list[Section]:
 
     asked = group.settings["run_length"]
     hint = f"Mean samples to the alarm at a mean run length of {asked:g} samples, by size in standard deviations."
-    cells = []
+    columns: list[ByDetector] = []
     for cell in group.cells:
         limit = {"mean_delay": cell["limit"]["moustakides"]}
-        cells.append(Cells(f"{cell['size']:g}", cell["methods"], mean, limit))
-    return [_table(f"Delay, {group.mounting}", hint, _by_detector(cells))]
+        columns.append((f"{cell['size']:g}", _with_limit(cell["methods"], limit), mean))
+    return [_table(f"Delay, {group.mounting}", hint, columns)]
 
 
 def _delay_curves(group: Group) -> list[Section]:
@@ -281,7 +276,7 @@ def _flight(group: Group) -> list[Section]:
         ("Error of the fused rate from the onset on", "Root mean square, rad/s.", rms),
     )
     return [
-        _table(title, hint, _by_detector([Cells(cell["fault"], cell["methods"], say) for cell in group.cells]))
+        _table(title, hint, [(cell["fault"], cell["methods"], say) for cell in group.cells])
         for title, hint, say in said
     ]
 
@@ -303,13 +298,12 @@ def _outcomes(cell: Figures, settings: Mapping[str, Any]) -> Section:
             best = cell["limit"][k]
             shares = {"right_declared": best["right"], "wrong_declared": best["declared"] - best["right"]}
             rows.append((LIMIT, f"{alarm:g}", shares))
-    names, alarms, figures = zip(*rows, strict=True)
-    columns = [Column("", names, ("detector",), str), Column("", alarms, ("false alarms",), str)]
-    columns += [Column("", figures, (word.replace("_", ", "),), _of(word)) for word in words]
     title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
     ratio = settings["sigma_ratio"]
     hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
-    return _table(title, hint, columns)
+    head = ("detector", "false alarms", *(word.replace("_", ", ") for word in words))
+    said = [(name, alarm, *(_of(word)(shares) for word in words)) for name, alarm, shares in rows]
+    return _alike_together(title, hint, head, said)
 
 
 _TABLES: Mapping[str, Shows] = {
