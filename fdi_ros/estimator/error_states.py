@@ -138,6 +138,11 @@ def prepare_layout(
         Number of units.
     priors, walks
         Standard deviations and random walks by the names of kinds, scalar or (n,), that stand in place of the table's.
+
+    Raises
+    ------
+    ValueError
+        If one is in neither.
     """
     n = len(unit)
     layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = n, MULTIPLIERS, -1, -1, -1
@@ -149,6 +154,8 @@ def prepare_layout(
             np.broadcast_to(given.get(kind.name, usual), max(n, len(owners)))
             for given, usual in ((priors, kind.prior), (walks, kind.walk))
         )
+        if np.isnan(prior).any() or np.isnan(walk).any():
+            raise ValueError(f"prior and walk of the {kind.name} must be given")
         for owner, places in enumerate(owners):
             count += len(places)
             layout["prior"][places], layout["walk"][places] = prior[owner], walk[owner]

@@ -416,7 +416,7 @@ def coefficients_of(sensors: Priors, axes: Array, scale: Array) -> tuple[Array, 
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
     priors: dict[str, float | Array] = {"bias": sensors.bias_std, "scale": scale, "delay": sensors.delay_std}
-    prepare_layout(layouts[0], sensors.unit, units, priors, {})
+    prepare_layout(layouts[0], sensors.unit, units, priors, {"bias": 0.0})
     signals = np.zeros((BASE, n, SIGNALS))
     zero = np.zeros(3)
     for k in range(BASE):
