@@ -133,10 +133,10 @@ def _check_one(field: Field, kind: str, value: Any, name: str, error: type[FdiEr
 
 
 def _check_number(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> float:
-    unit, number = field.unit_suffix, math.nan
+    unit, number = field.unit_suffix, None
     with contextlib.suppress(TypeError, ValueError, OverflowError):
-        number = math.nan if isinstance(value, bool) else float(value)
-    if math.isnan(number):
+        number = None if isinstance(value, bool) else float(value)
+    if number is None:
         raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
     if not field.low <= number <= field.high:
         raise error(f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")

@@ -156,7 +156,7 @@ def test_a_fault_says_itself_in_words_that_read_back(kind):
         ("channel=imu_1.x kind=wobble", "unknown fault kind 'wobble', expected one of: bias, drift"),
         ("channel=imu_1.x kind=bias", "needs size in rad/s"),
         ("channel=imu_1.x kind=bias size=0", "size is 0"),
-        ("channel=imu_1.x kind=bias size=nan", "size is 'nan', expected a number"),
+        ("channel=imu_1.x kind=bias size=nan", "size is nan rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=inf", "size is inf rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=1000", "size is 1000 rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=big", "size is 'big', expected a number"),
