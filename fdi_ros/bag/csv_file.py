@@ -20,13 +20,14 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Source
+from fdi_ros.bag.flight_log import FlightLog
+from fdi_ros.bag.log_parts import ImuSamples, Portion, Source
 from fdi_ros.bag.raw import MOST_SHOWN
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
@@ -35,6 +36,8 @@ from fdi_ros.system.text import shown
 from fdi_ros.system.yaml_file import read_yaml
 
 COLUMNS = "columns.yaml"
+GUIDE = 'docs/flight_logs.md, "Tables of text"'
+KIND = "columns"
 _PORTION = 1 << 21
 """Bytes that are read at once."""
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
@@ -61,17 +64,24 @@ class Columns(NamedTuple):
     """Rates of each IMU are multiplied by this for rad/s."""
 
 
-class CsvReader(LogReader):
-    """Reads a table in portions."""
+class CsvLog(FlightLog):
+    """An open table, read in portions."""
 
-    def portions(self, end: int) -> Iterator[Portion]:
-        """Read the table from its start up to a place in the file, bytes."""
-        delimiter, columns = self.find_columns()
+    stack = "a table of text (.csv)"
+    magic = b""
+    kinds = (KIND,)
+    settings: ClassVar = {"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"}
+    one_imu = "this table has one IMU ({}): nothing to compare it with"
+    slowest = 5.0
+
+    def portions(self) -> Iterator[Portion]:
+        """Read the table from its start up to `end`."""
+        delimiter, columns = find_columns(self.file, self.note)
         offset, bad, rest = self.file.tell(), 0, b""
         self.counts.clear()
-        while rest or offset < end:
-            data = rest + self.file.read(max(0, min(_PORTION, end - offset - len(rest))))
-            final = offset + len(data) >= end
+        while rest or offset < self.end:
+            data = rest + self.file.read(max(0, min(_PORTION, self.end - offset - len(rest))))
+            final = offset + len(data) >= self.end
             size = data.rfind(b"\n") + 1
             if not size and not final:
                 raise BagError(f"{self.file.name} has a line of more than {len(data)} bytes at byte {offset}")
@@ -89,76 +99,79 @@ class CsvReader(LogReader):
                 samples = _samples(table[good], ends[used][good], columns)
             self.counts["lines"] += len(used)
             offset, rest = offset + size, b"" if final else data[size:]
-            yield Portion(samples, offset / end)
+            yield Portion(samples, offset / self.end)
             if final:
                 break
         if bad:
             self.note(f"{bad} lines without a time were left out")
 
-    def find_columns(self) -> tuple[str, Columns]:
-        """Return what stands between columns, and those that are read, and go behind the line of names.
 
-        Raises
-        ------
-        BagError
-            If there is no such line, or it has no columns of gyros.
-        """
-        self.file.seek(0)
-        line = self._header()
-        delimiter = max("\t;,", key=line.count)
-        names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
-        if np.isfinite([_number(names, k) for k in range(len(names))]).all():
-            raise BagError(
-                f"{self.file.name} has no names of columns: its first line holds numbers. Put a line of names before"
-                f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
-            )
-        return delimiter, self._columns(names)
+def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Columns]:
+    """Return what stands between columns, and those that are read, and go behind the line of names.
 
-    def _header(self) -> str:
-        """Return the first line with something in it, of at least four columns."""
-        for _ in range(64):
-            line = self.file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
-            if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
-                return line.rstrip("\r\n")
-        raise BagError(f"{self.file.name} has no line with the names of its columns")
+    Raises
+    ------
+    BagError
+        If there is no such line, or it has no columns of gyros.
+    """
+    file.seek(0)
+    line = _header(file)
+    delimiter = max("\t;,", key=line.count)
+    names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
+    if np.isfinite([_number(names, k) for k in range(len(names))]).all():
+        raise BagError(
+            f"{file.name} has no names of columns: its first line holds numbers. Put a line of names before"
+            f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
+        )
+    return delimiter, _columns(file, names, note)
 
-    def _columns(self, names: Sequence[str]) -> Columns:
-        """Choose the columns, and say which.
 
-        Raises
-        ------
-        BagError
-            If there are none, or ``columns.yaml`` asks for others than there are.
-        """
-        path = Path(self.file.name).parent / COLUMNS
-        told = read_yaml(path, "file", BagError) if path.exists() else {}
-        if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
-            raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
-        imus = told.get("imus", _imus(names))
-        if not isinstance(imus, list) or any(not isinstance(imu, list) or len(imu) != 3 for imu in imus):
-            raise BagError(f"{path}: imus is a list of three columns for each IMU")
-        time: Any = told.get("time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None))
-        listed = shown(", ".join(names), MOST_SHOWN)
-        for name in (time, *(column for imu in imus for column in imu)):
-            if name not in names:
-                missing = "no column of times" if name is None else f"no column {name!r}"
-                raise BagError(f"{self.file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}")
-        if not imus:
-            raise BagError(f"{self.file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}")
-        tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
-        rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
-        said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
-        stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
-        unit = " in deg/s" if _DEGREES in rates else "" if stated else "; no unit is named: taken as rad/s"
-        self.note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}")
-        places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
-        return Columns(names.index(time), tick, places, tuple(rates))
+def _header(file: BinaryIO) -> str:
+    """Return the first line with something in it, of at least four columns."""
+    for _ in range(64):
+        line = file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
+        if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
+            return line.rstrip("\r\n")
+    raise BagError(f"{file.name} has no line with the names of its columns")
+
+
+def _columns(file: BinaryIO, names: Sequence[str], note: Callable[[str], None]) -> Columns:
+    """Choose the columns, and say which.
+
+    Raises
+    ------
+    BagError
+        If there are none, or ``columns.yaml`` asks for others than there are.
+    """
+    path = Path(file.name).parent / COLUMNS
+    told = read_yaml(path, "file", BagError) if path.exists() else {}
+    if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
+        raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
+    imus = told.get("imus", _imus(names))
+    if not isinstance(imus, list) or any(not isinstance(imu, list) or len(imu) != 3 for imu in imus):
+        raise BagError(f"{path}: imus is a list of three columns for each IMU")
+    time: Any = told.get("time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None))
+    listed = shown(", ".join(names), MOST_SHOWN)
+    for name in (time, *(column for imu in imus for column in imu)):
+        if name not in names:
+            missing = "no column of times" if name is None else f"no column {name!r}"
+            raise BagError(f"{file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}")
+    if not imus:
+        raise BagError(f"{file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}")
+    tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
+    rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
+    said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
+    stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
+    unit = " in deg/s" if _DEGREES in rates else "" if stated else "; no unit is named: taken as rad/s"
+    note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}")
+    places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
+    return Columns(names.index(time), tick, places, tuple(rates))
 
 
 def has_gyros(file: BinaryIO) -> bool:
     """Whether a table has columns of gyros."""
     try:
-        CsvReader(file, lambda _: None).find_columns()
+        find_columns(file, lambda _: None)
     except BagError:
         return False
     return True
@@ -245,16 +258,3 @@ def _samples(table: Array, end: Int, columns: Columns) -> list[ImuSamples]:
         measured = np.asarray(~np.isnan(rate).all(axis=1))
         samples.append(ImuSamples(Source(KIND, k), stamp, rate, absent, end).at(measured))
     return samples
-
-
-KIND = "columns"
-GUIDE = 'docs/flight_logs.md, "Tables of text"'
-CSV = LogFormat(
-    stack="a table of text (.csv)",
-    kinds=(KIND,),
-    settings={"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"},
-    magic=b"",
-    reader=CsvReader,
-    one_imu="this table has one IMU ({}): nothing to compare it with",
-    slowest=5.0,
-)

@@ -18,35 +18,23 @@ spectra, and are not read.
 Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
 TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
 
-FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted. The
-multiplier of a type that has its own (c, C, e, E: hundredths) is that again.
+Rates are in rad/s and accelerations in m/s^2 in all versions; what FMTU, UNIT and MULT say of them is not looked at.
 
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.log_parts import (
-    FLU,
-    Field,
-    ImuSamples,
-    LogFormat,
-    LogReader,
-    Portion,
-    Source,
-    per_time,
-    possible_start,
-    row_type,
-)
+from fdi_ros.bag.flight_log import FlightLog
+from fdi_ros.bag.log_parts import FLU, Field, ImuSamples, Portion, Source, per_time, possible_start, row_type
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
@@ -54,7 +42,6 @@ Rows = NDArray[np.void]
 """Records of a log, by field."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
-MAGIC = b"\xa3\x95"
 _FMT = 128
 _FMT_SIZE = 89
 _HEAD = 3
@@ -85,8 +72,7 @@ _TYPES = {
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"
 """Types that are the number itself."""
-_HUNDREDTHS = "cCeE"
-_TYPES_OF = {"Message": "Z", "Label": "Z", "UnitIds": "N", "MultIds": "N", "I": "B"}
+_TYPES_OF = {"Message": "Z", "I": "B"}
 """Columns that are read and may not be any number, and their types."""
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
@@ -96,13 +82,7 @@ _VALUES = {
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
-_OTHERS = {
-    "MSG": {"Message"},
-    "ERR": {"Subsys", "ECode"},
-    "FMTU": {"FmtType", "UnitIds", "MultIds"},
-    "UNIT": {"Id", "Label"},
-    "MULT": {"Id", "Mult"},
-}
+_OTHERS = {"MSG": {"Message"}, "ERR": {"Subsys", "ECode"}}
 """Columns of further messages that are read."""
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
@@ -194,61 +174,60 @@ def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int,
     return count, position, lost
 
 
-@dataclass
-class _Message:
+class _Message(NamedTuple):
     """A kind of message that is read."""
 
     name: str
     fields: np.dtype[np.void]
     """Columns that are read, within a whole record."""
-    columns: tuple[str, ...]
-    """All columns."""
-    types: str
-
-    @property
-    def sensor(self) -> tuple[str, int] | None:
-        """Kind and number of what samples of sensors are in; None: in this there are none."""
-        match = _SENSORS.fullmatch(self.name)
-        return (match[1], int(match[2] or 1) - 1) if match else None
 
 
-class DataflashReader(LogReader):
-    """Reads a log in portions, in bounded memory."""
+class DataflashLog(FlightLog):
+    """An open log, read in portions, in bounded memory."""
 
-    def portions(self, end: int) -> Iterator[Portion]:
-        """Read the log from its start up to a place in the file, bytes."""
+    stack = "ArduPilot"
+    magic = b"\xa3\x95"
+    kinds = tuple(_VALUES)
+    settings: ClassVar = {
+        "Copter": "ArduCopter: LOG_BITMASK bit 18, Fast IMU",
+        "": "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros",
+    }
+    one_imu = (
+        "this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
+        " INS_ENABLE_MASK names"
+    )
+    counted_by = "IMU"
+
+    def portions(self) -> Iterator[Portion]:
+        """Read the log from its start up to `end`."""
         self._forget()
         offset = lost = 0
         while True:
             self.file.seek(offset)
-            data = np.frombuffer(self.file.read(min(_PORTION, end - offset)), dtype=np.uint8)
-            final = offset + _PORTION >= end
+            data = np.frombuffer(self.file.read(min(_PORTION, self.end - offset)), dtype=np.uint8)
+            final = offset + _PORTION >= self.end
             # Numbers of a damaged log may be anything.
             with np.errstate(all="ignore"):
                 samples, size, beside = self._read(data, final)
             lost += beside
-            yield Portion([one._replace(end=one.end + offset) for one in samples], (offset + size) / end)
+            yield Portion([one._replace(end=one.end + offset) for one in samples], (offset + size) / self.end)
             offset += size
             if final or not size:
                 break
-        if lost + end - offset:
-            self.note(f"{lost + end - offset} bytes belong to no whole record and were left out")
+        if lost + self.end - offset:
+            self.note(f"{lost + self.end - offset} bytes belong to no whole record and were left out")
 
     def _forget(self) -> None:
         """Begin anew: what a log says of its records counts from there on."""
         self.unread.clear()
         self.counts.clear()
-        self.texts.clear()
+        self.said.clear()
         self.vehicle, self.start_utc = "", None
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
         self._messages: dict[int, _Message] = {}
         self._unknown: dict[int, str] = {}
         """Of messages of IMUs that cannot be read: why."""
-        self._units: dict[int, str] = {}
-        self._multipliers: dict[int, float] = {}
-        self._of_columns: dict[int, tuple[bytes, bytes]] = {}
-        """Units and multipliers of the columns of a message."""
 
     def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:
         """Read a portion; return its samples, where its last record ends, and the bytes before that in no record."""
@@ -259,14 +238,15 @@ class DataflashReader(LogReader):
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
         starts = self._sorted(number, offset)
         rows = {k: _rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
-        self._learn(rows)
         samples: list[ImuSamples] = []
         for k, of_message in rows.items():
-            message = self._messages[k]
-            if (sensor := message.sensor) is not None:
-                ends = starts[k] + message.fields.itemsize
-                samples += _samples(Source(*sensor), of_message, self._factors(k, message), ends)
-            elif _GPS.fullmatch(message.name) and self.start_utc is None:
+            name, kind = self._messages[k]
+            if (sensor := _SENSORS.fullmatch(name)) is not None:
+                source = Source(sensor[1], int(sensor[2] or 1) - 1)
+                samples += _samples(source, of_message, starts[k] + kind.itemsize)
+            elif name in _OTHERS:
+                self._listen(name, of_message)
+            elif self.start_utc is None:
                 self.start_utc = _start_utc(of_message)
         return samples, int(end), int(lost)
 
@@ -298,48 +278,17 @@ class DataflashReader(LogReader):
         elif _SENSORS.fullmatch(name):
             self._unknown[number] = lacks
 
-    def _learn(self, rows: dict[int, Rows]) -> None:
-        """Take in what the log says of its vehicle, and of the units of its columns; the first counts."""
-        for k, of_message in rows.items():
-            name = self._messages[k].name
-            if name == "MSG":
-                said = [text.decode("ascii", "replace") for text in of_message["Message"].tolist()]
-                vehicles = (match[1].title() for one in said if (match := _FIRMWARE.match(one)))
-                self.vehicle = self.vehicle or next(vehicles, "")
-                self._add_texts(name, of_message, said)
-            elif name == "ERR":
-                errors = zip(of_message["Subsys"].tolist(), of_message["ECode"].tolist(), strict=True)
-                self._add_texts(name, of_message, [_error_text(*error) for error in errors])
-            elif name == "UNIT":
-                for one in of_message:
-                    self._units.setdefault(int(one["Id"]), one["Label"].decode("ascii", "replace"))
-            elif name == "MULT":
-                for one in of_message:
-                    self._multipliers.setdefault(int(one["Id"]), float(one["Mult"]))
-            elif name == "FMTU":
-                for one in of_message:
-                    self._of_columns.setdefault(int(one["FmtType"]), (one["UnitIds"], one["MultIds"]))
-
-    def _add_texts(self, kind: str, rows: Rows, texts: Sequence[str]) -> None:
-        """Take in what the records (k,) of a message say, where they say when."""
+    def _listen(self, name: str, rows: Rows) -> None:
+        """Take in what records (k,) of a message say of the flight, and of the vehicle; the first counts."""
+        if name == "MSG":
+            texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
+            vehicles = (match[1].title() for one in texts if (match := _FIRMWARE.match(one)))
+            self.vehicle = self.vehicle or next(vehicles, "")
+        else:
+            texts = [_error_text(*error) for error in zip(rows["Subsys"].tolist(), rows["ECode"].tolist(), strict=True)]
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
-                self.add_text(stamp, kind, text)
-
-    def _factors(self, number: int, message: _Message) -> dict[str, float]:
-        """Return what values of each column are to be multiplied by, for rad, m and s."""
-        units, multipliers = self._of_columns.get(number, (b"", b""))
-        factors = {}
-        for k, (column, kind) in enumerate(zip(message.columns, message.types, strict=True)):
-            factor = 0.01 if kind in _HUNDREDTHS else 1.0
-            if k < len(multipliers) and kind not in _HUNDREDTHS:
-                said = self._multipliers.get(multipliers[k], 1.0)
-                # 0 stands for none.
-                factor *= said if math.isfinite(said) and said > 0 else 1.0
-            if k < len(units) and self._units.get(units[k], "").startswith("deg"):
-                factor *= math.pi / 180.0
-            factors[column] = factor
-        return factors
+                self.add_text(stamp, name, text)
 
 
 def _error_text(subsystem: float, code: float) -> str:
@@ -361,7 +310,7 @@ def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message |
     fields: dict[str, Field] = {}
     at = _HEAD
     for column, kind in zip(names, types, strict=True):
-        allowed = _TYPES_OF.get(column, _NUMBERS + _HUNDREDTHS * (column in (*rate, *acceleration)))
+        allowed = _TYPES_OF.get(column, _NUMBERS)
         if column in (*needed, *acceleration, *_OPTIONAL) and kind in allowed:
             fields.setdefault(column, Field(_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
@@ -371,14 +320,14 @@ def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message |
         return None, f"it has no column {lacking[0]}"
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
         return None, "it has no column of times"
-    return _Message(name, row_type(fields, size), names, types), ""
+    return _Message(name, row_type(fields, size)), ""
 
 
-def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int) -> list[ImuSamples]:
+def _samples(source: Source, rows: Rows, end: Int) -> list[ImuSamples]:
     """Return the samples in the records (k,) of one message, of each instance by itself; end (k,) is where they end."""
     columns = rows.dtype.names or ()
     instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), source.instance)
-    rate, acceleration = (_vectors(rows, names, factors) for names in _VALUES[source.kind])
+    rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
         acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
@@ -386,7 +335,6 @@ def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int)
     return [
         ImuSamples(Source(source.kind, k), stamp, rate * FLU, acceleration * FLU, end).at(instance == k)
         for k in np.unique(instance).tolist()
-        if k >= 0
     ]
 
 
@@ -395,11 +343,11 @@ def _rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
     return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
 
 
-def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3), in their units; NaN where the rows do not have them."""
+def _vectors(rows: Rows, columns: Sequence[str]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
     if not set(columns) <= set(rows.dtype.names or ()):
         return np.full((len(rows), 3), np.nan)
-    return np.column_stack([rows[column].astype(np.float64) * factors.get(column, 1.0) for column in columns])
+    return np.column_stack([rows[column].astype(np.float64) for column in columns])
 
 
 def _stamp(rows: Rows) -> Int:
@@ -429,18 +377,3 @@ def _start_utc(rows: Rows) -> int | None:
     stamp = rows["TimeUS"].astype(np.int64) if new else rows["T"].astype(np.int64) * 1000
     utc = (_GPS_EPOCH - _LEAP + _WEEK * week) * 1_000_000 + ms * 1000
     return possible_start(utc, stamp)
-
-
-DATAFLASH = LogFormat(
-    stack="ArduPilot",
-    kinds=tuple(_VALUES),
-    settings={
-        "Copter": "ArduCopter: LOG_BITMASK bit 18, Fast IMU",
-        "": "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros",
-    },
-    magic=MAGIC,
-    reader=DataflashReader,
-    one_imu="this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
-    " INS_ENABLE_MASK names",
-    counted_by="IMU",
-)

@@ -1,15 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a format of flight logs is made of: where samples come from, what a portion of a log gives, records by field."""
+"""Samples of flight logs: where they come from, how often and when they were logged, records by field."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +15,18 @@ from numpy.typing import NDArray
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
 
-SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
-COARSE_RATE = 0.5
-"""Hz."""
 FLU = np.array([1.0, -1.0, -1.0])
 """From FRD."""
+FEWEST = 20
+"""Samples by which the rate of a source can be judged."""
+_TOLERANCE = 0.95
+"""Of that rate; clocks and loggers are not exact."""
+_APART = 1.5
+"""Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
+_STEP = 1_000_000
+"""us; a log goes on as long as its times step back by no more."""
+_BESIDE = 17
+"""Samples whose median says where a log has come to: no few damaged times move it."""
 
 
 class Source(NamedTuple):
@@ -61,10 +66,6 @@ class LogText(NamedTuple):
     text: str
 
 
-MOST_TEXTS = 1000
-"""Texts of a log that are kept: the first ones."""
-
-
 class Portion(NamedTuple):
     """What one portion of a log holds."""
 
@@ -73,64 +74,115 @@ class Portion(NamedTuple):
     """Share of the log read up to its end, 0 to 1."""
 
 
-class LogReader(ABC):
-    """Reads an open log; remembers what the log says of itself.
+@dataclass
+class Track:
+    """What was seen of one source."""
 
-    Parameters
-    ----------
-    file
-        The log.
-    note
-        Takes one line on each thing in it that cannot be read, or that a reader must know.
+    slowest: float
+    """Samples per second that it must be logged at."""
+    count: int = 0
+    fast: int = 0
+    """Samples that follow the one before without a gap."""
+    fast_time: int = 0
+    """us between these and the ones before."""
+    first: int = 0
+    last: int = 0
+    """Stamps of the first and the last, us."""
+
+    def add(self, stamp: Int) -> None:
+        """Take in the stamps (k,) of further samples."""
+        if not len(stamp):
+            return
+        steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
+        steps = steps[(steps > 0) & (steps <= 1e6 * _APART / self.slowest)]
+        self.fast += len(steps)
+        self.fast_time += int(steps.sum())
+        self.first = self.first if self.count else int(stamp[0])
+        self.last = int(stamp[-1])
+        self.count += len(stamp)
+
+    @property
+    def steady(self) -> bool:
+        """Whether most samples follow one another without gaps."""
+        return 2 * self.fast > self.count
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return self.count >= FEWEST and self.fast_enough
+
+    @property
+    def fast_enough(self) -> bool:
+        """Whether it is logged fast enough, as far as its samples tell."""
+        return (self.steady or self.count < FEWEST) and self.rate >= _TOLERANCE * self.slowest
+
+    @property
+    def rate(self) -> float:
+        """Samples per second: between gaps, or if there is little else than gaps, on average."""
+        if self.steady:
+            return self.fast * 1e6 / self.fast_time
+        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+
+    @property
+    def figures(self) -> str:
+        """Words for how fast it is logged."""
+        if self.count < 2:
+            return "once"
+        if self.last <= self.first:
+            return "at times that do not advance"
+        bursts = " in bursts" if not self.fast_enough and self.rate >= _TOLERANCE * self.slowest else ""
+        return f"at {self.rate:.3g} Hz{bursts}"
+
+
+@dataclass
+class Clock:
+    """Follows the time of one source to find where it steps back for good: there a second log begins in the file."""
+
+    latest: int | None = None
+    """Stamp up to which the log has come, us; None: at its start."""
+    stamp: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Of the last samples, us."""
+    end: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Where the records of these end, bytes."""
+
+    def first_behind(self, samples: ImuSamples) -> int:
+        """Take in samples; return where the record of the first one behind a step ends, bytes; 0: there is none."""
+        stamp, end = np.append(self.stamp, samples.stamp), np.append(self.end, samples.end)
+        self.stamp, self.end = stamp[1 - _BESIDE :], end[1 - _BESIDE :]
+        if not len(stamp):
+            return 0
+        steady = bool((np.abs(np.diff(stamp)) <= _STEP).all())
+        come = stamp if steady else medians(stamp, _BESIDE)
+        first = int(come[0]) if self.latest is None else self.latest
+        before = np.maximum.accumulate(np.append(first, come[:-1]))
+        self.latest = max(first, int(come.max()))
+        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+        behind = (come < before - _STEP) | (come - before > LOG_SPAN)
+        return int(end[np.argmax(behind)]) if behind.any() else 0
+
+
+def medians(stamp: Int, window: int) -> Int:
+    """Return the median of so many stamps (k,) beside each; before the first and after the last they are mirrored."""
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, window // 2, mode="reflect"), window)
+    return np.sort(beside, axis=1)[:, window // 2]
+
+
+def copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
+    """Return which sources are copies of which others: those with the same times, since sensors have their own.
+
+    A copy has the number of the sensor and that of all sensors in the sum. Where more than two have the same times, as
+    in a simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
     """
-
-    def __init__(self, file: BinaryIO, note: Callable[[str], None]) -> None:
-        self.file, self.note = file, note
-        self.unread: dict[str, str] = {}
-        """Messages of IMUs that are there and cannot be read, by name, and why."""
-        self.counts: Counter[str] = Counter()
-        """Records of every message, by name."""
-        self.vehicle = ""
-        """Kind of vehicle by the name of its firmware; empty: not known."""
-        self.start_utc: int | None = None
-        """UTC of the start of the autopilot, us since 1970; None: not known."""
-        self.texts: list[LogText] = []
-        """What the autopilot said up to the place that was read."""
-
-    def add_text(self, stamp: int, kind: str, text: str) -> None:
-        """Take in what the autopilot said at a time, us."""
-        if len(self.texts) < MOST_TEXTS and (line := " ".join(text.split())):
-            self.texts.append(LogText(stamp, kind, line))
-
-    @abstractmethod
-    def portions(self, end: int) -> Iterator[Portion]:
-        """Read the log from its start up to a place in the file, bytes, in the order of the file."""
-
-
-@dataclass(frozen=True)
-class LogFormat:
-    """What logs of a flight stack look like."""
-
-    stack: str
-    kinds: tuple[str, ...]
-    """Messages that samples of every IMU are logged in."""
-    settings: Mapping[str, str]
-    """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
-    magic: bytes
-    """First bytes of a file."""
-    reader: Callable[[BinaryIO, Callable[[str], None]], LogReader]
-    one_imu: str
-    """Sentence for a log of a single IMU, with a place for what of it is logged."""
-    slowest: float = 20.0
-    """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-    coarse: str = ""
-    """Kind of message with means of the rate at `COARSE_RATE` or faster, read where nothing better is there."""
-    counted_by: str = ""
-    """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
-    selected: str = ""
-    """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
-    most: int = 0
-    """Bytes of a log that is read whole; 0: it is read in portions, and may have any size."""
+    same = [
+        (one, other)
+        for (one, other), count in shared.items()
+        if one in sensors and other in sensors and 2 * count > min(sensors[one].count, sensors[other].count)
+    ]
+    ordered = sorted({source for pair in same for source in pair})
+    if len(ordered) == 2 * len(same):
+        return {other: one for one, other in same}
+    half = len(ordered) // 2
+    return {} if len(ordered) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:
@@ -167,6 +219,11 @@ def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
         "itemsize": size,
     }
     return np.dtype(layout)
+
+
+def part(size: int, k: int, count: int) -> slice:
+    """Return part k of so many equal ones of a log that was read whole."""
+    return slice(size * k // count, size * (k + 1) // count)
 
 
 def per_time(change: Array, seconds: NDArray[Any]) -> Array:

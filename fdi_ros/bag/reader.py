@@ -19,16 +19,16 @@ from types import TracebackType
 import zstandard
 
 from fdi_ros import __version__
-from fdi_ros.bag.csv_file import CSV
-from fdi_ros.bag.dataflash import DATAFLASH
+from fdi_ros.bag.csv_file import CsvLog
+from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.log_parts import LogText
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import LFS, OWN, Batch, Damage, Topic, find_files
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
-from fdi_ros.bag.tlog import TLOG
-from fdi_ros.bag.ulog import ULOG
+from fdi_ros.bag.tlog import Tlog
+from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import SOURCES, source_of_type
@@ -36,7 +36,7 @@ from fdi_ros.system.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.system.text import shown
 from fdi_ros.system.trusted_file import open_regular
 
-LOGS = {".bin": DATAFLASH, ".csv": CSV, ".tlog": TLOG, ".ulg": ULOG, ".ulog": ULOG}
+LOGS: dict[str, type[FlightLog]] = {".bin": DataflashLog, ".csv": CsvLog, ".tlog": Tlog, ".ulg": Ulog, ".ulog": Ulog}
 """Formats of flight logs, and tables of text."""
 
 
@@ -157,7 +157,7 @@ class Recording:
             elif plain.suffix.lower() == ".bag":
                 self._files.append(Ros1File(plain, self.damage, self._left))
             elif (form := LOGS.get(plain.suffix.lower())) is not None:
-                self._files.append(FlightLog(plain, self.damage, form))
+                self._files.append(form(plain, self.damage))
             else:
                 self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))
         except BagError as error:

@@ -15,13 +15,15 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Source, possible_start
+from fdi_ros.bag.flight_log import FlightLog
+from fdi_ros.bag.log_parts import ImuSamples, Portion, Source, part, possible_start
 from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
 from fdi_ros.mavlink.vehicle import dialect
+from fdi_ros.model.samples import Int
 from fdi_ros.system.limits import TLOG_BYTES
 
 _HEARTBEAT, _STATUSTEXT = 0, 253
@@ -35,8 +37,8 @@ _TOGETHER = 1 << 16
 """Samples of a source handed on at once, about."""
 _LATE = 3_600_000_000
 """us; a message that came by so much more or less late than half of the others has a damaged time."""
-SLOWEST = 5.0
-"""Samples a second from which on it can be judged; many ground stations ask for no more than 10."""
+_LATEST = 2.0**53
+"""us; up to there a time is exact in the memory of samples."""
 
 
 class _Record(NamedTuple):
@@ -52,48 +54,50 @@ class _Record(NamedTuple):
     """As pymavlink decodes it."""
 
 
-class _Series:
-    """The samples of one source, in the order of the file."""
+class Tlog(FlightLog):
+    """An open log, read whole."""
 
-    def __init__(self) -> None:
-        self.stamp, self.came, self.end = array("q"), array("q"), array("q")
-        """On the autopilot's clock, us; since 1970, us; where the record ends, bytes."""
-        self.values = array("d")
-        """Rate and acceleration of each, rad/s and m/s^2."""
+    stack = "a ground station (.tlog)"
+    magic = b"\0"
+    kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
+    settings: ClassVar = {"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"}
+    one_imu = (
+        "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
+        " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
+    )
+    slowest = 5.0  # many ground stations ask for no more than 10 Hz
+    most = TLOG_BYTES
+    _series: dict[Source, array[float]] | None = None
+    """Of each sample: its time, us on the autopilot's clock, when it came, us since 1970, where its record ends, bytes,
+    rate and acceleration, rad/s and m/s^2."""
 
-    def samples(self, source: Source, end: int) -> ImuSamples:
-        """Return those up to a place in the file, bytes."""
-        values = np.frombuffer(self.values).reshape(-1, 6)
-        stamp, ends = (np.frombuffer(one, dtype=np.int64) for one in (self.stamp, self.end))
-        return ImuSamples(source, stamp, values[:, :3], values[:, 3:], ends).at(ends <= end)
-
-
-class TlogReader(LogReader):
-    """Reads a log whole."""
-
-    _series: dict[Source, _Series] | None = None
-
-    def portions(self, end: int) -> Iterator[Portion]:
-        """Return the samples up to a place in the file, bytes."""
+    def portions(self) -> Iterator[Portion]:
+        """Return the samples up to `end`."""
         if self._series is None:
-            self._texts: list[tuple[int, str]] = []
+            self._came: list[tuple[int, str]] = []
             """What the autopilot said, with the time at which it came, us since 1970."""
             self.file.seek(0)
-            self._series = self._load(self.file.read(end))
-        found = [one.samples(source, end) for source, one in self._series.items()]
-        self.start_utc = min(filter(None, (_start_utc(one, end) for one in self._series.values())), default=None)
-        self.texts.clear()
+            self._series = self._load(self.file.read(self.end))
+        rows = {source: np.frombuffer(one).reshape(-1, 9) for source, one in self._series.items()}
+        rows = {source: values[values[:, 2] <= self.end] for source, values in rows.items()}
+        times = {source: values[:, :3].astype(np.int64) for source, values in rows.items()}
+        self.start_utc = min(filter(None, map(_start_utc, times.values())), default=None)
+        self.said.clear()
         if self.start_utc is not None:
-            for came, text in self._texts:
+            for came, text in self._came:
                 self.add_text(came - self.start_utc, "STATUSTEXT", text)
-        count = max((len(one.stamp) for one in found), default=0) // _TOGETHER + 1
+        found = [
+            ImuSamples(source, times[source][:, 0], values[:, 3:6], values[:, 6:], times[source][:, 2])
+            for source, values in rows.items()
+        ]
+        count = max(map(len, rows.values()), default=0) // _TOGETHER + 1
         for k in range(count):
-            yield Portion([one.at(_part(len(one.stamp), k, count)) for one in found], (k + 1) / count)
+            yield Portion([one.at(part(len(one.stamp), k, count)) for one in found], (k + 1) / count)
 
-    def _load(self, data: bytes) -> dict[Source, _Series]:
+    def _load(self, data: bytes) -> dict[Source, array[float]]:
         """Read the messages of IMUs of the first autopilot that says that it is one."""
         beats = (one for one in self._records(data, (_HEARTBEAT,)) if one.message.autopilot != NO_AUTOPILOT)
-        series: dict[Source, _Series] = {}
+        series: dict[Source, array[float]] = {}
         if (beat := next(beats, None)) is None:
             return series
         autopilot = beat.message.autopilot
@@ -101,7 +105,7 @@ class TlogReader(LogReader):
             came = int.from_bytes(data[record.at : record.at + _TIME], "big")
             if record.number == _STATUSTEXT:
                 if record.system == beat.system:
-                    self._texts.append((came, str(record.message.text)))
+                    self._came.append((came, str(record.message.text)))
                 continue
             kind = MESSAGES[record.number].kind
             if record.system != beat.system or not understood(kind, autopilot):
@@ -110,11 +114,9 @@ class TlogReader(LogReader):
             reading = read(record.number, record.payload)
             if reading is None or reading.unit >= MOST_UNITS:
                 continue
-            one = series.setdefault(Source(kind, reading.unit), _Series())
-            one.stamp.append(min(reading.time, 2**63 - 1))
-            one.came.append(came)
-            one.end.append(record.end)
-            one.values.extend((*reading.rate, *reading.acceleration))
+            time = min(reading.time, _LATEST)
+            row = (time, min(came, _LATEST), record.end, *reading.rate, *reading.acceleration)
+            series.setdefault(Source(kind, reading.unit), array("d")).extend(row)
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
         if raw in series and scaled not in series and stands_in(RAW, autopilot):
             series[scaled] = series.pop(raw)
@@ -161,29 +163,16 @@ def record_end(data: bytes, at: int) -> int:
     return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
 
 
-def _part(size: int, k: int, count: int) -> slice:
-    """Return part k of so many equal ones."""
-    return slice(size * k // count, size * (k + 1) // count)
+def _start_utc(times: Int) -> int | None:
+    """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true.
 
-
-def _start_utc(one: _Series, end: int) -> int | None:
-    """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true."""
-    stamp, came, ends = (np.frombuffer(values, dtype=np.int64) for values in (one.stamp, one.came, one.end))
-    start = (came - stamp)[ends <= end]
-    if not len(start):
+    Parameters
+    ----------
+    times
+        (k, 3) of each sample: its time, us, and when it came, us since 1970; another.
+    """
+    if not len(times):
         return None
+    start = times[:, 1] - times[:, 0]
     earliest = start[np.abs(start - np.median(start)) <= _LATE].min(keepdims=True)
     return possible_start(earliest, np.zeros_like(earliest))
-
-
-TLOG = LogFormat(
-    stack="a ground station (.tlog)",
-    kinds=tuple(dict.fromkeys(message.kind for message in MESSAGES.values())),
-    settings={"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"},
-    magic=b"\0",
-    reader=TlogReader,
-    one_imu="this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
-    " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names",
-    slowest=SLOWEST,
-    most=TLOG_BYTES,
-)

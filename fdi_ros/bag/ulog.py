@@ -24,22 +24,14 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from itertools import count, takewhile
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.log_parts import (
-    FLU,
-    SETTINGS,
-    ImuSamples,
-    LogFormat,
-    LogReader,
-    Portion,
-    Source,
-    per_time,
-    possible_start,
-)
+from fdi_ros.bag.flight_log import SETTINGS, FlightLog
+from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, part, per_time, possible_start
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.installation import require
@@ -53,6 +45,8 @@ _DEEPEST = 16
 """Formats within formats."""
 _TOGETHER = 1 << 14
 """Messages handed on at once, about."""
+_SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
+_GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
 _MEAN_TIME = 100_000
 """us over which PX4 takes the means of vehicle_imu_status."""
@@ -87,33 +81,47 @@ class _Bounded(io.BytesIO):
         return data
 
 
-class UlogReader(LogReader):
-    """Reads a file whole."""
+class Ulog(FlightLog):
+    """An open file, read whole."""
 
-    _parts: list[dict[Source, Columns]] | None = None
-    """Of each part of the file, of which appended ones begin with the topics anew: the messages of each topic."""
+    stack = "PX4"
+    magic = MAGIC
+    kinds = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo")
+    settings: ClassVar = {"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"}
+    one_imu = (
+        "this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
+        f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n"
+    )
+    coarse = _STATUS
+    selected = _SELECTED
+    most = ULOG_BYTES
+    _topics: dict[Source, Columns] | None = None
+    """Messages of IMUs."""
 
-    def portions(self, end: int) -> Iterator[Portion]:
+    def portions(self) -> Iterator[Portion]:
         """Return the samples, some of each topic together; where they end in the file is not known."""
-        if self._parts is None:
-            self._parts = self._load(end)
-        sizes = [max((_size(columns) for columns in part.values()), default=0) // _TOGETHER + 1 for part in self._parts]
-        done = 0
-        for part, count in zip(self._parts, sizes, strict=True):
-            for k in range(count):
-                # Numbers of a damaged log may be anything.
-                with np.errstate(all="ignore"):
-                    samples = [one for topic in part.items() if (one := self._samples(*topic, k, count)) is not None]
-                done += 1
-                yield Portion(samples, done / sum(sizes))
+        if self._topics is None:
+            self._topics = self._load()
+        parts = max(map(_size, self._topics.values()), default=0) // _TOGETHER + 1
+        for k in range(parts):
+            samples = []
+            for source, columns in self._topics.items():
+                rows = part(_size(columns), k, parts)
+                read = _read(source.kind, {name: column[rows] for name, column in columns.items()})
+                if read is not None:
+                    stamp, rate, acceleration = read
+                    samples.append(ImuSamples(source, stamp, rate, acceleration, np.zeros(len(stamp), dtype=np.int64)))
+            yield Portion(samples, (k + 1) / parts)
 
-    def _load(self, end: int) -> list[dict[Source, Columns]]:
+    def _load(self) -> dict[Source, Columns]:
         """Read the file with pyulog, and tell what of it could not be read."""
         require("reading PX4's logs (.ulg)", ("pyulog",))
         self.file.seek(0)
-        data = self.file.read(end)
+        data = self.file.read(self.end)
         if (second := data.find(MAGIC, 1)) > 0:
-            self.note(f"a second log begins at byte {second}: the {end - second} bytes from there on were left out")
+            self.note(
+                f"a second log begins at byte {second}: the {len(data) - second} bytes from there on were left out"
+            )
             data = data[:second]
         bounded = _Bounded(data)
         log = _parsed(bounded, self.file.name)
@@ -122,52 +130,38 @@ class UlogReader(LogReader):
         self._note_gaps(log)
         for text in log.logged_messages:
             self.add_text(int(text.timestamp), text.log_level_str(), text.message)
-        parts: list[dict[Source, Columns]] = []
+        topics: dict[Source, Columns] = {}
         for one in log.data_list:
-            source = Source(one.name, one.multi_id)
-            part = next((part for part in parts if source not in part), None)
-            if part is None:
-                parts.append(part := {})
-            part[source] = one.data
-            self._describe(source, one.data)
-        for part in parts:
-            part.update(_simultaneous({one: columns for one, columns in part.items() if one.kind == _STATUS}))
-        for name in _READERS.keys() & log.message_formats.keys() - self.counts.keys():
-            if log.file_corruption:
-                self.unread[name] = _LACKS
-        return parts
+            self._take(topics, Source(one.name, one.multi_id), one.data)
+        topics |= _simultaneous({source: columns for source, columns in topics.items() if source.kind == _STATUS})
+        if log.file_corruption:
+            self.unread |= dict.fromkeys(_READERS.keys() & log.message_formats.keys() - self.counts.keys(), _LACKS)
+        return topics
 
     def _note_gaps(self, log: Any) -> None:
         """Tell what of a file, as pyulog reads it, is damaged or was never written."""
         if log.file_corruption:
             self.note("it is damaged: what pyulog could not read was left out")
         if dropouts := [1e-3 * one.duration for one in log.dropouts]:
-            count = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
+            times = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
             seconds = f"for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
-            self.note(f"the logger dropped out {count}, {seconds}")
+            self.note(f"the logger dropped out {times}, {seconds}")
 
-    def _describe(self, source: Source, columns: Columns) -> None:
-        """Count the messages of a topic, take its time of day, or note why it cannot be read."""
+    def _take(self, topics: dict[Source, Columns], source: Source, columns: Columns) -> None:
+        """Count the messages of a topic, and keep those of an IMU; of GPS the time of day is taken."""
         self.counts[source.kind] += _size(columns)
-        if source.kind not in _NEEDED:
-            return
-        rows = _rows(source.kind, columns)
-        if source.kind in _GPS:
-            self.start_utc = _start_utc(rows) if rows and self.start_utc is None else self.start_utc
-        elif rows is None and source.kind != _STATUS:
-            self.unread[source.kind] = _LACKS
-
-    def _samples(self, source: Source, columns: Columns, k: int, count: int) -> ImuSamples | None:
-        """Return part k of so many equal ones of the samples of a topic; None: it has none."""
+        if source.kind in _GPS and self.start_utc is None:
+            self.start_utc = _start_utc(columns)
         if source.kind not in _READERS:
-            return None
-        size = _size(columns)
-        part = slice(size * k // count, size * (k + 1) // count)
-        rows = _rows(source.kind, {name: column[part] for name, column in columns.items()})
-        if rows is None:
-            return None
-        stamp, rate, acceleration = _READERS[source.kind](rows)
-        return ImuSamples(source, stamp, rate * FLU, acceleration * FLU, np.zeros(len(stamp), dtype=np.int64))
+            return
+        if source in topics:
+            # What was appended to a file begins with the topics anew.
+            before = topics[source]
+            columns = {name: np.concatenate([before[name], columns[name]]) for name in before.keys() & columns.keys()}
+        if _read(source.kind, {name: column[:0] for name, column in columns.items()}) is not None:
+            topics[source] = columns
+        elif source.kind != _STATUS:
+            self.unread[source.kind] = _LACKS
 
 
 def _parsed(file: _Bounded, path: str) -> Any:
@@ -224,16 +218,19 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
 
     What is interpolated over a second of flight differs by more than any fault.
     """
-    rows = {one: rows for one, columns in topics.items() if (rows := _rows(_STATUS, columns)) and _size(rows)}
-    if len(rows) < 2:
+    stamps = {source: _stamp(columns) for source, columns in topics.items() if _size(columns)}
+    if len(stamps) < 2:
         return {}
-    times = np.sort(min(map(_stamp, rows.values()), key=len))
-    nearest = [_nearest(_stamp(columns), times) for columns in rows.values()]
-    late = [_stamp(columns)[k] - times for columns, k in zip(rows.values(), nearest, strict=True)]
+    times = np.sort(min(stamps.values(), key=len))
+    nearest = {source: _nearest(stamp, times) for source, stamp in stamps.items()}
+    late = [stamps[source][k] - times for source, k in nearest.items()]
     kept = np.max(np.abs(late), axis=0) <= _MEAN_TIME // 2
     return {
-        one: {"timestamp": times[kept], **{f"mean_gyro[{a}]": columns["mean_gyro"][k[kept], a] for a in range(3)}}
-        for (one, columns), k in zip(rows.items(), nearest, strict=True)
+        source: {
+            "timestamp": times[kept],
+            **{name: column[k[kept]] for name, column in topics[source].items() if name.startswith("mean_gyro")},
+        }
+        for source, k in nearest.items()
     }
 
 
@@ -251,111 +248,94 @@ def _size(columns: Columns) -> int:
     return len(next(iter(columns.values())))
 
 
-def _rows(name: str, columns: Columns) -> Columns | None:
-    """Return the fields of a topic that are read, arrays as (k, length); None: it lacks what is needed."""
-    rows = {field: columns[field] for field in _OPTIONAL if field in columns}
-    lengths: set[int] = set()
-    for field, length in _NEEDED[name].items():
-        parts = [columns[field]] if field in columns and not length else []
-        while length and (one := f"{field}[{len(parts)}]") in columns:
-            parts.append(columns[one])
-        if not parts or length not in (0, _ANY, len(parts)):
-            return None
-        rows[field] = np.stack(parts, axis=1) if length else parts[0]
-        lengths |= {len(parts)} if length == _ANY else set()
-    return rows if len(lengths) <= 1 else None
+def _array(columns: Columns, name: str) -> NDArray[Any]:
+    """Return a field that is an array, (k, length).
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    there = takewhile(columns.__contains__, (f"{name}[{k}]" for k in count()))
+    return np.stack([columns[one] for one in there], axis=1)
 
 
-def _stamp(rows: Columns) -> Int:
+def _stamp(columns: Columns) -> Int:
     """Time of samples (k,), us since the start of the autopilot; before version 1.11 that of publication."""
-    stamp = rows["timestamp"].astype(np.int64)
-    if "timestamp_sample" not in rows:
+    stamp = columns["timestamp"].astype(np.int64)
+    if "timestamp_sample" not in columns:
         return stamp
-    sampled = rows["timestamp_sample"].astype(np.int64)
+    sampled = columns["timestamp_sample"].astype(np.int64)
     return np.where(sampled > 0, sampled, stamp)
 
 
 Read = tuple[Int, Array, Array]
-"""Stamps (k,), us, rates and accelerations (k, 3) in FRD, NaN where they are not logged."""
+"""Stamps (k,), us, rates and accelerations (k, 3), NaN where they are not logged."""
 
 
-def _absent(stamp: Int) -> Array:
-    return np.full((len(stamp), 3), np.nan)
+def _read(kind: str, columns: Columns) -> Read | None:
+    """Return the samples in messages of a kind, in FLU; None: they lack a field, or have another form."""
+    try:
+        # Numbers of a damaged log may be anything.
+        with np.errstate(all="ignore"):
+            stamp, rate, acceleration = _READERS[kind](columns)
+    except (KeyError, ValueError):
+        return None
+    rate = rate.astype(np.float64)
+    acceleration = np.full(rate.shape, np.nan) if acceleration is None else acceleration.astype(np.float64)
+    if not rate.shape == acceleration.shape == (len(stamp), 3):
+        return None
+    return stamp, rate * FLU, acceleration * FLU
 
 
-def _sensor_gyro(rows: Columns) -> Read:
-    stamp = _stamp(rows)
-    return stamp, np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64), _absent(stamp)
+def _sensor_gyro(columns: Columns) -> tuple[Int, Array, None]:
+    return _stamp(columns), np.stack([columns[axis] for axis in "xyz"], axis=1), None
 
 
-def _vehicle_imu(rows: Columns) -> Read:
+def _vehicle_imu(columns: Columns) -> Read:
     """Mean rates over the time of each sample, and accelerations likewise."""
-    rate = per_time(rows["delta_angle"].astype(np.float64), rows["delta_angle_dt"] * 1e-6)
-    acceleration = per_time(rows["delta_velocity"].astype(np.float64), rows["delta_velocity_dt"] * 1e-6)
-    return _stamp(rows), rate, acceleration
+    rate = per_time(_array(columns, "delta_angle").astype(np.float64), columns["delta_angle_dt"] * 1e-6)
+    change = _array(columns, "delta_velocity").astype(np.float64)
+    return _stamp(columns), rate, per_time(change, columns["delta_velocity_dt"] * 1e-6)
 
 
-def _sensor_combined(rows: Columns) -> Read:
-    stamp = _stamp(rows)
-    return stamp, rows["gyro_rad"].astype(np.float64), _absent(stamp)
+def _sensor_combined(columns: Columns) -> tuple[Int, Array, None]:
+    return _stamp(columns), _array(columns, "gyro_rad"), None
 
 
-def _sensor_gyro_fifo(rows: Columns) -> Read:
+def _sensor_gyro_fifo(columns: Columns) -> tuple[Int, Array, None]:
     """All samples of each message: equally spaced, the last at its time."""
-    room = rows["x"].shape[1]
-    count = np.minimum(rows["samples"].astype(np.int64), room)
-    before = count[:, None] - 1 - np.arange(room)
-    good = np.isfinite(rows["dt"]) & (rows["dt"] > 0) & (rows["dt"] < 1e6)
-    spacing = np.where(good, rows["dt"], 0.0).astype(np.float64)
-    stamp = _stamp(rows)[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
-    raw = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-    rate = raw * rows["scale"].astype(np.float64)[:, None, None]
+    raw = np.stack([_array(columns, axis) for axis in "xyz"], axis=-1).astype(np.float64)
+    room = raw.shape[1]
+    size = np.minimum(columns["samples"].astype(np.int64), room)
+    before = size[:, None] - 1 - np.arange(room)
+    spacing = columns["dt"].astype(np.float64)
+    spacing = np.where((spacing > 0) & (spacing < 1e6), spacing, 0.0)
+    stamp = _stamp(columns)[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
+    rate = raw * columns["scale"].astype(np.float64)[:, None, None]
     filled = before >= 0
-    return stamp[filled], rate[filled], _absent(stamp[filled])
+    return stamp[filled], rate[filled], None
 
 
-def _vehicle_imu_status(rows: Columns) -> Read:
+def _vehicle_imu_status(columns: Columns) -> tuple[Int, Array, None]:
     """Mean rates of the last 0.1 s before each message, at the middle of these."""
-    stamp = _stamp(rows) - _MEAN_TIME // 2
-    return stamp, rows["mean_gyro"].astype(np.float64), _absent(stamp)
+    return _stamp(columns) - _MEAN_TIME // 2, _array(columns, "mean_gyro"), None
 
 
-def _start_utc(rows: Columns) -> int | None:
+def _start_utc(columns: Columns) -> int | None:
     """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
-    fixed = rows["fix_type"] >= _FIX if "fix_type" in rows else np.ones(len(rows["timestamp"]), dtype=bool)
-    return possible_start(rows["time_utc_usec"].astype(np.int64)[fixed], rows["timestamp"].astype(np.int64)[fixed])
+    if not {"timestamp", "time_utc_usec"} <= columns.keys():
+        return None
+    fixed = columns["fix_type"] >= _FIX if "fix_type" in columns else np.ones(_size(columns), dtype=bool)
+    utc, stamp = (columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp"))
+    return possible_start(utc, stamp)
 
 
-_READERS: dict[str, Callable[[Columns], Read]] = {
+_READERS: dict[str, Callable[[Columns], tuple[Int, Array, Array | None]]] = {
     "vehicle_imu": _vehicle_imu,
     "sensor_gyro": _sensor_gyro,
     "sensor_gyro_fifo": _sensor_gyro_fifo,
-    "sensor_combined": _sensor_combined,
-    "vehicle_imu_status": _vehicle_imu_status,
+    _SELECTED: _sensor_combined,
+    _STATUS: _vehicle_imu_status,
 }
-_SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
-_GPS = ("sensor_gps", "vehicle_gps_position")
-_ANY = -1
-_NEEDED = {
-    "sensor_gyro": {"timestamp": 0, "x": 0, "y": 0, "z": 0},
-    "vehicle_imu": {"timestamp": 0, "delta_angle": 3, "delta_angle_dt": 0, "delta_velocity": 3, "delta_velocity_dt": 0},
-    "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": _ANY, "y": _ANY, "z": _ANY},
-    _SELECTED: {"timestamp": 0, "gyro_rad": 3},
-    _STATUS: {"timestamp": 0, "mean_gyro": 3},
-    **{name: {"timestamp": 0, "time_utc_usec": 0} for name in _GPS},
-}
-"""Fields without which a topic is not read, and how long an array each is: 0, a single value; `_ANY`, all alike."""
-_OPTIONAL = ("timestamp_sample", "fix_type")
-
-ULOG = LogFormat(
-    stack="PX4",
-    kinds=tuple(name for name in _READERS if name not in (_SELECTED, _STATUS)),
-    settings={"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"},
-    magic=MAGIC,
-    reader=UlogReader,
-    one_imu="this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
-    f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n",
-    coarse=_STATUS,
-    selected=_SELECTED,
-    most=ULOG_BYTES,
-)
+"""Stamp, rate and acceleration in FRD of the messages of each kind; None: that is not logged."""

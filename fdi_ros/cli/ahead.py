@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import multiprocessing
 import os
@@ -78,12 +77,12 @@ def warm_path() -> None:
 def warm_verbs() -> None:
     """Compile what the offline verbs need besides, whatever the detector."""
     if all(map(there, BAGS)):
-        from fdi_ros.bag.dataflash import DataflashReader
+        from fdi_ros.bag.dataflash import find_records
         from fdi_ros.bag.mcap_file import walk
-        from fdi_ros.bag.raw import Damage
 
         walk(b"")
-        list(DataflashReader(io.BytesIO(b"\0"), Damage().add).portions(1))
+        sizes, found = np.zeros(256, dtype=np.int64), np.empty((2, 1), dtype=np.int64)
+        find_records(np.frombuffer(b"\0", dtype=np.uint8), sizes, True, found)
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
     Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))
