@@ -117,12 +117,9 @@ def add_workers(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="Dask scheduler to work instead: tls://host:port, or where nobody else reaches it tcp://host:port",
+        help="Dask scheduler to work instead: tls://host:port (certificates: Dask's configuration), or where nobody"
+        " else reaches it tcp://host:port",
     )
-    default = "default: Dask's configuration"
-    add_file(parser, "--tls-ca-file", f"certificate that the scheduler's is known by; {default}")
-    add_file(parser, "--tls-cert", f"certificate to be known by; {default}")
-    add_file(parser, "--tls-key", f"key of that certificate; {default}")
 
 
 def shipped(kind: str) -> str:

@@ -39,11 +39,10 @@ def _fleet(arguments: Namespace) -> int:
     from fdi_ros.fleet.judge import judge_all
     from fdi_ros.fleet.page import Fleet
     from fdi_ros.fleet.tables import Tables
-    from fdi_ros.system.jobs import cluster_of, worker_count
+    from fdi_ros.system.jobs import worker_count
     from fdi_ros.system.result_file import write_text
 
     workers = worker_count(arguments.workers)
-    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     names = ", ".join(shown(file.name) for file in arguments.config)
     parameters = with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
     paths, unread = find_recordings(arguments.paths)
@@ -55,7 +54,9 @@ def _fleet(arguments: Namespace) -> int:
     compile_for_workers(arguments)
     try:
         with Progress(sys.stderr, arguments.quiet, "flights") as progress:
-            judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, progress.show)
+            judge_all(
+                paths, parameters, arguments.calibrate == "each", tables, workers, arguments.scheduler, progress.show
+            )
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
@@ -104,17 +105,15 @@ def _montecarlo(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress
     from fdi_ros.experiments.montecarlo import load_study, run_study
     from fdi_ros.experiments.report import headline, report
-    from fdi_ros.system.jobs import cluster_of
     from fdi_ros.system.result_file import plain
 
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
-    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     outputs = Outputs(arguments, ("report", "json"), [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     compile_for_workers(arguments)
     with Progress(sys.stderr, arguments.quiet, study.name) as progress:
-        result = run_study(study, arguments.workers, cluster, progress.show)
+        result = run_study(study, arguments.workers, arguments.scheduler, progress.show)
     return outputs.finish(f"{headline(result)}\n", plain(result), lambda: report(result))
 
 

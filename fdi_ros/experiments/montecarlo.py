@@ -32,7 +32,7 @@ from fdi_ros.experiments.study import (
     read_study,
 )
 from fdi_ros.replay.outcomes import added
-from fdi_ros.system.jobs import Cluster, run_jobs, worker_count
+from fdi_ros.system.jobs import run_jobs, worker_count
 
 AnyProtocol = TrialProtocol[Any]
 
@@ -116,7 +116,7 @@ def load_study(path: str | Path, trials: int | None = None, seed: int | None = N
 def run_study(
     study: Study,
     workers: int | None = None,
-    cluster: Cluster | None = None,
+    cluster: str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> StudyResult:
     """Run a study and return all figures and settings.
@@ -128,7 +128,7 @@ def run_study(
     workers
         Local processes; None: as many as there are cores. The figures do not depend on it.
     cluster
-        Dask cluster that works instead.
+        Address of the scheduler of a Dask cluster that works instead.
     progress
         Called with the share done.
 

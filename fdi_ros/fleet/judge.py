@@ -31,7 +31,7 @@ from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
-from fdi_ros.system.jobs import Cluster, run_jobs
+from fdi_ros.system.jobs import run_jobs
 from fdi_ros.system.text import date_of, shown, storable
 
 CALIBRATED = 1_000_000
@@ -48,7 +48,7 @@ def judge_all(
     calibrated: bool,
     tables: Tables,
     workers: int,
-    cluster: Cluster | None,
+    cluster: str | None,
     show: Callable[[float], object],
 ) -> None:
     """Judge the recordings that are not in the tables as they are now, and write the tables.

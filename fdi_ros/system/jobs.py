@@ -6,8 +6,9 @@
 A worker that dies costs the time of its job: it is run again. The results do not depend on which worker ran what. A job
 that kills its worker every time ends the run, or, where the caller says what stands for it, costs itself alone.
 
-A cluster is reached over TLS where its address says so. Whoever reaches a scheduler without TLS can run any code on its
-workers, and, since results are pickled, here. So one that others can reach is warned of.
+A cluster is reached over TLS where its address says so, with the certificates that Dask's configuration names. Whoever
+reaches a scheduler without TLS can run any code on its workers, and, since results are pickled, here. So one that
+others can reach is warned of.
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -70,7 +69,7 @@ def run_jobs(
     function: Function,
     jobs: Sequence[Job],
     workers: int,
-    cluster: Cluster | None,
+    cluster: str | None,
     lost: Lost | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done, in any order.
@@ -84,7 +83,8 @@ def run_jobs(
     workers
         Processes; 1: this process alone.
     cluster
-        Dask cluster that works instead, or None.
+        Address of the scheduler of a Dask cluster that works instead, ``tcp://host:port`` or ``tls://host:port``; None:
+        there is none.
     lost
         Makes the result of a job that kills its worker again and again. Without it such a job ends the run. In this
         process alone there is no worker to be killed.
@@ -92,11 +92,14 @@ def run_jobs(
     Raises
     ------
     StudyError
-        If the scheduler is not there, or is lost, or workers die again and again and `lost` is not given.
+        If the address is none, the scheduler is not there, or is lost, or workers die again and again and `lost` is not
+        given.
     """
     if not jobs:
         return iter(())
     if cluster is not None:
+        if not re.fullmatch(r"\w+://.+:\d+", cluster):
+            raise StudyError(f"scheduler is {cluster!r}, expected an address such as tcp://host:8786")
         return _on_cluster(function, jobs, cluster, lost)
     # A single job that may kill its process is kept out of this one.
     if workers == 1 or (len(jobs) == 1 and lost is None):
@@ -172,64 +175,13 @@ CONNECT_TIMEOUT = 10.0
 TLS = "tls://"
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """A Dask cluster, and what proves who is who where it is reached over TLS.
-
-    Raises
-    ------
-    StudyError
-        If the address is none, or the files do not suit it.
-    """
-
-    address: str
-    """Of the scheduler: ``tcp://host:port`` or ``tls://host:port``."""
-    ca_file: Path | None = None
-    """Certificate by which those of the cluster are known; without the three Dask's own configuration holds."""
-    certificate: Path | None = None
-    """Our own."""
-    key: Path | None = None
-    """Of that certificate."""
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch(r"\w+://.+:\d+", self.address):
-            raise StudyError(f"scheduler is {self.address!r}, expected an address such as tcp://host:8786")
-        files = {"--tls-ca-file": self.ca_file, "--tls-cert": self.certificate, "--tls-key": self.key}
-        given = {name: path for name, path in files.items() if path is not None}
-        if given and not self.address.startswith(TLS):
-            raise StudyError(f"{next(iter(given))} is for a scheduler at {TLS}..., and this is {self.address}")
-        if given and len(given) < len(files):
-            missing = next(name for name in files if name not in given)
-            raise StudyError(f"{missing} is missing: {', '.join(files)} belong together")
-        for name, path in given.items():
-            if not path.is_file():
-                raise StudyError(f"{name}: there is no {path}")
-
-
-def cluster_of(address: str | None, ca_file: Path | None, certificate: Path | None, key: Path | None) -> Cluster | None:
-    """Return the cluster that was asked for; None: none was.
-
-    Raises
-    ------
-    StudyError
-        If what is given does not make one.
-    """
-    if address is None:
-        if any((ca_file, certificate, key)):
-            raise StudyError("--tls-ca-file, --tls-cert and --tls-key are for a cluster: give --scheduler, too")
-        return None
-    return Cluster(address, ca_file, certificate, key)
-
-
-def _on_cluster(
-    function: Function, jobs: Sequence[Job], cluster: Cluster, lost: Lost | None
-) -> Iterator[tuple[int, Any]]:
+def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Lost | None) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
     require("--scheduler", ("dask", "distributed"))
     import distributed
 
     with _connected(distributed, cluster) as client:
-        _warn_if_open(client.scheduler_info()["address"], cluster.address)
+        _warn_if_open(client.scheduler_info()["address"], cluster)
 
         def run(numbers: Iterable[int]) -> Iterator[tuple[int, Any]]:
             # Not pure: the same arguments may be a block of another study's seed on the same cluster.
@@ -253,7 +205,7 @@ def _on_cluster(
                 else:
                     yield k, future.result()
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
-            raise StudyError(f"the cluster at {cluster.address} was lost: {_line(error)}") from error
+            raise StudyError(f"the cluster at {cluster} was lost: {_line(error)}") from error
 
 
 @functools.cache
@@ -276,7 +228,7 @@ def _warn_if_open(listens_at: str, address: str) -> None:
 
 
 @contextmanager
-def _connected(distributed: Any, cluster: Cluster) -> Iterator[Any]:
+def _connected(distributed: Any, cluster: str) -> Iterator[Any]:
     import logging
 
     # A scheduler that is not there, or is lost, is reported in one line of ours, not in pages of retries.
@@ -286,30 +238,15 @@ def _connected(distributed: Any, cluster: Cluster) -> Iterator[Any]:
         logger.setLevel(logging.CRITICAL)
     try:
         try:
-            security = _security(distributed, cluster)
-            client = distributed.Client(
-                cluster.address, timeout=CONNECT_TIMEOUT, set_as_default=False, security=security
-            )
+            security = distributed.Security(require_encryption=True) if cluster.startswith(TLS) else None
+            client = distributed.Client(cluster, timeout=CONNECT_TIMEOUT, set_as_default=False, security=security)
         except (OSError, ValueError, TypeError, TimeoutError) as error:
-            raise StudyError(f"no Dask scheduler at {cluster.address}: {_line(error)}") from error
+            raise StudyError(f"no Dask scheduler at {cluster}: {_line(error)}") from error
         with client:
             yield client
     finally:
         for logger, level in levels.items():
             logger.setLevel(level)
-
-
-def _security(distributed: Any, cluster: Cluster) -> Any:
-    """Return what proves who is who; None: there is no TLS."""
-    if not cluster.address.startswith(TLS):
-        return None
-    files = {
-        "tls_ca_file": cluster.ca_file,
-        "tls_client_cert": cluster.certificate,
-        "tls_client_key": cluster.key,
-    }
-    given = {name: str(path) for name, path in files.items() if path is not None}
-    return distributed.Security(require_encryption=True, **given)
 
 
 def _died_words(times: int) -> str:

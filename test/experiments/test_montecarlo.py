@@ -1,6 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
+import contextlib
 import json
 import math
 import os
@@ -29,7 +30,6 @@ from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import tables
 from fdi_ros.replay.outcomes import added, quantiles, share
 from fdi_ros.system import jobs
-from fdi_ros.system.jobs import Cluster, cluster_of
 from fdi_ros.system.result_file import MADE_BY, plain, write_json
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +104,7 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
     with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
         came = killing(lambda: next(iter(cluster.workers.values())).pid)
         study = load_study(study_file(tmp_path, SMALL))
-        result = run_study(study, cluster=Cluster(cluster.scheduler_address))
+        result = run_study(study, cluster=cluster.scheduler_address)
     assert len(came) > 3
     assert as_text(result, tmp_path) == expected
 
@@ -202,7 +202,7 @@ def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are
         # One worker: others are with it when it dies.
         distributed.LocalCluster(**ONE_WORKER) as cluster,
     ):
-        check_that_one_is_lost(tmp_path, Cluster(cluster.scheduler_address))
+        check_that_one_is_lost(tmp_path, cluster.scheduler_address)
 
 
 def certificate(folder, name):
@@ -215,6 +215,14 @@ def certificate(folder, name):
     return made, key
 
 
+def configured(ca_file, cert, key):
+    """Dask's configuration with these files for a client."""
+    import dask
+
+    names = {"ca-file": ca_file, "client.cert": cert, "client.key": key}
+    return dask.config.set({f"distributed.comm.tls.{name}": str(path) for name, path in names.items()})
+
+
 def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monkeypatch, distributed):
     (ours, key), (foreign, foreign_key) = certificate(tmp_path, "ours"), certificate(tmp_path, "foreign")
     known = {f"tls_{who}_{what}": str(path) for who in ("scheduler", "worker", "client")
@@ -224,11 +232,11 @@ def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monke
     with distributed.LocalCluster(protocol="tls", security=security, processes=False, **ONE_WORKER) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
-        found = jobs.run_jobs(abs, [(-1,), (-2,)], 1, Cluster(address, ours, ours, key))
-        assert dict(found) == {0: 1, 1: 2}
-        for other in (Cluster(address, ours, foreign, foreign_key), Cluster(address)):
-            with pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
-                list(jobs.run_jobs(abs, [(-1,)], 1, other))
+        with configured(ours, ours, key):
+            assert dict(jobs.run_jobs(abs, [(-1,), (-2,)], 1, address)) == {0: 1, 1: 2}
+        for other in (configured(ours, foreign, foreign_key), contextlib.nullcontext()):
+            with other, pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
+                list(jobs.run_jobs(abs, [(-1,)], 1, address))
 
 
 @pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
@@ -237,25 +245,10 @@ def test_a_scheduler_without_tls_that_others_reach_is_warned_of(host, warned, ca
     with distributed.LocalCluster(host=host, protocol="tcp://", processes=False, **ONE_WORKER) as cluster:
         port = cluster.scheduler_address.rpartition(":")[2]
         for _ in range(2):
-            assert list(jobs.run_jobs(abs, [(-1,)], 1, Cluster(f"tcp://127.0.0.1:{port}"))) == [(0, 1)]
+            assert list(jobs.run_jobs(abs, [(-1,)], 1, f"tcp://127.0.0.1:{port}")) == [(0, 1)]
     said = capsys.readouterr().err
     assert said.count("fdi: warning: the scheduler at tcp://127.0.0.1:") == warned
     assert ("whoever reaches it can run code on its workers and on this machine" in said) == warned
-
-
-@pytest.mark.parametrize(
-    ("address", "files", "words"),
-    [
-        ("tcp://a:1", ("x", "x", "x"), "--tls-ca-file is for a scheduler at tls://..., and this is tcp://a:1"),
-        ("tls://a:1", ("x", None, None), "--tls-cert is missing"),
-        ("tls://a:1", ("x", "x", "y"), "--tls-key: there is no .*y"),
-        (None, (None, "x", None), "give --scheduler, too"),
-    ],
-)
-def test_files_of_tls_that_make_no_sense_are_refused(tmp_path, address, files, words):
-    (tmp_path / "x").touch()
-    with pytest.raises(StudyError, match=words):
-        cluster_of(address, *(None if name is None else tmp_path / name for name in files))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
