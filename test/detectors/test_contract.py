@@ -31,7 +31,6 @@ NAMES = sorted(DETECTORS)
 ANY_NUMBER = sorted(set(NAMES) - {"determinant"})
 LASTING = {"sequential": 200 * SIGMA}
 """Error of a channel without which a method gives no alarm in noise with single wild values, rad/s."""
-WITHOUT_MEMORY = sorted(set(NAMES) - {"cusum", "sequential"})
 SINGLE_FAULT = sorted(set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum", "sequential"})
 RATE_OPTIONS = [name for name in NAMES if "false_alarm_probability" in accepted_options(detector_class(name))]
 RUN_LENGTHS = ("cusum", "sequential")
@@ -102,6 +101,8 @@ class TestVerdict:
             assert array.shape == (z.shape if per_channel else (rows,)), field
             assert array.dtype == (np.bool_ if field in ("alarm", "suspects", "isolated") else np.float64), field
         assert np.array_equal(z, before), "detect must not write to its argument"
+        for layout in (np.asfortranarray(z), np.repeat(z, 2, axis=0)[::2]):
+            assert_same_bits(verdict, detector_of(name).detect(layout))
 
     @each_variant
     @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
@@ -160,21 +161,6 @@ class TestStream:
         whole = detector.detect(z, acceleration)
         detector.reset()
         assert_same_bits(whole, in_pieces(detector, z, acceleration, cuts))
-
-    @each
-    def test_memory_layout_does_not_matter(self, name: str) -> None:
-        z, _ = stream(np.random.default_rng(9), usual_geometry(name), 50)
-        plain = detector_of(name).detect(z)
-        assert_same_bits(plain, detector_of(name).detect(np.asfortranarray(z)))
-        assert_same_bits(plain, detector_of(name).detect(np.repeat(z, 2, axis=0)[::2]))
-
-    @pytest.mark.parametrize("name", WITHOUT_MEMORY)
-    def test_order_does_not_matter_without_memory(self, name: str) -> None:
-        detector = detector_of(name, MOVING)
-        z, acceleration = stream(np.random.default_rng(10), detector.geometry, 200)
-        lose(np.random.default_rng(11), z, 0.1)
-        forth, back = detector.detect(z, acceleration), detector.detect(z[::-1], acceleration[::-1])
-        assert_same_bits(forth, Verdict(*(field[::-1] for field in back)))
 
 
 def on_channels(detector: Detector, kept: np.ndarray) -> Detector | str:
@@ -468,61 +454,33 @@ class TestLopsidedAxes:
                 isolated += bool(verdict.isolated[20:].all())
         assert isolated > 60
 
-    def test_isolable_is_what_the_method_can_do(self) -> None:
-        """Channel k of which another has `|S_ik| > S_ii` is never the one of largest residual."""
-        missed = 0
-        for seed in range(20):
-            geometry = random_axes(np.random.default_rng(seed), 6)
-            share = np.abs(geometry.S) / np.diag(geometry.S)[:, None]
-            hidden = (share > 1 + 1e-9).any(axis=0)
-            missed += hidden.sum()
-            assert not create_detector("max_residual", geometry, CONSTANT).isolable[hidden].any()
-        assert missed > 10
-
-    def test_guaranteeing_no_fault_isolates_none(self) -> None:
-        detector = create_detector("guaranteed", Geometry.dodecahedron(), CONSTANT, max_faults=0)
-        assert not detector.isolable.any()
-
 
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
     *((name, options, words) for name in RATE_OPTIONS for options, words in (
         ({"false_alarm_probability": 0.0}, "is 0, expected between 0 and 1"),
-        ({"false_alarm_probability": -0.1}, "is -0.1, expected between 0 and 1"),
         ({"false_alarm_probability": 1.0}, "is 1, expected between 0 and 1"),
         ({"false_alarm_probability": math.nan}, "is nan, expected between 0 and 1"),
         ({"false_alarms_per_hour": 1.0, "false_alarm_probability": 1e-3}, "not both"),
     )),
     *((name, options, words) for name in (*RATE_OPTIONS, *RUN_LENGTHS) for options, words in (
-        ({"false_alarms_per_hour": -2.0, "sample_rate": 100.0}, "is -2, expected > 0"),
         ({"false_alarms_per_hour": 0.0, "sample_rate": 100.0}, "is 0, expected > 0"),
         ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz, got None"),
-        ({"false_alarms_per_hour": 1.0, "sample_rate": 0.0}, "needs a sample_rate > 0 Hz, got 0.0"),
         ({"false_alarms_per_hour": 1e9, "sample_rate": 1.0}, "expected between 0 and 1"),
     )),
     *((name, options, words) for name in RUN_LENGTHS for options, words in (
         ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
-        ({"run_length": -5.0}, "run_length is -5 samples"),
-        ({"run_length": math.inf}, "run_length is inf samples"),
         ({"run_length": math.nan}, "run_length is nan samples"),
-        (
-            {"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0},
-            "give run_length or false_alarms_per_hour, not both",
-        ),
+        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "give run_length or false_alarms"),
     )),
     *((name, {"confidence": value}, f"confidence is {value:g}, expected above 0.5 and below 1")
       for name in ("likelihood_ratio", *RUN_LENGTHS) for value in (0.0, 0.5, 1.0, -1.0, math.nan)),
     ("cusum", {"shift": 0.0}, "shift is 0 standard deviations, expected 0.05 to 3"),
-    ("cusum", {"shift": -1.0}, "shift is -1 standard deviations"),
     ("cusum", {"shift": math.nan}, "shift is nan"),
-    ("cusum", {"shift": 5.0}, "shift is 5 standard deviations"),
     ("guaranteed", {"threshold": 0.0}, "threshold is 0 bounds, expected finite and > 0"),
-    ("guaranteed", {"threshold": -3.0}, "threshold is -3 bounds"),
     ("guaranteed", {"threshold": math.inf}, "threshold is inf"),
     ("guaranteed", {"max_faults": 3}, "max_faults is 3, expected 0, 1 or 2"),
-    ("guaranteed", {"max_faults": -1}, "max_faults is -1, expected 0, 1 or 2"),
     ("guaranteed", {"max_faults": 1.5}, "max_faults is 1.5, expected 0, 1 or 2"),
     ("max_residual", {"tolerance": "guess"}, "tolerance is 'guess', expected one of: calibrated"),
-    ("mean_abs_residual", {"tolerance": "guess"}, "tolerance is 'guess', expected one of: calibrated"),
     ("projector", {"construction": "guess"}, "construction is 'guess', expected one of: svd"),
     ("projector", {"norm": "guess"}, "norm is 'guess', expected one of: l2"),
     ("determinant", {"criterion": "guess"}, "criterion is 'guess', expected one of: determinant"),
@@ -546,9 +504,6 @@ class TestBadOptions:
     def test_unknown_detector(self) -> None:
         with pytest.raises(DetectorError, match=r"unknown detector 'median', expected one of: .*max_residual"):
             create_detector("median", Geometry.two_triad_cone(), CONSTANT)
-
-    def test_determinant_wants_five_channels(self) -> None:
-        assert re.match("determinant has 4 channels, expected 5: .*square", detector_class("determinant").refuses(4))
 
     @each
     def test_numbers_of_channels_refused_are_those_that_fail(self, name: str) -> None:

@@ -38,27 +38,20 @@ class TestWorkedExample:
     geometry = Geometry([[-c, -s, 0], [c, s / 2, -h], [-c, s / 2, h], [c, -s, 0], [-c, s / 2, -h], [c, s / 2, h]])
     z = geometry.axes @ [-172.82, 604.19, -1284.63] + [0.50, 20.10, -50.80, -0.01, -0.02, 0.30]
 
-    def test_sample(self) -> None:
+    def test_intervals_and_verdict_are_those_printed(self) -> None:
         printed = [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19]
         np.testing.assert_allclose(self.z, printed, atol=0.0051)
-
-    def test_intervals(self) -> None:
-        lower, upper = guaranteed(self.geometry, max_faults=2).error_bounds(self.z[None])
+        detector = guaranteed(self.geometry, max_faults=2)
+        lower, upper = detector.error_bounds(self.z[None])
         np.testing.assert_allclose((lower + upper)[0] / 2, [0, 20.89, -51.35, 0, 0, 0], atol=0.0051)
         np.testing.assert_allclose((upper - lower)[0] / 2, [1.00, 2.74, 2.74, 1.00, 1.00, 1.00], atol=0.0051)
         extremes = self.z[1] - upper[0, 1], self.z[1] - lower[0, 1]
         np.testing.assert_allclose(extremes, [1051.72, 1057.20], atol=0.0051)
-
-    def test_verdict(self) -> None:
-        detector = guaranteed(self.geometry, max_faults=2)
         verdict = detector.detect(self.z[None])
-        assert verdict.alarm[0]
         assert verdict.isolated[0]
         assert np.flatnonzero(verdict.suspects[0]).tolist() == [1, 2]
         np.testing.assert_allclose(verdict.error[0], [0, 20.89, -51.35, 0, 0, 0], atol=0.0051)
-        np.testing.assert_allclose(verdict.scores[0, 1:3], [20.89 - 2.74, 51.35 - 2.74], atol=0.011)
-        possible = [detector.sets[k] for k in np.flatnonzero(detector.culprits(self.z[None])[0])]
-        assert possible == [(1, 2)]
+        assert [detector.sets[k] for k in np.flatnonzero(detector.culprits(self.z[None])[0])] == [(1, 2)]
 
 
 class TestAgainstLinearProgrammes:
@@ -160,18 +153,6 @@ def test_more_faults_than_allowed_are_a_contradiction() -> None:
     assert not verdict.error.any()
 
 
-def test_no_fault_allowed() -> None:
-    geometry = Geometry.cone(6)
-    z = np.tile(geometry.axes @ [1.0, 2.0, 3.0], (2, 1))
-    z[0] += [0.9, -0.9, 0.9, -0.9, 0.9, -0.9]
-    z[1, 0] += 10
-    verdict = guaranteed(geometry, max_faults=0).detect(z)
-    assert verdict.alarm.tolist() == [False, True]
-    assert verdict.statistic[0] <= 1 < verdict.statistic[1]
-    assert verdict.suspects[1].all()
-    assert not verdict.isolated.any()
-
-
 def test_both_channels_of_an_axis_struck_leave_it_without_bounds() -> None:
     # With both x channels struck nothing measures x: the pair may be off by any amount.
     detector = guaranteed(Geometry.from_triads([np.eye(3), np.eye(3)]), max_faults=2)
@@ -184,31 +165,6 @@ def test_both_channels_of_an_axis_struck_leave_it_without_bounds() -> None:
     assert np.flatnonzero(verdict.suspects[0]).tolist() == [0, 3]
     assert not verdict.isolated[0]
     assert np.isfinite(verdict.error).all()
-
-
-def test_an_axis_that_nothing_checks_has_no_bounds() -> None:
-    geometry = Geometry([[1, 0, 0], [0, 1, 0], [0.8, 0.6, 0], [0.6, -0.8, 0], [0, 0, 1]])
-    lower, upper = guaranteed(geometry, max_faults=1).error_bounds(np.zeros((1, 5)))
-    assert (lower[0, 4], upper[0, 4]) == (-np.inf, np.inf)
-    assert np.isfinite(lower[0, :4]).all()
-
-
-def test_fewer_channels_assume_fewer_faults() -> None:
-    geometry = Geometry.two_triad_cone()
-    detector = guaranteed(geometry, max_faults=2)
-    z = np.tile(geometry.axes @ [1.0, 2.0, 3.0], (2, 1))
-    z[:, 3] += 40
-    z[0, 0] = np.nan
-    z[1, :2] = np.nan
-    verdict = detector.detect(z)
-    assert verdict.alarm.all()
-    assert verdict.isolated.tolist() == [True, False]
-    assert np.flatnonzero(verdict.suspects[0]).tolist() == [3]
-    assert verdict.suspects[1].tolist() == [False, False, True, True, True, True]
-    lower, upper = detector.error_bounds(z)
-    assert lower[0, 3] <= 40 <= upper[0, 3]
-    assert np.isnan(lower[0, 0])
-    assert np.isnan(upper[1]).all()
 
 
 @settings(max_examples=50)

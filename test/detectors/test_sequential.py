@@ -19,7 +19,6 @@ from vehicles import vehicle
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Verdict
-from fdi_ros.detectors.evidence import SIZES, SMALLEST, STEP_LIMIT
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output
@@ -86,21 +85,6 @@ def measured() -> Sequential:
 
 
 class TestSums:
-    def test_recursion(self) -> None:
-        """Every sum of the first time scale, from the innovations that it was given."""
-        detector, z = sequential(), white(1, 150)
-        z[60:, 2] += 3.0
-        sizes = SMALLEST * 2.0 ** np.arange(SIZES)
-        sums = np.zeros((2, 6, SIZES))
-        for row in z:
-            detector.detect(row[None])
-            scale = detector.states[0]["scales"][0]
-            x = scale["series"][scale["newest"]][:6]
-            y = np.minimum(np.stack([x, -x]), STEP_LIMIT)[:, :, None]
-            sums = (1 + sums) * np.exp(sizes * y - sizes**2 / 2)
-            sums = np.minimum(sums, 1e6 * 3.6e8)
-            np.testing.assert_allclose(scale["sums"][:, :6], sums, rtol=1e-6)
-
     def test_no_more_than_the_number_of_samples_in_the_mean(self) -> None:
         """What makes the run length exact: their mean less the number of samples never tends upward."""
         detector, sums = sequential(run_length=1e15), []
@@ -232,12 +216,6 @@ class TestNoFault:
         assert not verdict.alarm.any()
 
 
-def test_a_channel_that_comes_and_goes_does_no_harm() -> None:
-    rng, z = np.random.default_rng(15), white(15, 3000)
-    z[rng.random(len(z)) < 0.3, 2] = np.nan
-    assert not fresh().detect(z).alarm.any()
-
-
 class TestDecision:
     """What becomes of the evidence in the monitor."""
 
@@ -249,20 +227,13 @@ class TestDecision:
         stamp = START + np.arange(len(z), dtype=np.int64) * round(1e9 / RATE)
         return pipeline, pipeline.process(Block(stamp, z))
 
-    def test_an_alarm_that_names_one_declares_it_at_once(self) -> None:
-        pipeline, output = self.flown(50.0, 20, decision__confirm_alarms=20, decision__confirm_window=20)
-        named = [channel for channel, state in declarations(pipeline, output) if state == "FAULTY"]
-        assert named == ["imu_2.y"]
-        of_these = (ChannelState.AMBIGUOUS, ChannelState.FAULTY)
-        declared = int(np.isin(output.state, of_these).any(axis=1).argmax())
-        assert declared == int(output.alarm.argmax()) < 1020
-
-    def test_with_votes_it_takes_as_many_as_asked_for(self) -> None:
-        changes = {"decision__rule": "votes", "decision__confirm_alarms": 20, "decision__confirm_window": 20}
+    @pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
+    def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(self, rule: str, after: int) -> None:
+        changes = {"decision__rule": rule, "decision__confirm_alarms": 20, "decision__confirm_window": 20}
         pipeline, output = self.flown(50.0, 20, **changes)
-        assert declarations(pipeline, output) == [("imu_2.y", "FAULTY")]
-        declared = int((output.state[:, 4] == ChannelState.FAULTY).argmax())
-        assert declared == int(output.alarm.argmax()) + 19
+        assert [name for name, state in declarations(pipeline, output) if state == "FAULTY"] == ["imu_2.y"]
+        declared = np.isin(output.state, (ChannelState.AMBIGUOUS, ChannelState.FAULTY)).any(axis=1)
+        assert int(declared.argmax()) == int(output.alarm.argmax()) + after < 1040
 
     def test_an_undecided_set_leaves_the_culprit_as_evidence_grows(self) -> None:
         sizes = []
@@ -274,23 +245,6 @@ class TestDecision:
             assert undecided[-1] == 0
             sizes.append(int(undecided.max()))
         assert max(sizes) > 1
-
-
-def test_how_far_off_a_sample_is_is_told_by_its_own_weights() -> None:
-    """With the last sample of a block the weights become those of the next: no outlier of this one is found by them."""
-    detector = sequential(noise=NoiseModel(SIGMA, scale_std=0.02, bias_std=0.005))
-    time = np.arange(600)[:, None] / RATE
-    z = np.sin(time * [2.0, 3.0, 5.0]) @ CONE.axes.T + SIGMA * white(1, 600)
-    changes = 0
-    for sample in z:
-        before = detector.states["estimator"]["share"][0, :6].copy()
-        detector.detect(sample[None])
-        own = detector.states["estimator"][0]
-        changes += (own["share"][:6] != before).any()
-        if before.all():
-            far = np.abs(own["statistic"][:6]) * np.sqrt(before * own["inflation"][:6])
-            np.testing.assert_allclose(own["distance"][:6], far, rtol=1e-12)
-    assert changes > 100
 
 
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
@@ -349,24 +303,17 @@ def flown_with_a_hole(units: int, hole: float, fault: float, seed: int) -> Outpu
     return pipeline.process(Block(START + (seconds[there] * 1e9).astype(np.int64), z[there]))
 
 
-@pytest.mark.parametrize("hole", [2.0, 6.0])
-@pytest.mark.parametrize("units", [2, 3])
-def test_a_fault_that_begins_in_a_hole_is_found(units: int, hole: float) -> None:
-    """10 mrad/s: of three units the channel by name, of two the two channels that disagree, in 4 s."""
-    for seed in range(8):
-        state = flown_with_a_hole(units, hole, 0.01, seed).state[1600]
-        faulty, ambiguous = (
-            np.flatnonzero(state == one).tolist() for one in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
-        )
-        assert (faulty, ambiguous) == (([4], []) if units == 3 else ([], [1, 4]))
-
-
 @pytest.mark.parametrize("hole", [2.0, 6.0, 20.0])
 @pytest.mark.parametrize("units", [2, 3])
-def test_nothing_is_declared_after_a_hole_without_a_fault(units: int, hole: float) -> None:
+def test_a_fault_that_begins_in_a_hole_is_found_and_none_without(units: int, hole: float) -> None:
+    """10 mrad/s: of three units the channel by name, of two the two channels that disagree, in 4 s."""
     for seed in range(8):
         state = flown_with_a_hole(units, hole, 0.0, seed).state
         assert not np.isin(state, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)).any()
+        if hole < 20.0:
+            found = flown_with_a_hole(units, hole, 0.01, seed).state[1600]
+            faulty, doubtful = (np.flatnonzero(found == one) for one in (ChannelState.FAULTY, ChannelState.AMBIGUOUS))
+            assert (faulty.tolist(), doubtful.tolist()) == (([4], []) if units == 3 else ([], [1, 4]))
 
 
 @pytest.mark.parametrize("offset", [-0.04, -0.02, 0.02, 0.04])
