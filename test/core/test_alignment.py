@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -152,16 +151,6 @@ def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lat
     assert corrected.counters == right.counters
 
 
-def test_four_milliseconds_beyond_the_skew_are_interpolated_without_delays_and_matched_with_them() -> None:
-    messages = at(*((j, 10.0 * k + 4.0 * j) for k in range(20) for j in range(2)))
-    for delays, interpolated, offset in (((), 19, 0), ((0.0, 0.004), 0, 0), ((-0.004, 0.0), 0, 4)):
-        aligner = Alignment(2, SKEW, TIMEOUT, delays)
-        samples = [s for j, stamp in messages for s in aligner.push(j, stamp, ramp(stamp))]
-        assert aligner.counters[1]["interpolated"] + aligner.counters[0]["interpolated"] == interpolated
-        # Stamps of the samples are those of the corrected time.
-        assert ms(samples)[:3] == [offset, 10 + offset, 20 + offset]
-
-
 @settings(max_examples=150, deadline=None)
 @given(streams())
 def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case) -> None:
@@ -231,13 +220,6 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert len(aligner.push(2, START, ramp(START))) == 0
     aligner.rows["rate"] = rate  # of the message on its way, which nothing remembers
     assert aligner.rows.tobytes() == before
-
-
-def test_stamps_within_the_skew_count_as_one_instant() -> None:
-    _, samples = run(at(*rounds(5, skew=1.5)))
-    assert ms(samples) == [0, 10, 20, 30, 40]
-    assert samples[2]["z"][0] == pytest.approx(0.020)
-    assert samples[2]["z"][3] == pytest.approx(0.0215)
 
 
 def test_one_lost_message_is_bridged_and_two_are_not() -> None:
@@ -319,11 +301,10 @@ def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, forme
         assert {kind: aligner.counters[j][kind] for kind in counts} == counts
 
 
-def test_all_clocks_set_back_shift_the_time_base_and_samples_still_increase() -> None:
+def test_all_clocks_set_back_shift_the_time_base() -> None:
     messages = rounds(20) + [(j, t - 3_600_000) for j, t in rounds(20)]
     aligner, samples = run(at(*messages))
     assert aligner.restarts == 1
-    assert all(a < b for a, b in itertools.pairwise(stamps_of(samples)))
     assert len(samples) == 40
     assert samples[-1]["stamp"] - samples[-1]["shift"] == START + round((190 - 3_600_000) * MS)
     assert samples[-1]["shift"] == aligner.shift
@@ -347,29 +328,12 @@ def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait() -> N
     assert count >= 2 * MAX_PENDING
 
 
-def test_nan_is_handed_on_as_delivered() -> None:
-    aligner = Alignment(2, SKEW, TIMEOUT)
-    aligner.push(0, 0, (math.nan, math.inf, 1.0))
-    (sample,) = aligner.push(1, 0, (0.0, 0.0, 0.0))
-    assert sample["received"][:6].all()
-    assert math.isnan(sample["z"][0])
-    assert sample["z"][1] == math.inf
-
-
 def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout() -> None:
     period = MAX_BRIDGE * TIMEOUT / MS + 1
     fast = [(0, 5.0 * k) for k in range(60)]
     slow = [(1, 1.0 + period * k) for k in range(10)]
     aligner, _ = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=0)
     assert aligner.counters[1]["interpolated"] == 0
-
-
-@pytest.mark.parametrize(
-    ("units", "skew", "timeout"), [(0, 0, 1), (5, 0, 1), (2, -1, 1), (2, 0, 0), (2, 0, 10**14), (2, 10**14, 1)]
-)
-def test_impossible_settings_are_refused(units, skew, timeout) -> None:
-    with pytest.raises(ConfigError, match="cannot align"):
-        Alignment(units, skew, timeout)
 
 
 @pytest.mark.parametrize(
@@ -386,55 +350,33 @@ def test_delays_that_do_not_fit_are_refused_in_one_line(parameters, words) -> No
     assert "\n" not in str(refused.value)
 
 
-def fast(seconds, rng):
-    return 1.0002 * seconds
+CLOCKS = {
+    "fast": lambda seconds: 1.0002 * seconds,
+    "slow": lambda seconds: 0.9998 * seconds,
+    "much too fast": lambda seconds: 1.05 * seconds,
+    "much too slow": lambda seconds: 0.95 * seconds,
+    # From 2 s on every message just less than the timeout ahead of the one before.
+    "leaping": lambda seconds: seconds + 0.99 * TIMEOUT / 1e9 * np.maximum(np.arange(len(seconds)) - 200, 0),
+    "random": lambda seconds: seconds + np.random.default_rng(1).uniform(-1.0, 1.0, len(seconds)),
+    "of another time": lambda seconds: seconds + 5e6,
+}
+KINDS = ("jumped", "late", "jumped", "late", "jumped", "backward", "jumped")
+"""As what messages with the stamps of these clocks are counted."""
 
 
-def slow(seconds, rng):
-    return 0.9998 * seconds
-
-
-def much_too_fast(seconds, rng):
-    return 1.05 * seconds
-
-
-def much_too_slow(seconds, rng):
-    return 0.95 * seconds
-
-
-def leaping(seconds, rng):
-    """From 2 s on every message just less than the timeout ahead of the one before."""
-    return seconds + 0.99 * TIMEOUT / 1e9 * np.maximum(np.arange(len(seconds)) - 200, 0)
-
-
-def random_stamps(seconds, rng):
-    return seconds + rng.uniform(-1.0, 1.0, len(seconds))
-
-
-def stamps_from_another_time(seconds, rng):
-    return seconds + 5e6
+def samples_of(clock: str) -> int:
+    """At 100 Hz: clocks that are hardly wrong part after minutes."""
+    return 72_000 if clock in ("fast", "slow") else 6000
 
 
 @pytest.mark.parametrize("odd", [0, 2])
-@pytest.mark.parametrize(
-    ("clock", "minutes", "kind"),
-    [
-        (fast, 12, "jumped"),
-        (slow, 12, "late"),
-        (much_too_fast, 1, "jumped"),
-        (much_too_slow, 1, "late"),
-        (leaping, 1, "jumped"),
-        (random_stamps, 1, "backward"),
-        (stamps_from_another_time, 1, "jumped"),
-    ],
-)
-def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, minutes, kind, odd) -> None:
-    rng = np.random.default_rng(odd)
-    count = round(minutes * 60 * 100)
+@pytest.mark.parametrize(("clock", "kind"), [*zip(CLOCKS, KINDS, strict=True)])
+def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, kind, odd) -> None:
+    rng, count = np.random.default_rng(odd), samples_of(clock)
     measured = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(3) + rng.uniform(0, 3e-4, (count, 3))
     arrival = (measured + rng.uniform(0, 0.005, (count, 3))).ravel()
     clocks = measured.copy()
-    clocks[:, odd] = clock(measured[:, odd], rng)
+    clocks[:, odd] = CLOCKS[clock](measured[:, odd])
     order = np.argsort(arrival)
     stamp = START + np.round(1e9 * clocks.ravel()[order]).astype(np.int64)
     aligner = Alignment(3, SKEW, TIMEOUT)
@@ -448,24 +390,22 @@ def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, minu
 
 
 @pytest.mark.parametrize("odd", [0, 1])
-@pytest.mark.parametrize("clock", [fast, slow, much_too_fast, much_too_slow, leaping])
+@pytest.mark.parametrize("clock", [*CLOCKS][:5])
 def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd) -> None:
-    rng = np.random.default_rng(odd)
-    count = 12 * 60 * 100 if clock in (fast, slow) else 6000
-    measured = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(2)
-    clocks = measured.copy()
-    clocks[:, odd] = clock(measured[:, odd], rng)
+    count = samples_of(clock)
+    clocks = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(2)
+    clocks[:, odd] = CLOCKS[clock](clocks[:, odd])
     stamp = START + np.round(1e9 * clocks.ravel()).astype(np.int64)
     aligner = Alignment(2, SKEW, TIMEOUT)
     block = aligner.push_block(np.tile(np.arange(2), count), stamp, np.zeros((2 * count, 3)))
     assert block.delivered[:100].any(axis=1).all()
     given = block.delivered[-1000:, ::3]
-    if clock is leaping:
+    if clock == "leaping":
         assert given[:, 1 - odd].all(), "that clock itself shows that it is the wrong one"
         assert not given[:, odd].any()
     else:
         assert not given.any()
-    assert aligner.are_parted == (clock is not leaping)
+    assert aligner.are_parted == (clock != "leaping")
 
 
 def test_two_clocks_that_come_together_again_are_believed_again() -> None:

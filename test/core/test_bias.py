@@ -9,7 +9,7 @@ import pytest
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
-from fdi_ros.core.bias import EFFICIENCY, f_quantile
+from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
@@ -44,14 +44,6 @@ def turned(z, rate, axis=2):
     return z + Pipeline(config()).geometry.axes[:, axis] * rate
 
 
-@pytest.mark.parametrize(("above", "below", "probability"), [(3, 4, 0.003), (3, 12, 0.05), (42, 42, 0.001)])
-def test_f_quantile_is_the_share_of_ratios_of_chi_squares(above, below, probability):
-    rng = np.random.default_rng(1)
-    drawn = rng.chisquare(above, 400_000) / above / (rng.chisquare(below, 400_000) / below)
-    beyond = (drawn > f_quantile(probability, above, below)).mean()
-    assert beyond == pytest.approx(probability, abs=4 * np.sqrt(probability / 400_000))
-
-
 def test_in_white_noise_it_is_as_exact_as_stated_and_without_bias():
     rng, pipeline, found = np.random.default_rng(2), Pipeline(config()), []
     for k in range(100):
@@ -82,8 +74,7 @@ def test_what_disturbs_for_a_moment_hardly_moves_a_bias(rows, channels, size, li
     assert (output.state[LENGTH + 10] != ChannelState.UNCHECKED).all()
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.05, 0.09])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("rate", "axis"), [(0.02, 0), (0.05, 1), (0.09, 2), (0.02, 2)])
 def test_a_constant_slow_turn_is_refused_and_told(rate, axis):
     _, words, output = learned(turned(noise(5), rate, axis))
     assert words.startswith("refused, not at rest: the channels agree on a turn of")

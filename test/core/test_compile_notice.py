@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import gc
 import os
 import re
 import shutil
@@ -20,10 +19,9 @@ from pathlib import Path
 
 import numba
 import pytest
-from numba.core import event
 
 from fdi_ros.compiling import notice as compile_notice
-from fdi_ros.compiling.notice import WORDS, YOUNG_OBJECTS, announced, clock, compiling_seconds, refused
+from fdi_ros.compiling.notice import WORDS, announced, clock, compiling_seconds, refused
 from fdi_ros.errors import FdiError
 
 
@@ -43,37 +41,6 @@ def test_compiling_is_announced_before_or_refused(caplog) -> None:
         two(1)
     assert two(1) == 2
     assert caplog.messages == [WORDS]
-
-
-class Kept:
-    """A view that keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.told: list[object] = []
-
-    def begin(self) -> None:
-        self.told.append("begin")
-
-    def draw(self, share: float) -> None:
-        self.told.append(share)
-
-    def wipe(self) -> None:
-        self.told.append("wipe")
-
-
-def test_a_view_is_told_the_share_while_and_only_while_something_is_compiled(monkeypatch) -> None:
-    monkeypatch.setattr(compile_notice, "TICK", 0.001)
-    left = iter([8, *[6] * 5, *[2] * 1_000_000])
-    monkeypatch.setattr(compile_notice, "missing", lambda: next(left))
-    view = Kept()
-    with announced(view):
-        assert view.told == []
-        while view.told.count(0.75) < 1:
-            new_function()(1)
-        assert view.told[0] == "begin"
-        assert view.told.count("begin") == 1
-        assert view.told[-1] == "wipe"
-    assert {one for one in view.told if isinstance(one, float)} <= {0.25, 0.75}
 
 
 def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog) -> None:
@@ -100,34 +67,6 @@ def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled() -> None
         new_function()(1)
     before = compiling_seconds()
     assert compiling_seconds() == before
-
-
-class Collected(event.Listener):
-    """When garbage is collected while the compiler runs."""
-
-    def __init__(self) -> None:
-        self.young: set[int] = set()
-
-    def on_start(self, event) -> None:
-        self.young.add(gc.get_threshold()[0])
-
-    def on_end(self, event) -> None:
-        pass
-
-
-@pytest.mark.parametrize(("before", "during"), [(800, YOUNG_OBJECTS), (90_000, 90_000), (0, 0)])
-def test_garbage_is_collected_less_often_only_while_anything_is_compiled(before, during) -> None:
-    usual = gc.get_threshold()
-    gc.set_threshold(before, 11, 12)
-    try:
-        with pytest.raises(FdiError), refused("no"):
-            new_function()(1)
-        assert gc.get_threshold() == (before, 11, 12)
-        with event.install_listener("numba:run_pass", seen := Collected()):
-            new_function()(1)
-        assert (seen.young, gc.get_threshold()) == ({during}, (before, 11, 12))
-    finally:
-        gc.set_threshold(*usual)
 
 
 @pytest.mark.usefixtures("compiled")
@@ -168,4 +107,5 @@ def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight) -> None:
     assert shares
     assert "compiling" not in result
     assert "\ncone_flight: " in on_a_terminal(command, root, **environment)
+    assert [*tmp_path.rglob("*.nbi")], "kept in the folder that the user wishes"
     shutil.rmtree(tmp_path)

@@ -210,11 +210,6 @@ def test_code_that_somebody_else_may_have_put_there_is_not_run(warm: tuple[Path,
         assert not mark.exists()
 
 
-def test_folder_that_the_user_wishes(copy: Path, tmp_path: Path) -> None:
-    kept, _, _ = outcome(start(copy, NUMBA_CACHE_DIR=str(tmp_path / "wished")))
-    assert kept.is_relative_to(tmp_path / "wished")
-
-
 def test_a_change_of_a_called_function_is_compiled(warm: tuple[Path, Path]) -> None:
     """Numba alone looks at the file of the caller only."""
     copy, _ = warm

@@ -16,21 +16,18 @@ import numpy as np
 import pytest
 from detectors.detector_trials import VARIANTS, usual_geometry
 from detectors.detector_trials import sound as healthy
-from monitor.streams import config, run
+from monitor.streams import parallel, stream, struck
+from monitor.test_receiver import Ear, messages
 
 from fdi_ros import NoiseModel, create_detector
 from fdi_ros.compiling.compiled import INTERPRETED
-from fdi_ros.core.alignment import Alignment, as_block
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.detectors.papers import single_fault
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
 
 FAULTS = (
-    "channel=g3 kind=bias size=0.1 start=0.6 stop=0.9",
-    "channel=g5 kind=dropout start=0.8 stop=0.9",
-    "channel=g1 kind=stuck start=1.0",
+    "channel=imu_1.z kind=bias size=0.1 start=0.6 stop=0.9",
+    "channel=imu_2.y kind=dropout start=0.8 stop=0.9",
+    "channel=imu_1.x kind=stuck start=1.0",
 )
 
 
@@ -38,47 +35,17 @@ def digest(parts: list[np.ndarray | bytes]) -> str:
     return hashlib.sha256(b"".join(np.asarray(part).tobytes() for part in parts)).hexdigest()
 
 
-def messages() -> tuple[str, int]:
-    """Of messages that are whole, damaged and cut off; and how many of the last kind could be read."""
-    rng, made, rows = np.random.default_rng(5), [], []
-    for k in range(80):
-        for row in (
-            ImuTemplate("x" * (k % 9)).fill(5**k % 2**60, rng.normal(size=3), np.arange(9.0)),
-            ChannelsTemplate(6).fill(rng.normal(size=6)),
-        ):
-            made.append(bytes(row))
-            damaged = bytearray(row)
-            damaged[k % 20] = rng.choice([0, 1, 255, damaged[k % 20]])
-            rows.append(bytes(damaged[: len(damaged) - k % 2]))
-    length = np.array([len(row) for row in rows])
-    packed = np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length
-    imus, arrays = ImuSource.decode(*packed, 3), ChannelsSource.decode(*packed, 6)
-    return digest([*made, *imus, *arrays]), int(arrays.good.sum())
-
-
-def alignment() -> tuple[str, int]:
-    """Of stamps that jump, repeat and go back; and how many samples they gave."""
-    rng, parts, count = np.random.default_rng(5), [], 0
-    for units in (2, 3, 4):
-        aligner = Alignment(units, 3, 25)
-        stamp = np.cumsum(rng.integers(-1, 4, 150)) + rng.choice([0, 0, 0, 0, 40, -200], 150).cumsum() // 2
-        rate = rng.normal(size=(150, 3))
-        rate[::17] = np.nan
-        for block in (aligner.push_block(rng.integers(0, units, 150), stamp, rate), as_block(aligner.flush(), units)):
-            parts += [block.stamp, block.z, block.delivered]
-            count += len(block)
-        parts.append(aligner.rows)
-    return digest(parts), count
-
-
 def flight(detector: str) -> tuple[str, int]:
-    """Of three faults in a short flight; and how many events there were."""
+    """Of messages in and out, with three faults, a lost and a cut message; and how many events there were."""
     biases = {"bias__startup_bias_duration": 0.3, "bias__max_rest_rate": 10.0}
     decision = {"decision__latch": False, "decision__clean_time": 0.2}
-    pipeline = Pipeline(config(detector__name=detector, noise__scale_std=0.002, **biases, **decision))
-    _, output = run(pipeline, 140, *FAULTS, size=0.02)
-    columns = [output.rows[name] for name in output.rows.dtype.names]
-    return digest([*columns, "\n".join(map(repr, output.events)).encode()]), len(output.events)
+    pipeline = Pipeline(parallel(2, detector__name=detector, noise__scale_std=0.002, **biases, **decision))
+    block, ear = struck(stream(pipeline.geometry, 140, 0.02), FAULTS, pipeline.channel_names), Ear(pipeline)
+    for k, (unit, data) in enumerate(messages(block, 2)):
+        if k != 41:
+            ear.take(unit, data[: 50 if k == 81 else None])
+    events = "\n".join(map(repr, ear.events)).encode()
+    return digest([*ear.fused, *ear.integrity, events]), len(ear.events)
 
 
 def verdicts() -> tuple[str, int]:
@@ -99,8 +66,7 @@ def verdicts() -> tuple[str, int]:
 
 
 def digests() -> dict[str, list[str | int]]:
-    found = {"messages": messages(), "alignment": alignment(), "verdicts": verdicts()}
-    found |= {name: flight(name) for name in ("likelihood_ratio", "sequential")}
+    found = {"verdicts": verdicts(), **{name: flight(name) for name in ("likelihood_ratio", "sequential")}}
     return {name: list(one) for name, one in found.items()}
 
 
