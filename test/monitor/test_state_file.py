@@ -104,11 +104,9 @@ def test_written_once_for_each_change(path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"configuration": "another"}, "another configuration"),
         ({"saved": 0.0}, "expected at most 60 s"),
         ({"saved": 4e9}, "s ahead of the clock, which was set back"),
         ({"format": 7}, "format 7, expected 3"),
-        ({"format": 1}, "format 1, expected 3"),
         ({"bias": {"g1": 0.0}}, "damaged"),
         ({"errors": {"value": [0.0], "covariance": [1.0], "late": []}}, "damaged"),
         ({"errors": {**NOTHING, "value": [math.nan] * COUNT}}, "damaged"),
@@ -120,11 +118,7 @@ def test_written_once_for_each_change(path):
         ({"known": ["g9"]}, "damaged"),
         ({"declared": {"faulty": {"g1": "moods"}, "ambiguous": []}}, "damaged"),
         ({"declared": []}, "damaged"),
-        ({"saved": 10**400}, "damaged"),
         ({"saved": float("nan")}, "damaged"),
-        ({"bias": {f"g{k}": 1e300 for k in range(1, 7)}}, "at most 0.1"),
-        ({"bias": {f"g{k}": True for k in range(1, 7)}}, "damaged"),
-        ({"declared": {"faulty": {"g1": ""}, "ambiguous": []}}, "damaged"),
         ({"declared": {"faulty": {"g1": "stuck"}, "ambiguous": ["g1"]}}, "damaged"),
     ],
 )
