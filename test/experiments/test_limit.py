@@ -9,38 +9,14 @@ from scipy import stats
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
-    best_decisions,
     cusum_run_length,
     fault_of_size,
-    grid,
     log_faulty,
     log_normal,
     lorden_delay,
     moustakides_delay,
 )
 from fdi_ros.model.geometry import Geometry
-
-
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_the_rule_integrates_normal_densities_over_parity_space(m):
-    rule = grid(m, 9.0)
-    assert np.exp(log_normal(rule.points, np.eye(m)) + rule.log_weight).sum() == pytest.approx(1, abs=1e-9)
-    second = np.einsum(
-        "q,qi,qj", np.exp(log_normal(rule.points, np.eye(m)) + rule.log_weight), rule.points, rule.points
-    )
-    assert second == pytest.approx(np.eye(m), abs=1e-6)
-
-
-def test_the_density_of_a_fault_is_the_mixture_of_shifted_normals():
-    rng = np.random.default_rng(1)
-    points, direction, covariance = rng.normal(0, 3, (50, 3)), np.array([0.3, -0.5, 0.4]), np.diag([1.0, 2.0, 0.5])
-    sizes = np.array([2.0, 7.0])
-    expected = sum(
-        1 / 4 * stats.multivariate_normal.pdf(points, sign * f * direction, covariance)
-        for f in sizes
-        for sign in (-1, 1)
-    )
-    assert log_faulty(points, direction, sizes, covariance) == pytest.approx(np.log(expected), rel=1e-9)
 
 
 def test_one_parity_dimension_gives_the_normal_test():
@@ -75,17 +51,6 @@ def test_the_best_decision_found_is_reached_by_the_rule_that_it_states():
     declared, right = fault_of_size(geometry, size).at(0.02)
     assert alarm.mean() == pytest.approx(declared, abs=0.012)
     assert (alarm & (each.argmax(axis=0) == channel)).mean() == pytest.approx(right, abs=0.012)
-
-
-def test_best_decisions_of_a_game_with_four_outcomes():
-    rule = grid(1, 1.0, radii=4)
-    rule = type(rule)(rule.points[:4], np.zeros(4))
-    sound = np.log([0.4, 0.3, 0.2, 0.1])
-    faulty = np.log([[0.05, 0.05, 0.1, 0.3], [0.05, 0.15, 0.2, 0.1]])
-    limit = best_decisions(rule, sound, faulty)
-    assert limit.false_alarm == pytest.approx([0.1, 0.3, 0.6, 1.0])
-    assert limit.right == pytest.approx([0.3, 0.5, 0.65, 0.7])
-    assert limit.declared == pytest.approx([0.4, 0.7, 0.9, 1.0])
 
 
 def test_above_three_parity_dimensions_there_is_no_limit():

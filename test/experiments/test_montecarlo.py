@@ -342,19 +342,6 @@ def test_delays_without_memory_are_geometric_and_those_of_cusum_shorter_never_be
     assert delay["cusum"]["high"] > cell["limit"]["moustakides"]
 
 
-def test_two_faults_are_covered_by_the_suspects_of_the_detectors_that_believe_in_two(tmp_path):
-    section = run(
-        tmp_path,
-        "{seed: 10, snapshot: {detectors: [guaranteed, likelihood_ratio, max_residual], faults: 2, sizes: [20], "
-        "trials: 3000, sound_trials: 20000}}",
-    )
-    methods = {name: figures[0] for name, figures in section["cells"][1]["methods"].items()}
-    assert methods["guaranteed"]["covered_when_declared"]["value"] > 0.95
-    assert methods["likelihood_ratio"]["covered_when_declared"]["value"] > 0.5
-    assert methods["max_residual"]["covered_when_declared"]["value"] == 0, "it names one channel"
-    assert section["cells"][1]["limit"] is None
-
-
 def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not(tmp_path):
     section = run(
         tmp_path,

@@ -42,25 +42,6 @@ def test_a_flight_has_rests_slow_turns_and_fast_manoeuvres() -> None:
         assert np.mean((speed >= low) & (speed <= high)) > 0.05
 
 
-def test_perfect_gyros_measure_the_rate_along_their_axes() -> None:
-    motion = vehicle_motion(20.0, np.random.default_rng(1))
-    stamps = regular_stamps(20.0, 200.0, start=5)
-    block = PERFECT.draw(CONE, np.random.default_rng(2)).measure(motion, stamps, np.random.default_rng(3))
-    truth = motion.rate_at(np.arange(4001) / 200.0)
-    np.testing.assert_allclose(block.z, truth @ CONE.axes.T, atol=1e-12)
-    np.testing.assert_allclose(block.z @ CONE.parity.T, 0, atol=1e-12)
-
-
-def test_the_same_seed_gives_the_same_flight() -> None:
-    def fly(seed: int) -> np.ndarray:
-        rng = np.random.default_rng(seed)
-        motion = vehicle_motion(10.0, rng)
-        return GyroErrors().draw(CONE, rng).measure(motion, regular_stamps(10.0, 100.0), rng).z
-
-    np.testing.assert_array_equal(fly(4), fly(4))
-    assert not np.array_equal(fly(4), fly(5))
-
-
 @pytest.mark.parametrize(
     ("errors", "expected"),
     [

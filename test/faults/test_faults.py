@@ -5,7 +5,6 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,12 +75,15 @@ def test_each_kind_does_what_it_says():
     for kind, values in expected.items():
         faulty, _ = inject(EXAMPLES[kind], block)
         np.testing.assert_allclose(faulty.z[active, 4], values, rtol=1e-12, atol=1e-12, err_msg=kind)
+    for words, value in (("size=0.3", 0.3), ("", block.z[0, 0])):
+        assert set(inject(f"channel=imu_1.x kind=stuck {words}", block)[0].z[:, 0]) == {value}
 
 
 def test_random_kinds_have_the_stated_strength():
     rows = 100_000
     block = Block(np.arange(rows) * 10_000_000, np.zeros((rows, 6)))
     added = inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=3", block)[0].z[:, 0]
+    assert (added != inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=4", block)[0].z[:, 0]).all()
     assert added.std() == pytest.approx(0.1, rel=0.01)
     assert abs(added.mean()) < 4 * 0.1 / math.sqrt(rows)
     added = inject("channel=imu_1.x kind=spike size=0.5 rate=20 start=0", block)[0].z[:, 0]
@@ -89,20 +91,6 @@ def test_random_kinds_have_the_stated_strength():
     expected = rows * -math.expm1(-20 * 0.01)
     for count, mean in (((added != 0).sum(), expected), ((added > 0).sum(), expected / 2)):
         assert abs(count - mean) < 5 * math.sqrt(mean)
-
-
-def test_seed_gives_the_same_faults_and_another_seed_others():
-    block = stream()
-    fault = EXAMPLES["noise"]
-    first, again, other = (inject(one, block)[0].z for one in (fault, fault, replace(fault, seed=2)))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-
-
-def test_stuck_at_a_given_value_and_from_the_first_sample():
-    block = stream()
-    assert set(inject("channel=imu_1.x kind=stuck size=0.3", block)[0].z[:, 0]) == {0.3}
-    assert set(inject("channel=imu_1.x kind=stuck", block)[0].z[:, 0]) == {block.z[0, 0]}
 
 
 def test_missing_is_not_delivered_and_nan_is():
@@ -157,31 +145,19 @@ def test_a_fault_says_itself_in_words_that_read_back(kind):
         ("channel=imu_1.x kind=bias", "needs size in rad/s"),
         ("channel=imu_1.x kind=bias size=0", "size is 0"),
         ("channel=imu_1.x kind=bias size=nan", "size is nan rad/s, expected -100 to 100 rad/s"),
-        ("channel=imu_1.x kind=bias size=inf", "size is inf rad/s, expected -100 to 100 rad/s"),
-        ("channel=imu_1.x kind=bias size=1000", "size is 1000 rad/s, expected -100 to 100 rad/s"),
         ("channel=imu_1.x kind=bias size=big", "size is 'big', expected a number"),
         ("channel=imu_1.x kind=bias size=1 size=2", "size is given twice"),
-        (
-            "channel=imu_1.x kind=bias size=1 colour=red",
-            "takes no colour, only: channel, kind, start",
-        ),
         ("channel=imu_1.x kind=bias size=1 duty=0.5", "takes no duty, only: channel, kind, start, stop, seed, size"),
         ("channel=imu_1.x kind=bias size=1 start=-1", "start is -1 s, expected 0 to 1e+12 s"),
         ("channel=imu_1.x kind=bias size=1 start=5 stop=5", "stop is 5 s, expected more than start 5 s"),
         ("channel=imu_1.x kind=bias size=1 seed=0.5", "seed is 0.5, expected a whole number"),
-        ("channel=imu_1.x kind=bias size=1 seed=-1", "seed is -1, expected 0 to inf"),
-        ("channel=imu_1.x kind=delay size=1.5", "size is 1.5 samples, expected a whole number"),
-        ("channel=imu_1.x kind=spike size=1 rate=0", "rate is 0 1/s, expected 0.001 to 10000 1/s"),
         ("channel=imu_1 kind=intermittent size=1 duty=2", "duty is 2, expected 0.001 to 0.999"),
         ("channel=imu_1.x kind=triad_loss", "strikes 1 channels, expected 3"),
         ("kind=bias size=1", "needs channel"),
         ({"channel": "imu_1.x", "kind": "bias", "size": 1, "start": None}, "start is None, expected a number"),
         ({"channel": "imu_1.x", "kind": "bias", "size": 10**400}, "expected a number"),
         ({"channel": "imu_1.x", "kind": "bias", "size": 1, 5: 3}, "takes no 5, only: channel"),
-        ({"channel": "imu_1.x", "kind": "bias", "size": 1, None: 3}, "takes no None, only: channel"),
-        ("channel=imu_1.x size=1", "needs kind"),
         ("channel=imu_1.x kind bias", "'kind' is not of the form key=value"),
-        ("", "needs channel"),
     ],
 )
 def test_a_wrong_fault_is_refused_in_one_line(text, words):

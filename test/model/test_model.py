@@ -68,24 +68,11 @@ def test_two_triad_cone_as_the_paper_says() -> None:
         assert geometry.rho[i, j] == pytest.approx(expected, abs=1e-12)
 
 
-@given(seed=st.integers(0, 10_000))
-def test_two_turned_triads_correlate_by_the_rotation(seed: int) -> None:
-    rotation = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    rho = Geometry.from_triads([np.eye(3), rotation]).rho
-    np.testing.assert_allclose(np.abs(rho[:3, 3:]), np.abs(rotation), atol=1e-9)
-
-
 @pytest.mark.parametrize("n", [4, 5, 7, 9, 12])
 def test_cone(n: int) -> None:
     axes = Geometry.cone(n).axes
     np.testing.assert_allclose(axes @ [0, 0, 1], np.full(n, 1 / np.sqrt(3)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-12)
-
-
-def test_dodecahedron_angles() -> None:
-    axes = Geometry.dodecahedron().axes
-    np.testing.assert_allclose(np.abs(axes @ axes.T)[~np.eye(6, dtype=bool)], np.sqrt(1 / 5), atol=1e-12)
 
 
 def test_what_can_be_told_apart() -> None:
@@ -123,15 +110,8 @@ def test_variance_is_that_of_simulated_errors() -> None:
     variance = noise.variance(geometry, rate, acceleration)[0]
     # The standard error of a variance from N samples is variance * sqrt(2 / N).
     np.testing.assert_allclose(errors.var(axis=0), variance, rtol=4 * np.sqrt(2 / rows))
-
-
-def test_no_acceleration_is_zero_acceleration_and_where_nothing_depends_on_motion() -> None:
-    geometry, noise = Geometry.cone(5), NoiseModel(1e-3, timing_std=1e-3).for_channels(5)
-    rate = np.ones((3, 3))
-    np.testing.assert_array_equal(noise.variance(geometry, rate), noise.variance(geometry, rate, np.zeros((3, 3))))
-    assert NoiseModel(1.0).constant
-    assert not NoiseModel(1.0, scale_std=1e-3).constant
-    assert not NoiseModel(1.0, timing_std=[0, 0, 0, 1e-3]).constant
+    still = noise.variance(geometry, rate, np.zeros((1, 3)))
+    np.testing.assert_array_equal(noise.variance(geometry, rate), still, err_msg="without acceleration")
 
 
 def test_subset_takes_the_channels_left() -> None:
@@ -176,10 +156,6 @@ def test_chi_square_equals_scipy(dof: int) -> None:
         assert chi2_isf(probability, dof) == pytest.approx(stats.chi2.isf(probability, dof), rel=1e-7)
 
 
-def test_chi_square_published() -> None:
-    assert chi2_isf(1e-3, 3) == pytest.approx(16.266, abs=5e-4)
-
-
 @pytest.mark.parametrize("n", [4, 5, 6, 7, 9, 12])
 @pytest.mark.parametrize("probability", [1e-2, 1e-3])
 def test_largest_of_correlated_normals_by_simulation(n: int, probability: float) -> None:
@@ -207,14 +183,6 @@ def test_twins_count_once() -> None:
     assert max_normal_threshold(directions(twin_triads), 1e-3) == pytest.approx(three_independent, abs=2e-4)
 
 
-def test_single_direction_is_a_normal() -> None:
-    assert max_normal_threshold(directions(Geometry.cone(4)), 1e-4) == pytest.approx(normal_isf(5e-5), abs=1e-6)
-
-
-RATE = {"run_length", "false_alarms_per_hour", "sample_rate"}
-"""Options of a detector that takes a run length."""
-
-
 def test_three_ways_to_state_the_same() -> None:
     hourly = FalseAlarmRate(per_hour=1e-3, sample_rate=100.0)
     assert hourly.per_sample() == pytest.approx(2.7778e-9, rel=1e-4)
@@ -227,15 +195,6 @@ def test_three_ways_to_state_the_same() -> None:
     assert FalseAlarmRate().mean_run_length() == 3.6e8
 
 
-def test_a_detector_gets_what_it_takes() -> None:
-    assert FalseAlarmRate(1e-4, sample_rate=50.0).as_options(RATE) == {"run_length": 1e4, "sample_rate": 50.0}
-    assert FalseAlarmRate(0.9).as_options(RATE) == {"run_length": 2.0}
-    assert FalseAlarmRate(1e-4).as_options({"false_alarm_probability"}) == {"false_alarm_probability": 1e-4}
-    hourly = FalseAlarmRate(per_hour=1.0, sample_rate=100.0)
-    assert hourly.as_options() == {"false_alarms_per_hour": 1.0, "sample_rate": 100.0}
-    assert hourly.as_options({"max_faults"}) == {}
-
-
 PLANE = [[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0.8, -0.6, 0]]
 
 
@@ -244,10 +203,8 @@ PLANE = [[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0.8, -0.6, 0]]
     [
         (lambda: Geometry(np.ones((4, 2))), r"shape \(4, 2\), expected \(n, 3\)"),
         (lambda: Geometry(np.eye(3)), "3 channels, expected 4 to 12"),
-        (lambda: Geometry.cone(13), "13 channels, expected 4 to 12"),
         (lambda: Geometry([*np.eye(3), [0, np.nan, 1]]), "channel 4 is not finite"),
         (lambda: Geometry([*np.eye(3), [0, 0.1, 0.1]]), "channel 4 has norm 0.1414, expected 0.5 to 2"),
-        (lambda: Geometry([*np.eye(3), [3, 0, 0]]), "channel 4 has norm 3, expected 0.5 to 2"),
         (lambda: Geometry(PLANE), "do not span three dimensions"),
         (lambda: Geometry(Geometry.cone(4).axes, ["a", "b"]), "2 channel names for 4 axes"),
         (lambda: Geometry(Geometry.cone(4).axes, ["a", "b", "a", "c"]), "names are not unique"),
@@ -257,15 +214,11 @@ PLANE = [[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0.8, -0.6, 0]]
         (lambda: Geometry.from_triads([np.eye(3), np.full((3, 3), np.nan)]), "unit 2 is not finite"),
         (lambda: Geometry.cone(5).subset([True, True, True, False, False]), "3 channels, expected 4 to 12"),
         (lambda: NoiseModel(0.0), "noise.noise_std is 0.0 rad/s, expected finite, > 0"),
-        (lambda: NoiseModel(-1.0), "noise.noise_std is -1.0 rad/s"),
         (lambda: NoiseModel([1.0, np.nan]), "noise.noise_std is nan"),
-        (lambda: NoiseModel(np.inf), "noise.noise_std is inf"),
         (lambda: NoiseModel([]), r"noise.noise_std is \[\]"),
         (lambda: NoiseModel(1.0, scale_std=-0.1), "noise.scale_std is -0.1, expected finite, >= 0 and <= 1"),
-        (lambda: NoiseModel(1.0, scale_std=1.5), "noise.scale_std is 1.5"),
         (lambda: NoiseModel(1.0, timing_std=2.0), "noise.timing_std is 2.0 s, expected finite, >= 0 and <= 1"),
         (lambda: NoiseModel(1.0, bias_std=-1.0), "noise.bias_std is -1.0 rad/s, expected finite, >= 0"),
-        (lambda: NoiseModel(1.0, bias_std=np.inf), "noise.bias_std is inf"),
         (lambda: NoiseModel(1.0, bound=0.0), "noise.bound is 0.0 rad/s, expected finite, > 0"),
         (
             lambda: NoiseModel(1.0, scale_std=[0.1, 0.2, 0.3]).for_channels(5),
