@@ -4,7 +4,7 @@
 """Recorded flights through a replay, as they are and with a bias injected into every channel.
 
 Settings: "calibrated": by `fdi calibrate` on another flight of the vehicle (a recording without a sister is cut in
-two), in this process; "inspected": `fdi inspect --write` of the recording itself. --trials: starts of the faults in
+two); "inspected": what `fdi inspect` writes for the recording itself. --trials: starts of the faults in
 each flight, evenly spread (1: the middle).
 
 Healthy: faulty, in_sets count channels that are declared, `words` tells which and when (s); solo imu_1.x disagrees with
@@ -19,9 +19,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,15 +27,15 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
-from trials import CONFIGS, Array, Asked, Mask, Row, either, faulty, in_set, seconds_of
+from trials import CONFIGS, Array, Asked, Mask, Row, faulty, in_set, seconds_of
 
 from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.faults.fault import fault_from
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, Sink, replay
-
-calibrate = either("fdi_ros.setup.calibrate:calibrate", "fdi_ros.calibration.calibrate:calibrate")
+from fdi_ros.setup.calibrate import calibrate
+from fdi_ros.setup.starting_config import starting_config_of
 
 WITHIN = (1.0, 4.0, 10.0)
 """Times to the name, s; the last is how long a fault is watched."""
@@ -147,12 +144,9 @@ def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), e
 
 @functools.cache
 def inspected(recorded: Recorded) -> Config:
-    """Return what `fdi inspect --write` gives, with the mounts that are known."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "inspected.yaml"
-        command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(recorded.path), "--write", str(path)]
-        subprocess.run(command, check=True, capture_output=True)
-        return Config.from_file(path, {"imus.mounts": recorded.base().imus.mounts})
+    """Return what `fdi inspect` writes, with the mounts that are known."""
+    found = starting_config_of(recorded.path, f"{recorded.path}: no settings for it").parameters
+    return Config.from_parameters({**found, "imus.mounts": recorded.base().imus.mounts})
 
 
 @functools.cache
@@ -183,13 +177,12 @@ def cross_correlated(recorded: Recorded, geometry: Any) -> Array:
 
 
 def delays_of(flown: Replayed, true: Array) -> dict[str, Any]:
-    """Return how the estimated delays differ from those of the cross-correlation, where the version reports them."""
+    """Return how the estimated delays differ from those of the cross-correlation, where any are estimated."""
     status = flown.pipeline.status()
-    delays, std = np.array(getattr(status, "delays", ())), np.array(getattr(status, "delay_std", ()))
+    delays, std = np.array(status.delays), np.array(status.delay_std)
     if len(delays) != len(true):
         return {}
-    taken_off = getattr(status, "delays_taken_off", ()) or 0.0
-    off = np.abs(delays + taken_off - true)[1:]
+    off = np.abs(delays + (status.delays_taken_off or 0.0) - true)[1:]
     with np.errstate(divide="ignore", invalid="ignore"):
         return {"late_off": 1e3 * float(off.max()), "late_sigmas": float((off / std[1:]).max())}
 

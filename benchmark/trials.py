@@ -3,13 +3,12 @@
 
 """What the parts of `estimator.py` share: what is asked, monitors, simulated gyros, motions, outcomes.
 
-Only names that versions from 0.2 on have, so that the same lines measure two of them beside each other. Shipped configs
-are those of the package that is imported; noise, scale errors and skew of the simulated gyros are stated here.
+Shipped configs are those of the package that is imported; noise, scale errors and skew of the simulated gyros are
+stated here.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -56,14 +55,6 @@ NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)
 """Only the biases are not as they should be."""
 REST = 6.0
 """At the start of every flight, s."""
-
-
-def either(*places: str) -> Any:
-    """Return what stands at the first of some places ("module:name") that the measured version has."""
-    for module, _, name in (place.partition(":") for place in places):
-        if importlib.util.find_spec(module.rpartition(".")[0]) and importlib.util.find_spec(module):
-            return getattr(importlib.import_module(module), name)
-    raise ImportError(f"none of {', '.join(places)}")
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def fly(config: Config, rng: Rng, kind: str) -> dict[str, Any]:
 def delay_error(pipeline: Pipeline, late: Array) -> tuple[float, float] | None:
     """Rms error, s, of the delays between units that are reported, and the largest in their standard deviations."""
     status = pipeline.status()
-    delays, std = np.array(getattr(status, "delays", ())), np.array(getattr(status, "delay_std", ()))
+    delays, std = np.array(status.delays), np.array(status.delay_std)
     if len(delays) != len(late) or not np.isfinite(delays).all():
         return None
     error = delays - late
