@@ -15,7 +15,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,42 +37,6 @@ _PREFIX = 9
 """Bytes of a record before its content: opcode, length of the content."""
 _HEAD = 22
 """Bytes of a message record before the message: channel, sequence, log time, publish time."""
-
-
-@dataclass(frozen=True)
-class Records:
-    """The records found in a run of bytes: k messages, and where topics are described."""
-
-    buffer: Bytes
-    channel: Int
-    """(k,) channel number of each message."""
-    log_time: Int
-    """(k,) ns."""
-    offset: Int
-    """(k,) first byte of each message in the buffer."""
-    length: Int
-    """(k,) bytes of each message."""
-    topics: list[tuple[int, bytes]]
-    """Schema and channel records: opcode and content."""
-    end: int
-    """Where the walk ended: the length of the buffer unless it is damaged, or another record stopped it."""
-
-    @classmethod
-    def joined(cls, parts: Sequence[Records]) -> Records:
-        """Return the records of several runs of bytes, laid one behind the other."""
-        if len(parts) == 1:
-            return parts[0]
-        ends = np.cumsum([len(part.buffer) for part in parts])
-        starts = (ends - [len(part.buffer) for part in parts]).tolist()
-        return cls(
-            np.concatenate([part.buffer for part in parts]),
-            np.concatenate([part.channel for part in parts]),
-            np.concatenate([part.log_time for part in parts]),
-            np.concatenate([part.offset + start for part, start in zip(parts, starts, strict=True)]),
-            np.concatenate([part.length for part in parts]),
-            [topic for part in parts for topic in part.topics],
-            int(ends[-1]),
-        )
 
 
 def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) -> tuple[bytes, str]:
@@ -113,7 +77,7 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
     return data, ""
 
 
-def walk(data: bytes, outside: bool = False) -> Records:
+def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, bytes]], int]:
     """Find the records in a run of bytes.
 
     Parameters
@@ -122,15 +86,19 @@ def walk(data: bytes, outside: bool = False) -> Records:
         The bytes; a record that is incomplete ends the walk.
     outside
         The records lie outside chunks: a chunk, the statistics and the footer end the walk, too.
+
+    Returns
+    -------
+    The messages, with the numbers of their channels as topics; opcode and content of schema and channel records; and
+    where the walk ended: the length of the data unless it is damaged, or another record stopped it.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     # How many there are is counted first.
     k, described, _ = find_records(buffer, outside, np.empty((4, 0), np.int64), np.empty((0, 3), np.int64))
     messages, topics = np.empty((4, k), np.int64), np.empty((described, 3), np.int64)
     _, _, end = find_records(buffer, outside, messages, topics)
-    channel, log_time, offset, length = messages
     contents = [(opcode, data[start:stop]) for opcode, start, stop in topics.tolist()]
-    return Records(buffer, channel, log_time, offset, length, contents, int(end))
+    return Batch(buffer, *messages, NO_HORIZON, 1.0), contents, int(end)
 
 
 @compiled
@@ -142,7 +110,7 @@ def find_records(data: Bytes, outside: bool, messages: Int, topics: Int) -> tupl
     data, outside
         As for `walk`.
     messages
-        (4, room): channel, log time, offset and length of each message, as in `Records`.
+        (4, room): channel, log time, offset and length of each message, as in `Batch`.
     topics
         (room, 3): opcode, first byte and end of the content of each schema and channel record.
 
@@ -257,27 +225,24 @@ class McapFile:
         """Read the messages of the topics."""
         place = {name: k for k, name in enumerate(topics)}
         read, whole, known = 0, sum(piece.size for piece in self._pieces), -1
-        waiting: list[Records] = []
+        waiting: list[Batch] = []
         held = 0
         for k, piece in enumerate(self._pieces):
             if not self._may_read(k):
                 break
             read += piece.size
-            waiting.append(self._records(piece))
+            waiting.append(self._messages(piece))
             held += len(waiting[-1].buffer)
             last = k + 1 == len(self._pieces) or not self._may_read(k + 1)
             if held < _TOGETHER and not last:
                 continue
-            records, waiting, held = Records.joined(waiting), [], 0
+            found, waiting, held = Batch.joined(waiting), [], 0
             if len(self._channels) != known:
                 # Reading describes channels as it goes on.
                 known, number = len(self._channels), self._numbers(place)
             horizon = self._pieces[k + 1].start_time if not last else NO_HORIZON
-            topic = number[records.channel]
-            batch = Batch(
-                records.buffer, topic, records.log_time, records.offset, records.length, horizon, read / whole
-            )
-            yield batch if (topic >= 0).all() else batch.at(topic >= 0)
+            batch = replace(found, topic=number[found.topic], horizon=horizon, progress=read / whole)
+            yield batch if (batch.topic >= 0).all() else batch.at(batch.topic >= 0)
 
     def _may_read(self, k: int) -> bool:
         """Whether all up to piece k unpacks to no more than it may."""
@@ -301,7 +266,7 @@ class McapFile:
         for k, piece in enumerate(self._pieces):
             if not self._may_read(k):
                 break
-            numbers, found = np.unique(self._records(piece).channel, return_counts=True)
+            numbers, found = np.unique(self._messages(piece).topic, return_counts=True)
             counts.update(dict(zip(numbers.tolist(), found.tolist(), strict=True)))
         self._counts = dict(counts)
 
@@ -364,35 +329,35 @@ class McapFile:
             return end
         for size in (_FIRST, _RUN):
             data = self._read(position, max(size, end - position))
-            records = walk(data, outside=True)
+            found, topics, stop = walk(data, outside=True)
             # The run may go on behind the bytes that were read.
-            if position + len(data) == self.size or data[records.end : records.end + 1] in _STOPS:
+            if position + len(data) == self.size or data[stop : stop + 1] in _STOPS:
                 break
-        if len(records.log_time):
-            start_time = max(0, int(records.log_time.min()))
-            self._pieces.append(Piece(start_time, position, records.end, records.end, 0, "", False))
-        for opcode, content in records.topics:
+        if len(found):
+            start_time = max(0, int(found.log_time.min()))
+            self._pieces.append(Piece(start_time, position, stop, stop, 0, "", False))
+        for opcode, content in topics:
             self._note(opcode, content)
-        return position + max(records.end, 1)
+        return position + max(stop, 1)
 
     def _read(self, position: int, size: int) -> bytes:
         self._file.seek(position)
         return self._file.read(size)
 
-    def _records(self, piece: Piece) -> Records:
-        """Read a piece; what is wrong with it is noted, and what cannot be read left out."""
+    def _messages(self, piece: Piece) -> Batch:
+        """Read a piece, topics as numbers of channels; what is wrong is noted, what cannot be read left out."""
         stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
         data, wrong = decompress(stored, piece.compression, piece.raw_size, piece.crc, piece.cut)
-        records = walk(data)
+        found, topics, end = walk(data)
         if wrong:
             self.damage.add(f"{self.path.name}: the chunk at byte {piece.offset} {wrong}")
-        elif records.end < len(data):
+        elif end < len(data):
             self.damage.add(
-                f"{self.path.name}: the chunk at byte {piece.offset} is damaged after byte {records.end} of {len(data)}"
+                f"{self.path.name}: the chunk at byte {piece.offset} is damaged after byte {end} of {len(data)}"
             )
-        for opcode, content in records.topics:
+        for opcode, content in topics:
             self._note(opcode, content)
-        return records
+        return found
 
     def _note(self, opcode: int, content: bytes) -> None:
         """Take in a description of a topic; the first of each number counts."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -68,6 +69,35 @@ class Batch:
             log_time=self.log_time[rows],
             offset=self.offset[rows],
             length=self.length[rows],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Batch]) -> Batch:
+        """Return the messages of several batches, with horizon and progress of the last."""
+        if len(parts) == 1:
+            return parts[0]
+        ends = np.cumsum([len(part.buffer) for part in parts]).tolist()
+        return replace(
+            parts[-1],
+            buffer=np.concatenate([part.buffer for part in parts]),
+            topic=np.concatenate([part.topic for part in parts]),
+            log_time=np.concatenate([part.log_time for part in parts]),
+            offset=np.concatenate([p.offset + end - len(p.buffer) for p, end in zip(parts, ends, strict=True)]),
+            length=np.concatenate([part.length for part in parts]),
+        )
+
+    @classmethod
+    def of_messages(cls, topics: Sequence[int], times: Sequence[int], data: Sequence[bytes], progress: float) -> Batch:
+        """Return k messages in the order of their times of recording, ns."""
+        length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
+        return cls(
+            buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
+            topic=np.array(topics, dtype=np.int64),
+            log_time=np.array(times, dtype=np.int64),
+            offset=np.cumsum(length) - length,
+            length=length,
+            horizon=times[-1] if times else 0,
+            progress=progress,
         )
 
     def message(self, k: int) -> bytes:

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import lz4.frame
-import numpy as np
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
@@ -124,16 +123,7 @@ class Ros1File:
         while rows := list(itertools.islice(found, _TOGETHER)):
             read += len(rows)
             numbers, times, data = zip(*rows, strict=True)
-            length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
-            yield Batch(
-                buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-                topic=np.array([chosen[number] for number in numbers], dtype=np.int64),
-                log_time=np.array(times, dtype=np.int64),
-                offset=np.cumsum(length) - length,
-                length=length,
-                horizon=times[-1],
-                progress=read / whole,
-            )
+            yield Batch.of_messages([chosen[number] for number in numbers], times, data, read / whole)
 
     def _messages(self, connections: list[Any]) -> Iterator[tuple[int, int, bytes]]:
         """Yield connection, time of recording, ns, and content as ROS 2 has it, of each message."""

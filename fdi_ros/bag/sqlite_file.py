@@ -21,7 +21,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zstandard
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
@@ -233,16 +232,7 @@ class SqliteFile:
             # Only a damaged database holds anything else.
             rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
             topics, times, data = zip(*rows, strict=True) if rows else ((), (), ())
-        length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
-        return Batch(
-            buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-            topic=np.fromiter(map(chosen.__getitem__, topics), dtype=np.int64, count=len(data)),
-            log_time=np.array(times, dtype=np.int64),
-            offset=np.cumsum(length) - length,
-            length=length,
-            horizon=times[-1] if times else 0,
-            progress=progress,
-        )
+        return Batch.of_messages([chosen[topic] for topic in topics], times, data, progress)
 
 
 def _unpacked(data: bytes) -> bytes:

@@ -322,10 +322,10 @@ def test_records_are_those_of_a_plain_reading(drawn, flips, absurd, more):
         struct.pack_into("<Q", data, 1, absurd)
     data = bytes(data[: more.draw(st.integers(0, len(data)))])
     for outside in (False, True):
-        found = walk(data, outside)
-        rows = zip(found.channel.tolist(), found.log_time.tolist(), found.offset, found.length, strict=True)
+        found, topics, end = walk(data, outside)
+        rows = zip(found.topic.tolist(), found.log_time.tolist(), found.offset, found.length, strict=True)
         messages = [(channel, time, data[start : start + size]) for channel, time, start, size in rows]
-        assert (messages, found.topics, found.end) == plainly_read(data, outside)
+        assert (messages, topics, end) == plainly_read(data, outside)
 
 
 def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
