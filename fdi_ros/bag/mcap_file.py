@@ -98,7 +98,8 @@ def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, byt
     messages, topics = np.empty((4, k), np.int64), np.empty((described, 3), np.int64)
     _, _, end = find_records(buffer, outside, messages, topics)
     contents = [(opcode, data[start:stop]) for opcode, start, stop in topics.tolist()]
-    return Batch(buffer, *messages, NO_HORIZON, 1.0), contents, int(end)
+    channel, log_time, offset, length = messages
+    return Batch(buffer, channel, log_time, offset, length, NO_HORIZON, 1.0), contents, int(end)
 
 
 @compiled

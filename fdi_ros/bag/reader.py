@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 import zstandard
 
@@ -38,6 +37,7 @@ from fdi_ros.system.trusted_file import open_regular
 
 LOGS: dict[str, type[FlightLog]] = {".bin": DataflashLog, ".csv": CsvLog, ".tlog": Tlog, ".ulg": Ulog, ".ulog": Ulog}
 """Formats of flight logs, and tables of text."""
+_File = McapFile | SqliteFile | Ros1File | FlightLog
 
 
 class Recording:
@@ -61,12 +61,14 @@ class Recording:
         self._left = 0
         """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
-        self._files: list[McapFile | SqliteFile | Ros1File | FlightLog] = []
+        self._files: list[_File] = []
         found = find_files(self.path, self.damage)
         self._compressed = found.compressed
         try:
             self._left = unpacked(sum(path.stat().st_size for path in found.paths))
-            self._open(found.paths)
+            refused = [error for path in found.paths if (error := self._open(path)) is not None]
+            if not self._files:
+                raise refused[0]
         except BaseException:
             self.close()
             raise
@@ -75,9 +77,7 @@ class Recording:
     def __enter__(self) -> Recording:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -142,22 +142,18 @@ class Recording:
                     batch = batch.at(possible)
                 yield batch
 
-    def _open(self, paths: Sequence[Path]) -> None:
-        """Open what can be opened; a damaged file among several is noted."""
-        refused = [error for path in paths if (error := self._try(path)) is not None]
-        if not self._files:
-            raise refused[0]
-
-    def _try(self, path: Path) -> BagError | None:
+    def _open(self, path: Path) -> BagError | None:
+        """Open a file; why it cannot be is noted and returned: of several files the others are read."""
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
             _refuse_pointer(plain)
-            if plain.suffix == ".mcap":
+            suffix = plain.suffix.lower()
+            if suffix in LOGS:
+                self._files.append(LOGS[suffix](plain, self.damage))
+            elif suffix == ".mcap":
                 self._files.append(McapFile(plain, self.damage, self._left))
-            elif plain.suffix.lower() == ".bag":
+            elif suffix == ".bag":
                 self._files.append(Ros1File(plain, self.damage, self._left))
-            elif (form := LOGS.get(plain.suffix.lower())) is not None:
-                self._files.append(form(plain, self.damage))
             else:
                 self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))
         except BagError as error:
@@ -222,7 +218,7 @@ def convert(recording: Recording, path: Path, progress: Callable[[float], None])
     BagError
         If the recording has no such topic.
     """
-    # Who only reads does not load it.
+    # Imported lazily: readers do not need it.
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

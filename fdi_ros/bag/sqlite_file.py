@@ -25,7 +25,7 @@ import zstandard
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
 from fdi_ros.errors import BagError
-from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE, unpacked
+from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE
 
 _ROWS = 4096
 """Messages read at once."""
@@ -47,7 +47,7 @@ class SqliteFile:
     compressed
         Each message is compressed by zstd by itself.
     most
-        Bytes that the messages may come to; default: as many as a file of this size may hold.
+        Bytes that the messages may come to.
 
     Raises
     ------
@@ -55,18 +55,16 @@ class SqliteFile:
         If the file cannot be opened or is no rosbag2 database.
     """
 
-    def __init__(self, path: Path, damage: Damage, compressed: bool = False, most: int | None = None) -> None:
+    def __init__(self, path: Path, damage: Damage, compressed: bool, most: int) -> None:
         self.path = path
         self.damage = damage
         self.compressed = compressed
-        if not path.is_file():
-            raise BagError(f"cannot open {path}: no such file")
         size = path.stat().st_size
         if size == 0:
             raise BagError(f"{path} is empty")
         self._open = contextlib.ExitStack()
         """What is to be closed: the database, then the folder of its copy."""
-        self._left = unpacked(size) if most is None else most
+        self._left = most
         self._steps = STEPS + STEPS_PER_BYTE * size
         try:
             self._base = self._opened()

@@ -270,7 +270,7 @@ def test_a_signal_ends_a_query(tmp_path):
 
     table = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
     database(tmp_path / "bag.db3", table).close()
-    file = SqliteFile(tmp_path / "bag.db3", Damage())
+    file = SqliteFile(tmp_path / "bag.db3", Damage(), False, 1 << 30)
     file._steps = 1 << 62
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
