@@ -4,7 +4,12 @@
 """Tables of text (.csv): a line of column names, then a line per sample, read in portions of bounded memory.
 
 Names say which columns are the time and the rates about x, y and z of each IMU, and their units: ``time_us``,
-``gyro_1_x [deg/s]``, ``imu_0.x``.
+``gyro_1_x [deg/s]``, ``imu_0.x``. A file ``columns.yaml`` in the same folder says it where names do not:
+
+    time: t                         # all are optional
+    time_unit: ms                   # s, ms, us or ns
+    rate_unit: deg/s                # rad/s or deg/s
+    imus: [[wx1, wy1, wz1], [wx2, wy2, wz2]]
 
 Axes are taken as they are. An IMU without a value in a line has no message there. Times are read as doubles: of a date,
 they are exact to 0.3 us.
@@ -16,7 +21,8 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import BinaryIO, ClassVar, NamedTuple
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,7 +33,9 @@ from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.limits import CSV_LINE_BYTES, EARLIEST
 from fdi_ros.system.text import shown
+from fdi_ros.system.yaml_file import read_yaml
 
+COLUMNS = "columns.yaml"
 GUIDE = 'docs/flight_logs.md, "Tables of text"'
 KIND = "columns"
 _PORTION = 1 << 21
@@ -62,7 +70,7 @@ class CsvLog(FlightLog):
     stack = "a table of text (.csv)"
     magic = b""
     kinds = (KIND,)
-    settings: ClassVar = {"": "does the name of the time have its unit (time_ms)?"}
+    settings: ClassVar = {"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"}
     one_imu = "this table has one IMU ({}): nothing to compare it with"
     slowest = 5.0
 
@@ -133,18 +141,29 @@ def _columns(file: BinaryIO, names: Sequence[str], note: Callable[[str], None]) 
     Raises
     ------
     BagError
-        If there are none, or they have another unit.
+        If there are none, or ``columns.yaml`` asks for others than there are.
     """
-    imus, time = _imus(names), next((name for name in names if _TIME.fullmatch(_split(name)[0])), None)
-    if time is None or not imus:
-        lacks, listed = "column of times" if time is None else "columns of gyros", shown(", ".join(names), MOST_SHOWN)
-        raise BagError(f"{file.name} has no {lacks} among {listed}; name them in its first line: {GUIDE}")
-    tick = _factor(_split(time)[1], _TIME_UNITS, 0.0, time)
-    rates = [_factor(_split(x)[1], _RATE_UNITS, 1.0, x) for x, _, _ in imus]
+    path = Path(file.name).parent / COLUMNS
+    told = read_yaml(path, "file", BagError) if path.exists() else {}
+    if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
+        raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
+    imus = told.get("imus", _imus(names))
+    if not isinstance(imus, list) or any(not isinstance(imu, list) or len(imu) != 3 for imu in imus):
+        raise BagError(f"{path}: imus is a list of three columns for each IMU")
+    time: Any = told.get("time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None))
+    listed = shown(", ".join(names), MOST_SHOWN)
+    for name in (time, *(column for imu in imus for column in imu)):
+        if name not in names:
+            missing = "no column of times" if name is None else f"no column {name!r}"
+            raise BagError(f"{file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}")
+    if not imus:
+        raise BagError(f"{file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}")
+    tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
+    rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
     said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
-    stated = all(_split(x)[1] for x, _, _ in imus)
+    stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
     unit = " in deg/s" if _DEGREES in rates else "" if stated else "; no unit is named: taken as rad/s"
-    note(f"columns by their names: time is {time}; {said}{unit}")
+    note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}")
     places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
     return Columns(names.index(time), tick, places, tuple(rates))
 

@@ -296,8 +296,11 @@ def flight_log(draw: Draw, stem: Path) -> Path:
 
 
 def table(draw: Draw, path: Path, made: list[logs.Unit]) -> Path:
-    """A table of text, with odd names and cells."""
+    """A table of text, with odd names and cells, and now and then a file that says what they are."""
     names = ["t", *(f"imu_{k}.{axis}" for k in range(len(made)) for axis in "xyz")]
+    about = {"time": "t", "time_unit": "s", "imus": [["imu_0.x", "imu_0.y", "imu_0.z"]] * draw.choice((1, 2, 900))}
+    if draw.odd() or draw.odd():
+        path.with_name("columns.yaml").write_text(odd_yaml(draw, json.dumps(about, indent=1)), errors="replace")
     names = [draw.choice((*NAMES, "t", '"', "gyro_x [\x1b[2J]")) if draw.odd() else name for name in names]
     rows = [names]
     for k in range(min(len(made[0].stamp), draw.choice((0, 30, 300)))):
