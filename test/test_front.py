@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,7 +19,6 @@ import fdi_ros
 from fdi_ros.bag.samples import joined, read_block
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import time_index
-from fdi_ros.replay import front
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.system.text import html_table, shown
@@ -60,27 +58,17 @@ def test_a_recording_is_read_in_blocks(flight: Path, config: fdi_ros.Config) -> 
         fdi_ros.read("nowhere")
 
 
-def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config) -> None:
+def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config, root: Path) -> None:
+    fault = {"channel": "imu_2.y", "kind": "bias", "size": 0.15, "start": 28}
     same = run_replay(Request(flight, config, (parse_fault(FAULT),), end=31.0)).scores
-    assert fdi_ros.replay(flight, config, [FAULT], end=31.0).scores == same
+    assert same.isolated == 1
     # A module of it has been imported, and it is a function all the same.
     assert "fdi_ros.replay.run" in sys.modules
-    assert fdi_ros.replay(flight, config, [FAULT], end=31.0).scores.isolated == 1
-
-
-def test_a_fault_is_a_mapping_too_and_settings_a_file(flight: Path, config: fdi_ros.Config, root: Path) -> None:
-    fault = {"channel": "imu_2.y", "kind": "bias", "size": 0.15, "start": 28}
-    result = fdi_ros.replay(flight, root / "config" / "two_imus.yaml", [fault], end=31.0)
-    assert result.scores == fdi_ros.replay(flight, config, [FAULT], end=31.0).scores
+    for settings, one in ((root / "config" / "two_imus.yaml", fault), (config, FAULT)):
+        assert fdi_ros.replay(flight, settings, [one], end=31.0).scores == same
     assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config
     with pytest.raises(fdi_ros.FdiError, match="takes no sise, only"):
         fdi_ros.replay(flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}])
-
-
-def test_what_can_be_called_says_with_what() -> None:
-    # The package that can be called has the parameters of the function that it calls.
-    assert inspect.signature(fdi_ros.replay) == inspect.signature(front.replay)
-    assert list(inspect.signature(fdi_ros.read).parameters) == ["path", "config", "start", "end"]
 
 
 def test_without_settings_units_that_are_turned_are_refused(flight: Path) -> None:
@@ -123,11 +111,9 @@ def test_things_say_what_they_are(flight: Path, config: fdi_ros.Config) -> None:
     for begin, one in known.items():
         assert repr(one).startswith(begin)
         assert len(repr(one)) < 3000
-    assert "samples of 6 channels" in repr(output)
     assert "UNCHECKED -> OK" in repr(event)
-    assert "channel 0" in repr(event)
     assert "imus.mounts" in repr(config)
-    assert "imus.max_skew" not in repr(config)
+    assert "imus.max_skew" not in repr(config), "what is as by default"
     for one, words in ((config, "startup_bias_duration"), (geometry, "g6"), (pipeline, "imu_2.z"), (output, "imu_1.x")):
         assert any(words in cell for cell in cells(one._repr_html_())), one
 

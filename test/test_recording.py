@@ -35,16 +35,6 @@ def declared(pipeline, output):
     return [(pipeline.channel_names[e.channel], e.after.name, e.stamp) for e in output.events if e.declares]
 
 
-def test_nothing_is_declared_in_180_seconds(block, config):
-    assert len(block) == 11_251
-    pipeline = Pipeline(config)
-    output = pipeline.process(block)
-    assert declared(pipeline, output) == []
-    # 3 s at rest for the bias, then a rate for every sample.
-    assert output.valid.sum() == len(block) - 188
-    assert pipeline.status().bias_state == "learned"
-
-
 def test_shaken_to_saturation_it_declares_no_sound_channel(recording, config):
     """The last 30 s reach the gyros' limit of 2000 deg/s, with nominal axes and scale factors."""
     whole = read_block(recording, config)
@@ -52,6 +42,9 @@ def test_shaken_to_saturation_it_declares_no_sound_channel(recording, config):
     pipeline = Pipeline(config)
     output = pipeline.process(whole)
     assert declared(pipeline, output) == []
+    # 3 s at rest for the bias, then a rate for every sample up to there.
+    assert output.valid[188:11_251].all()
+    assert pipeline.status().bias_state == "learned"
     counted = sum(channel.out_of_range for channel in pipeline.status().channels)
     assert counted == (np.abs(whole.z) >= 34.8).sum() > 100
 

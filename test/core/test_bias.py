@@ -3,8 +3,12 @@
 
 """The start-up average: what it makes of noise, spikes and biases, and what it does not take for rest."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from monitor.streams import RATE, config
+from monitor.streams import SIGMA as NOISE
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
@@ -14,17 +18,9 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 
-NOISE = 0.0025
-RATE = 100.0
 LENGTH = 300
 """Samples of an average."""
-
-
-def config(**parameters):
-    settings = {"noise.noise_std": NOISE, "bias.startup_bias_duration": LENGTH / RATE, "sample_rate": RATE}
-    # A detector that goes on without a rest would not wait for one.
-    settings["detector.name"] = "likelihood_ratio"
-    return Config.from_parameters(settings | {name.replace("__", "."): v for name, v in parameters.items()})
+config = partial(config, bias__startup_bias_duration=LENGTH / RATE)
 
 
 def noise(seed, n=6):

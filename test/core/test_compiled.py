@@ -114,14 +114,6 @@ def test_first_starts_at_once_then_a_load(copy: Path) -> None:
     assert "compiled it in" not in warm[2]
 
 
-def test_what_compiled_code_calls_is_kept_only_as_a_part_of_it(warm: tuple[Path, Path]) -> None:
-    _, made = warm
-    whole, parts = ({one.name.partition("-")[0] for one in made.rglob(kind)} for kind in ("*.nbi", "*.nbp"))
-    assert whole == {"decision.clear_declarations", "residual_search.judge"}
-    assert parts > {"decision.clear", "decision.forget_alarms", "decision.forget_kind"}
-    assert not whole & parts
-
-
 def test_installation_that_cannot_be_written(copy: Path) -> None:
     cannot_be_written(copy / "fdi_ros" / "__pycache__")
     kept, _, output = outcome(start(copy))

@@ -20,15 +20,12 @@ from fdi_ros.core.alignment import restamp
 from fdi_ros.core.parity import compute_joint_weights, eliminate_rate
 from fdi_ros.core.records import DelayBuffer, Parity
 from fdi_ros.estimator.error_states import (
-    ERROR_KINDS,
     MAX_STATES,
-    SIGNALS,
     ErrorStates,
     Layout,
     Projection,
     begin_states,
     fill_signals,
-    places_of,
     predict,
     prepare_layout,
     project,
@@ -84,16 +81,6 @@ def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     prepare_layout(layout[0], unit, units, PRIORS, WALKS)
     begin_states(layout[0], states[0], np.full(n, 0.01))
     return layout[0], states[0], unit
-
-
-@pytest.mark.parametrize(("n", "units"), [(4, 0), (6, 2), (12, 4)])
-def test_every_state_of_the_table_has_its_place(n: int, units: int) -> None:
-    layout, _, unit = estimator(n, units)
-    places = [place for kind in ERROR_KINDS for owner in places_of(kind.name, n, units) for place in owner]
-    assert places == list(range(layout["count"]))
-    for i in range(n):
-        used = [p for p in layout["place"][i] if p >= 0]
-        assert len(used) == len(set(used)) == (SIGNALS if unit[i] > 0 else SIGNALS - 1)
 
 
 @settings(max_examples=25)

@@ -20,12 +20,13 @@ def noisy(rng: np.random.Generator, geometry: Geometry, rows: int) -> np.ndarray
     return rng.uniform(-3, 3, (rows, 3)) @ geometry.axes.T + rng.standard_normal((rows, geometry.n))
 
 
+@pytest.mark.parametrize("construction", ["svd", "qr"])
 @pytest.mark.parametrize("n", [4, 5, 6, 7, 9])
-def test_scores_are_j_by_its_definition(n: int) -> None:
+def test_scores_are_j_by_its_definition(n: int, construction: str) -> None:
     rng = np.random.default_rng(n)
     geometry = random_axes(rng, n)
     z = noisy(rng, geometry, 50)
-    detector = Projector(geometry, UNIT, false_alarm_probability=0.999)
+    detector = Projector(geometry, UNIT, false_alarm_probability=0.999, construction=construction)
     verdict = detector.detect(z)
     gain = geometry.S
     for row, sample in enumerate(z):
@@ -37,17 +38,6 @@ def test_scores_are_j_by_its_definition(n: int) -> None:
             named = int(np.argmin(left))
             assert verdict.suspects[row, named]
             assert verdict.error[row, named] == pytest.approx(kappa[named], rel=1e-9)
-
-
-@pytest.mark.parametrize("n", [5, 6, 8])
-def test_svd_equals_qr(n: int) -> None:
-    rng = np.random.default_rng(2)
-    geometry = random_axes(rng, n)
-    z = noisy(rng, geometry, 300) + 8 * np.eye(n)[rng.integers(n, size=300)]
-    one, other = (Projector(geometry, UNIT, construction=c).detect(z) for c in ("svd", "qr"))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
-    assert one.alarm.sum() > 50
 
 
 @pytest.mark.parametrize("n", [5, 6, 7, 9])

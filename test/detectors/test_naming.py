@@ -24,13 +24,11 @@ from fdi_ros.detectors.naming import (
     FIT,
     FIT_PER_CHECK,
     GAIN_STD,
-    SET_MARGIN,
     SPREAD,
     TWO_CHECKS,
     Inference,
     add_channels,
     add_units,
-    choose,
     explain,
 )
 
@@ -160,31 +158,6 @@ class TestOdds:
 
 
 class TestChoice:
-    @settings(max_examples=60)
-    @given(
-        tenths=st.lists(st.integers(-300, 0), min_size=1, max_size=30, unique=True),
-        confidence=st.sampled_from([0.6123, 0.9123, 0.99, 0.999, 0.9999]),
-        seed=st.integers(0, 1000),
-    )
-    def test_is_the_smallest_set_of_that_probability(self, tenths: list[int], confidence: float, seed: int) -> None:
-        rng, rows, odds = np.random.default_rng(seed), allocate(Inference), [k / 10 for k in tenths]
-        members = rng.integers(1, 1 << 6, len(odds))
-        rows["mask"], rows["count"] = (1 << 12) - 1, len(odds)
-        rows["odds"][0, : len(odds)], rows["members"][0, : len(odds)] = odds, members
-        choose(rows[0], 6, confidence)
-        order = np.argsort(odds)[::-1]
-        share = np.cumsum(np.exp(np.array(odds)[order]))
-        share /= share[-1]
-        common = np.bitwise_and.reduce(members[order[: np.searchsorted(share, confidence) + 1]])
-        # A set is told with less certainty than a name, and holds two channels at least.
-        count = np.searchsorted(share, max(1 - SET_MARGIN * (1 - confidence), 0.0)) + 1
-        union = np.bitwise_or.reduce(members[order[:count]])
-        while union & (union - 1) == 0 and count < len(order) and share[count - 1] < confidence:
-            union |= members[order[count]]
-            count += 1
-        assert rows["common"][0] == (common if 0 < int(common).bit_count() <= 2 else 0)
-        assert rows["union"][0] == union
-
     def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self) -> None:
         """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
         rng = np.random.default_rng(3)

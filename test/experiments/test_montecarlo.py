@@ -391,14 +391,6 @@ def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):
     assert '"type":"band"' in text
 
 
-def test_detectors_of_equal_figures_share_a_row(tmp_path):
-    # Both alarm where the largest normalised residual does, and name its channel.
-    alone = {"snapshot": {**SMALL["snapshot"], "detectors": ["max_residual", "projector", "guaranteed"]}}
-    (head, rows), *_ = [one.content for one in tables(run_study(load_study(study_file(tmp_path, alone)), 1))]
-    assert head[:2] == ("detector", "healthy")
-    assert [row[0] for row in rows] == ["max_residual, projector", "guaranteed", "best possible, approximate"]
-
-
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_the_studies_that_come_with_the_package_are_valid(path):
     study = load_study(path, trials=5, seed=1)

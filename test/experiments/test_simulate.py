@@ -35,13 +35,6 @@ def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: f
     assert not motion.rate_at(motion.time[-1:] + 1).any()
 
 
-def test_a_flight_has_rests_slow_turns_and_fast_manoeuvres() -> None:
-    motion = vehicle_motion(300.0, np.random.default_rng(0), max_rate=2.0)
-    speed = np.abs(motion.rate_at(np.linspace(0, 300, 30_000))).max(axis=1)
-    for low, high in ((0.0, 1e-9), (1e-3, 0.3), (1.0, 2.0)):
-        assert np.mean((speed >= low) & (speed <= high)) > 0.05
-
-
 @pytest.mark.parametrize(
     ("errors", "expected"),
     [

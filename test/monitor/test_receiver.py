@@ -137,20 +137,6 @@ def test_malformed_messages_are_counted_and_named():
     assert not ear.receiver.errors[1]
 
 
-def test_a_unit_that_falls_silent_is_named_and_the_rest_goes_on():
-    ear = Ear(Pipeline(parallel(3)))
-    block = stream(ear.receiver.pipeline.geometry, 300)
-    for k, (unit, data) in enumerate(messages(block, 3)):
-        if unit != 2 or k < 300:
-            ear.take(unit, data)
-    assert not ear.receiver.is_live(2)
-    assert ear.receiver.is_live(0)
-    states = {channel.name: channel.state for channel in ear.receiver.pipeline.status().channels}
-    assert {states[f"imu_3.{axis}"] for axis in "xyz"} == {ChannelState.STALE}
-    assert states["imu_1.x"] != ChannelState.STALE
-    assert len(ear.fused) >= 295
-
-
 @pytest.mark.parametrize("leap", [-0.06, -0.03, 0.004, 0.03, 0.06])
 @pytest.mark.parametrize("motion", [0.0, 1.0])
 def test_a_clock_that_leaps_once_by_less_than_the_timeout_blames_no_other_unit(leap, motion):

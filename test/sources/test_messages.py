@@ -40,16 +40,6 @@ triangles = st.lists(finite, min_size=6, max_size=6)
 ros = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="ROS 2 is not installed")
 
 
-def by_ros(data, kind):
-    """A message as rclpy reads it."""
-    from rclpy.serialization import deserialize_message
-
-    package, _, name = kind.split("/")
-    return deserialize_message(data, getattr(importlib.import_module(f"{package}.msg"), name))
-
-
-BY_EITHER = pytest.mark.parametrize("deserialise", [STORE.deserialize_cdr, pytest.param(by_ros, marks=ros)])
-
 parse_imu, decode_imu = partial(ImuSource.parse, count=3), partial(ImuSource.decode, count=3)
 patch_imu, patch_channels = ImuSource.patch, ChannelsSource.patch
 decode_array, array_count = ChannelsSource.decode, ChannelsSource.announced
@@ -172,30 +162,28 @@ class TestOneMessage:
 class TestManyMessages:
     """Read from one buffer, as they lie in a recording."""
 
-    @BY_EITHER
     @settings(max_examples=150)
     @given(drawn=imus)
-    def test_imus_equal_what_others_deserialise(self, drawn, deserialise) -> None:
+    def test_imus_equal_what_others_deserialise(self, drawn) -> None:
         messages = [imu_bytes(stamp, rate, frame, order) for stamp, rate, frame, order, _ in drawn]
         decoded = decode_imu(*packed(messages, [gap for *_, gap in drawn]))
         assert decoded.good.all()
         for k, message in enumerate(messages):
-            true = deserialise(message, IMU)
+            true = STORE.deserialize_cdr(message, IMU)
             assert decoded.stamp[k] == true.header.stamp.sec * 10**9 + true.header.stamp.nanosec
             rate = true.angular_velocity
             assert same(decoded.values[k], [rate.x, rate.y, rate.z])
 
-    @BY_EITHER
     @settings(max_examples=150)
     @given(drawn=arrays)
-    def test_arrays_equal_what_others_deserialise(self, drawn, deserialise) -> None:
+    def test_arrays_equal_what_others_deserialise(self, drawn) -> None:
         messages = [array_bytes(values, labels, order) for values, labels, order, _ in drawn]
         buffer, offset, length = packed(messages, [gap for *_, gap in drawn])
         assert array_count(buffer, offset, length) == len(drawn[0][0])
         for channels in {len(values) for values, *_ in drawn} - {0}:
             decoded = decode_array(buffer, offset, length, channels)
             for k, message in enumerate(messages):
-                true = deserialise(message, ARRAY).data
+                true = STORE.deserialize_cdr(message, ARRAY).data
                 assert decoded.good[k] == (len(true) == channels)
                 assert not decoded.good[k] or same(decoded.values[k], true)
 
