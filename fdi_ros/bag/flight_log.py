@@ -48,7 +48,7 @@ SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
 _COARSE_RATE = 0.5
 """Hz; means may be logged no more seldom."""
-_FAR = 10_000_000
+_MAX_TIME_STEP = 10_000_000
 """us; a sample that far from those logged before and after it has a damaged time."""
 _TOGETHER = 1 << 10
 """Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
@@ -223,9 +223,9 @@ class FlightLog(ABC):
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
         stamp = samples.stamp
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
-        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _FAR).any():
+        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
             # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
-            good &= np.abs(stamp - medians(stamp, 5)) <= _FAR
+            good &= np.abs(stamp - medians(stamp, 5)) <= _MAX_TIME_STEP
         if good.all():
             return samples
         self.note("samples with impossible times were left out")

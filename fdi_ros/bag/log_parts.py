@@ -21,9 +21,9 @@ FEWEST = 20
 """Samples by which the rate of a source can be judged."""
 _TOLERANCE = 0.95
 """Of that rate; clocks and loggers are not exact."""
-_APART = 1.5
+_MAX_INTERVAL_RATIO = 1.5
 """Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
-_STEP = 1_000_000
+_MAX_STEP_BACK = 1_000_000
 """us; a log goes on as long as its times step back by no more."""
 _BESIDE = 17
 """Samples whose median says where a log has come to: no few damaged times move it."""
@@ -94,7 +94,7 @@ class Track:
         if not len(stamp):
             return
         steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        steps = steps[(steps > 0) & (steps <= 1e6 * _APART / self.slowest)]
+        steps = steps[(steps > 0) & (steps <= 1e6 * _MAX_INTERVAL_RATIO / self.slowest)]
         self.fast += len(steps)
         self.fast_time += int(steps.sum())
         self.first = self.first if self.count else int(stamp[0])
@@ -151,13 +151,13 @@ class Clock:
         self.stamp, self.end = stamp[1 - _BESIDE :], end[1 - _BESIDE :]
         if not len(stamp):
             return 0
-        steady = bool((np.abs(np.diff(stamp)) <= _STEP).all())
+        steady = bool((np.abs(np.diff(stamp)) <= _MAX_STEP_BACK).all())
         come = stamp if steady else medians(stamp, _BESIDE)
         first = int(come[0]) if self.latest is None else self.latest
         before = np.maximum.accumulate(np.append(first, come[:-1]))
         self.latest = max(first, int(come.max()))
         # Nor does a log go on years later: there its times begin to be dates, or no longer are.
-        behind = (come < before - _STEP) | (come - before > LOG_SPAN)
+        behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
         return int(end[np.argmax(behind)]) if behind.any() else 0
 
 

@@ -168,11 +168,11 @@ class RecordingFiles:
     paths: tuple[Path, ...]
     compressed: bool = False
     """Each message is compressed by itself."""
-    own: bool = False
+    made_by_fdi: bool = False
     """The folder is one that ``fdi replay --output`` has written."""
 
 
-OWN = "fdi_ros"
+MADE_BY_FDI = "fdi_ros"
 """Key in the custom data of the metadata.yaml of an output bag."""
 
 
@@ -216,7 +216,7 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     return RecordingFiles(
         tuple(paths[:FILES]),
         str(about.get("compression_mode", "")).lower() == "message",
-        isinstance(custom, dict) and OWN in custom,
+        isinstance(custom, dict) and MADE_BY_FDI in custom,
     )
 
 

@@ -23,7 +23,7 @@ from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.log_parts import LogText
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.raw import LFS, OWN, Batch, Damage, Topic, find_files
+from fdi_ros.bag.raw import LFS, MADE_BY_FDI, Batch, Damage, Topic, find_files
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import Tlog
@@ -31,7 +31,7 @@ from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import SOURCES, source_of_type
-from fdi_ros.system.limits import CHANNELS, LATEST, unpacked
+from fdi_ros.system.limits import CHANNELS, LATEST, max_unpacked_bytes
 from fdi_ros.system.text import shown
 from fdi_ros.system.trusted_file import open_regular
 
@@ -65,7 +65,7 @@ class Recording:
         found = find_files(self.path, self.damage)
         self._compressed = found.compressed
         try:
-            self._left = unpacked(sum(path.stat().st_size for path in found.paths))
+            self._left = max_unpacked_bytes(sum(path.stat().st_size for path in found.paths))
             refused = [error for path in found.paths if (error := self._open(path)) is not None]
             if not self._files:
                 raise refused[0]
@@ -234,7 +234,7 @@ def convert(recording: Recording, path: Path, progress: Callable[[float], None])
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     # By this it may be replaced later: what anything else has recorded never is.
-    writer.set_custom_data(OWN, __version__)
+    writer.set_custom_data(MADE_BY_FDI, __version__)
     with writer:
         connections = [writer.add_connection(topic.name, topic.type, typestore=store) for topic in topics]
         counts = [0] * len(topics)

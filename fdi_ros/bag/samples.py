@@ -113,8 +113,8 @@ class Samples:
         self.source = source_of(config)
         recording.require(self.topics, self.source.type)
         self.alignment = Alignment(*self.source.alignment)
-        own = self.source.channels_of(0, channels)
-        self._width = own.stop - own.start
+        first = self.source.channels_of(0, channels)
+        self._width = first.stop - first.start
         """Values in a message."""
         self._span = (start, end)
         self._tap = tap

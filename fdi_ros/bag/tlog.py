@@ -13,9 +13,10 @@ Stamps are the autopilot's own; UTC is that of the message that came with the le
 
 from __future__ import annotations
 
+import contextlib
 from array import array
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -35,23 +36,10 @@ _LEAST = _TIME + 8
 """Bytes of the shortest record."""
 _TOGETHER = 1 << 16
 """Samples of a source handed on at once, about."""
-_LATE = 3_600_000_000
+_MAX_DELAY_SPREAD = 3_600_000_000
 """us; a message that came by so much more or less late than half of the others has a damaged time."""
 _LATEST = 2.0**53
 """us; up to there a time is exact in the memory of samples."""
-
-
-class _Record(NamedTuple):
-    """One message of an autopilot."""
-
-    at: int
-    """Where the record begins in the file, bytes."""
-    end: int
-    number: int
-    system: int
-    payload: bytes
-    message: Any
-    """As pymavlink decodes it."""
 
 
 class Tlog(FlightLog):
@@ -96,34 +84,41 @@ class Tlog(FlightLog):
 
     def _load(self, data: bytes) -> dict[Source, array[float]]:
         """Read the messages of IMUs of the first autopilot that says that it is one."""
-        beats = (one for one in self._records(data, (_HEARTBEAT,)) if one.message.autopilot != NO_AUTOPILOT)
         series: dict[Source, array[float]] = {}
+        beats = (beat for _, _, beat in self._messages(data, (_HEARTBEAT,)) if beat.autopilot != NO_AUTOPILOT)
         if (beat := next(beats, None)) is None:
             return series
-        autopilot = beat.message.autopilot
-        for record in self._records(data, (*MESSAGES, _STATUSTEXT)):
-            came = int.from_bytes(data[record.at : record.at + _TIME], "big")
-            if record.number == _STATUSTEXT:
-                if record.system == beat.system:
-                    self._came.append((came, str(record.message.text)))
+        for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
+            if message.get_srcSystem() != beat.get_srcSystem():
                 continue
-            kind = MESSAGES[record.number].kind
-            if record.system != beat.system or not understood(kind, autopilot):
+            came, number = int.from_bytes(data[at : at + _TIME], "big"), message.get_msgId()
+            if number == _STATUSTEXT:
+                self._came.append((came, str(message.text)))
+                continue
+            kind = MESSAGES[number].kind
+            if not understood(kind, beat.autopilot):
                 continue
             self.counts[kind] += 1
-            reading = read(record.number, record.payload)
+            start = at + _TIME
+            payload = start + (10 if data[start] == 0xFD else 6)
+            reading = read(number, data[payload : payload + data[start + 1]])
             if reading is None or reading.unit >= MOST_UNITS:
                 continue
             time = min(reading.time, _LATEST)
-            row = (time, min(came, _LATEST), record.end, *reading.rate, *reading.acceleration)
+            row = (time, min(came, _LATEST), end, *reading.rate, *reading.acceleration)
             series.setdefault(Source(kind, reading.unit), array("d")).extend(row)
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
-        if raw in series and scaled not in series and stands_in(RAW, autopilot):
+        if raw in series and scaled not in series and stands_in(RAW, beat.autopilot):
             series[scaled] = series.pop(raw)
         return series
 
-    def _records(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[_Record]:
-        """Find the messages with these ids that an autopilot has sent, and that pymavlink accepts."""
+    def _messages(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[tuple[int, int, Any]]:
+        """Find the messages with these ids that an autopilot has sent, and that pymavlink accepts.
+
+        Yields
+        ------
+        Where the record begins and ends in the file, bytes, and the message as pymavlink decodes it.
+        """
         codec = dialect()
         parser = codec.MAVLink(None)
         at = lost = 0
@@ -134,17 +129,12 @@ class Tlog(FlightLog):
             if not end:
                 at, lost = at + 1, lost + 1
                 continue
-            second, start = data[at + _TIME] == 0xFD, at + _TIME
+            start = at + _TIME
+            second = data[start] == 0xFD
             number = int.from_bytes(data[start + 7 : start + 10], "little") if second else data[start + 5]
-            system, component = data[start + 5 : start + 7] if second else data[start + 3 : start + 5]
-            if number in numbers and component == _AUTOPILOT_COMPONENT:
-                payload = start + (10 if second else 6)
-                try:
-                    message = parser.decode(bytearray(data[start:end]))
-                except codec.MAVError:
-                    message = None
-                if message is not None:
-                    yield _Record(at, end, number, system, data[payload : payload + data[start + 1]], message)
+            if number in numbers and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT:
+                with contextlib.suppress(codec.MAVError):
+                    yield at, end, parser.decode(bytearray(data[start:end]))
             at = end
         if lost + len(data) - at:
             self.note(f"{lost + len(data) - at} bytes belong to no whole record and were left out")
@@ -174,5 +164,5 @@ def _start_utc(times: Int) -> int | None:
     if not len(times):
         return None
     start = times[:, 1] - times[:, 0]
-    earliest = start[np.abs(start - np.median(start)) <= _LATE].min(keepdims=True)
+    earliest = start[np.abs(start - np.median(start)) <= _MAX_DELAY_SPREAD].min(keepdims=True)
     return possible_start(earliest, np.zeros_like(earliest))

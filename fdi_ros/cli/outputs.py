@@ -353,7 +353,7 @@ def _check_folder(path: Path) -> None:
         found = find_files(path, Damage())
     except BagError:
         found = None
-    ours = found is not None and found.own and there == {"metadata.yaml", *(file.name for file in found.paths)}
+    ours = found is not None and found.made_by_fdi and there == {"metadata.yaml", *(file.name for file in found.paths)}
     if not ours or not all(child.is_file() for child in path.iterdir()):
         raise BagError(
             f"{path} is a folder that holds more than a recording made by fdi; it is not overwritten even by --force"

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
-from fdi_ros.bag.raw import OWN, Batch
+from fdi_ros.bag.raw import MADE_BY_FDI, Batch
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
@@ -143,7 +143,7 @@ class OutputBag(Sink):
         self._config = config
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # By this it may be replaced later: what anything else has recorded never is.
-        self._writer.set_custom_data(OWN, __version__)
+        self._writer.set_custom_data(MADE_BY_FDI, __version__)
         self._encoder = Encoder(config.body_frame, channels)
         self._watch = InputWatch(config)
         self._shift = 0

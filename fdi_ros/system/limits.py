@@ -53,6 +53,6 @@ WORD, LINE = 120, 4000
 """Characters of a text from a file, and of a whole line with such texts, that are shown."""
 
 
-def unpacked(size: int) -> int:
+def max_unpacked_bytes(size: int) -> int:
     """Bytes that a recording of so many bytes may unpack to."""
     return FREE_BYTES + FREE_RATIO * size

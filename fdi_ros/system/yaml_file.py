@@ -89,21 +89,17 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
     FdiError
         Of that class, if the file cannot be read, is no YAML, or is beyond the limits.
     """
-    return parse_yaml(_read_text(path, what, error), f"{what} {path}", error)
-
-
-def _read_text(path: str | Path, what: str, error: type[FdiError]) -> str:
-    """Read a text file of bounded size; parameters and errors as for `read_yaml`."""
     try:
         with open_regular(path) as file:
             data = file.read(YAML_BYTES + 1)
         if len(data) > YAML_BYTES:
             raise error(f"{what} {path} is longer than {YAML_BYTES} bytes")
-        return data.decode("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError as refused:
         raise error(f"{what} {path} is not YAML: {refused}") from refused
     except (OSError, ValueError) as refused:
         raise error(f"cannot read {what} {path}: {getattr(refused, 'strerror', None) or refused}") from refused
+    return parse_yaml(text, f"{what} {path}", error)
 
 
 def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
