@@ -17,7 +17,7 @@ import numpy as np
 
 from fdi_ros.cli.outputs import bar_of
 from fdi_ros.compiling.compiled import LOG, allocate, compilations, missing
-from fdi_ros.compiling.notice import TICK, LogView, View
+from fdi_ros.compiling.notice import TICK, View
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.estimator.blocks import rests
@@ -49,7 +49,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
         running = [pool.submit(_quietly, part) for part in parts]
         first = missing()
         if first:
-            view = view or LogView()
+            view = view or View()
             view.begin()
             while wait(running, TICK).not_done:
                 view.draw(1 - missing() / first)

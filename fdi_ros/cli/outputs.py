@@ -22,7 +22,7 @@ import numpy as np
 
 from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
-from fdi_ros.compiling.notice import WORDS, clock, compiling_seconds, is_compiling
+from fdi_ros.compiling.notice import WORDS, View, clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.verdict import Severity, with_first_line_coloured
 from fdi_ros.system.installation import PROGRESS, there
@@ -105,7 +105,7 @@ class Progress:
         self._share = share
 
 
-class CompileBar:
+class CompileBar(View):
     """The share compiled, on the last line of a terminal while anything is compiled: a `View` of `announced`.
 
     Parameters

@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
 from numba.core import event
 
@@ -34,19 +34,6 @@ YOUNG_OBJECTS = 7000
 Python's default, is a seventh of its time. More seldom still costs memory and saves nothing."""
 LOG_PERIOD = 10.0
 """How often it is logged, s."""
-
-
-class View(Protocol):
-    """Shows that something is compiled."""
-
-    def begin(self) -> None:
-        """Say it, before the first compilation."""
-
-    def draw(self, share: float) -> None:
-        """Show the share done, 0 to 1; called from a thread of its own while something is compiled."""
-
-    def wipe(self) -> None:
-        """Make room: for now nothing is compiled."""
 
 
 class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
@@ -104,33 +91,33 @@ def clock() -> float:
     return time.perf_counter() - _watch.now()
 
 
-class LogView:
-    """Says it in the log, with a bar in letters now and then."""
+class View:
+    """Shows that something is compiled: in the log, with a bar in letters now and then; a terminal derives its own."""
 
     def __init__(self) -> None:
         self._begun = self._next = 0.0
 
     def begin(self) -> None:
-        """Log it."""
+        """Say it, before the first compilation."""
         LOG.warning(WORDS)
         self._begun = time.monotonic()
         self._next = self._begun + LOG_PERIOD
 
     def draw(self, share: float) -> None:
-        """Log the share done."""
+        """Show the share done, 0 to 1; called from a thread of its own while something is compiled."""
         now = time.monotonic()
         if now >= self._next:
             self._next = now + LOG_PERIOD
             LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), now - self._begun)
 
     def wipe(self) -> None:
-        """Leave what was logged."""
+        """Make room: for now nothing is compiled."""
 
 
 @contextlib.contextmanager
 def announced(view: View | None = None) -> Iterator[None]:
     """Say, before anything is compiled within, that it is, and how far it is; view: where, default the log."""
-    shown, lock, first = view or LogView(), threading.Lock(), [0]
+    shown, lock, first = view or View(), threading.Lock(), [0]
     over = threading.Event()
 
     def tick() -> None:

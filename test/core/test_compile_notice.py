@@ -45,7 +45,7 @@ def test_compiling_is_announced_before_or_refused(caplog) -> None:
 
 def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog) -> None:
     monkeypatch.setattr(compile_notice, "LOG_PERIOD", 0.0)
-    view = compile_notice.LogView()
+    view = compile_notice.View()
     view.begin()
     for share in (0.0, 0.5, 1.0):
         view.draw(share)
