@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Motion
@@ -83,7 +84,9 @@ def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) ->
         Hz.
     """
     rng = np.random.default_rng([20, seed])
-    mounts = [np.eye(3), *(_random_rotation(rng) for _ in range(units - 1))]
+    # Drawn evenly: unit quaternions from four normal numbers, w first.
+    turns = (np.roll(rng.standard_normal(4), -1) for _ in range(units - 1))
+    mounts = [np.eye(3), *(Rotation.from_quat(turn).as_matrix() for turn in turns)]
     nominal = Geometry.from_triads(mounts)
     n = nominal.n
     across = rng.normal(0, MISALIGNMENT, (n, 3))
@@ -112,15 +115,3 @@ def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) ->
         }
     )
     return Vehicle(config, Block(START + np.round(t * 1e9).astype(np.int64), z), axes, bias.mean(axis=0), late)
-
-
-def _random_rotation(rng: Rng) -> Array:
-    """Rotation (3, 3) drawn evenly: a unit quaternion from four normal numbers."""
-    w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

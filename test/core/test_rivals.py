@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from monitor.streams import mounted
 
-from fdi_ros import Block, Config, Output, Pipeline
+from fdi_ros import Block, Output, Pipeline
 from fdi_ros.model.geometry import Geometry
 
 RATE, ONSET, NOISE = 100, 12.0, 0.003
@@ -17,20 +18,14 @@ PARALLEL = np.tile(np.eye(3), (3, 1))
 
 def flown(axes: np.ndarray, faults: dict[int, float], seed: int) -> tuple[Output, np.ndarray, np.ndarray]:
     """Return the output on biases from the onset on, errors (N, 3) of the fused rate, and times (N,)."""
-    settings = {
-        "input": "channels",
-        "geometry.preset": "axes",
-        "geometry.axes": tuple(axes.ravel().tolist()),
-        "noise.noise_std": (NOISE,),
-        "bias.startup_bias_duration": 4.0,
-    }
     seconds = np.arange(30 * RATE) / RATE
     rate = np.where(seconds > 5.0, 0.5, 0.0)[:, None] * np.sin(seconds[:, None] * [1.0, 1.3, 0.7])
     values = rate @ axes.T + NOISE * np.random.default_rng(seed).standard_normal((len(seconds), len(axes)))
     for channel, bias in faults.items():
         values[seconds >= ONSET, channel] += bias
     stamps = (1e9 * seconds).astype(np.int64) + 10**18
-    output = Pipeline(Config.from_parameters(settings)).process(Block(stamps, values))
+    settings = mounted(axes, noise__noise_std=NOISE, bias__startup_bias_duration=4.0)
+    output = Pipeline(settings).process(Block(stamps, values))
     return output, output.rate - rate, seconds
 
 

@@ -57,6 +57,12 @@ def parallel(count: int, **changes: object) -> Config:
     return config(input="imus", imus__topics=topics, **changes)
 
 
+def mounted(axes: NDArray[np.float64], **changes: object) -> Config:
+    """Settings of channels along these axes (n, 3), whatever housings they are in, judged by `sequential`."""
+    axis = {"geometry.preset": "axes", "geometry.axes": axes.ravel().tolist(), "detector.name": "sequential"}
+    return config(input="channels", **axis, **changes)
+
+
 def struck(block: Block, faults: Sequence[str], names: Sequence[str]) -> Block:
     """The stream with faults injected."""
     return Injector([parse_fault(fault) for fault in faults], names).apply(block)

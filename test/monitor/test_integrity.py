@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import config, parallel
+from monitor.streams import config, mounted, parallel
 
-from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.core.subsets import fill_level, passes_test, prepare_subsets
 from fdi_ros.errors import ConfigError
@@ -298,20 +297,11 @@ def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_what_no_hypothesis_explains_is_in_the_covariance(seed: int) -> None:
     """Three gyros of a housing that is not given drift together: nobody can say which, and the rate says so."""
-    axes = np.tile(np.eye(3), (3, 1))
-    config = Config.from_parameters(
-        {
-            "input": "channels",
-            "geometry.preset": "axes",
-            "geometry.axes": tuple(axes.ravel().tolist()),
-            "noise.noise_std": (0.003,),
-            "detector.name": "sequential",
-        }
-    )
+    settings = mounted(np.tile(np.eye(3), (3, 1)), noise__noise_std=0.003)
     rng, seconds = np.random.default_rng(seed), np.arange(6000) / 100.0
     z = 0.003 * rng.standard_normal((6000, 9))
     z[:, :3] += (0.02 * np.clip(seconds - 20.0, 0.0, None))[:, None] * rng.permutation([0.2, 0.5, 0.84])
-    output = Pipeline(config).process(Block((1e9 * seconds).astype(np.int64) + 10**18, z))
+    output = Pipeline(settings).process(Block((1e9 * seconds).astype(np.int64) + 10**18, z))
     rate, covariance = output.rate[2500:], output.covariance[2500:]
     stated = np.isfinite(rate).all(axis=1)
     nees = np.einsum("ki,kij,kj->k", rate[stated], np.linalg.inv(covariance[stated]), rate[stated]) / 3
