@@ -18,16 +18,18 @@ spectra, and are not read.
 Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
 TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
 
-Rates are in rad/s and accelerations in m/s^2 in all versions; what FMTU, UNIT and MULT say of them is not looked at.
+FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted. The
+multiplier of a type that has its own (c, C, e, E: hundredths) is that again.
 
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -72,7 +74,8 @@ _TYPES = {
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"
 """Types that are the number itself."""
-_TYPES_OF = {"Message": "Z", "I": "B"}
+_HUNDREDTHS = "cCeE"
+_TYPES_OF = {"Message": "Z", "Label": "Z", "UnitIds": "N", "MultIds": "N", "I": "B"}
 """Columns that are read and may not be any number, and their types."""
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
@@ -82,7 +85,13 @@ _VALUES = {
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
-_OTHERS = {"MSG": {"Message"}, "ERR": {"Subsys", "ECode"}}
+_OTHERS = {
+    "MSG": {"Message"},
+    "ERR": {"Subsys", "ECode"},
+    "FMTU": {"FmtType", "UnitIds", "MultIds"},
+    "UNIT": {"Id", "Label"},
+    "MULT": {"Id", "Mult"},
+}
 """Columns of further messages that are read."""
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
@@ -180,6 +189,8 @@ class _Message(NamedTuple):
     name: str
     fields: np.dtype[np.void]
     """Columns that are read, within a whole record."""
+    columns: Mapping[str, str]
+    """Types of all columns, in their order."""
 
 
 class DataflashLog(FlightLog):
@@ -228,6 +239,10 @@ class DataflashLog(FlightLog):
         self._messages: dict[int, _Message] = {}
         self._unknown: dict[int, str] = {}
         """Of messages of IMUs that cannot be read: why."""
+        self._units: dict[int, str] = {}
+        self._multipliers: dict[int, float] = {}
+        self._of_columns: dict[int, tuple[bytes, bytes]] = {}
+        """Units and multipliers of the columns of a message."""
 
     def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:
         """Read a portion; return its samples, where its last record ends, and the bytes before that in no record."""
@@ -238,15 +253,16 @@ class DataflashLog(FlightLog):
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
         starts = self._sorted(number, offset)
         rows = {k: _rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
+        # Units before the samples: in a short log both are in one portion.
+        for k, of_message in rows.items():
+            self._learn(self._messages[k].name, of_message)
         samples: list[ImuSamples] = []
         for k, of_message in rows.items():
-            name, kind = self._messages[k]
+            name, kind, _ = self._messages[k]
             if (sensor := _SENSORS.fullmatch(name)) is not None:
                 source = Source(sensor[1], int(sensor[2] or 1) - 1)
-                samples += _samples(source, of_message, starts[k] + kind.itemsize)
-            elif name in _OTHERS:
-                self._listen(name, of_message)
-            elif self.start_utc is None:
+                samples += _samples(source, of_message, self._factors(k), starts[k] + kind.itemsize)
+            elif _GPS.fullmatch(name) and self.start_utc is None:
                 self.start_utc = _start_utc(of_message)
         return samples, int(end), int(lost)
 
@@ -278,8 +294,22 @@ class DataflashLog(FlightLog):
         elif _SENSORS.fullmatch(name):
             self._unknown[number] = lacks
 
+    def _learn(self, name: str, rows: Rows) -> None:
+        """Take in what records (k,) of a message say of flight, vehicle and units of columns; the first counts."""
+        if name == "UNIT":
+            for one in rows:
+                self._units.setdefault(int(one["Id"]), one["Label"].decode("ascii", "replace"))
+        elif name == "MULT":
+            for one in rows:
+                self._multipliers.setdefault(int(one["Id"]), float(one["Mult"]))
+        elif name == "FMTU":
+            for one in rows:
+                self._of_columns.setdefault(int(one["FmtType"]), (one["UnitIds"], one["MultIds"]))
+        elif name in ("MSG", "ERR"):
+            self._listen(name, rows)
+
     def _listen(self, name: str, rows: Rows) -> None:
-        """Take in what records (k,) of a message say of the flight, and of the vehicle; the first counts."""
+        """Take in the texts and errors in records (k,)."""
         if name == "MSG":
             texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
             vehicles = (match[1].title() for one in texts if (match := _FIRMWARE.match(one)))
@@ -289,6 +319,21 @@ class DataflashLog(FlightLog):
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
+
+    def _factors(self, number: int) -> dict[str, float]:
+        """Return what values of each column are to be multiplied by, for rad, m and s."""
+        units, multipliers = self._of_columns.get(number, (b"", b""))
+        factors = {}
+        for k, (column, kind) in enumerate(self._messages[number].columns.items()):
+            factor = 0.01 if kind in _HUNDREDTHS else 1.0
+            if k < len(multipliers) and kind not in _HUNDREDTHS:
+                said = self._multipliers.get(multipliers[k], 1.0)
+                # 0 stands for none.
+                factor *= said if math.isfinite(said) and said > 0 else 1.0
+            if k < len(units) and self._units.get(units[k], "").startswith("deg"):
+                factor *= math.pi / 180.0
+            factors[column] = factor
+        return factors
 
 
 def _error_text(subsystem: float, code: float) -> str:
@@ -310,7 +355,7 @@ def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message |
     fields: dict[str, Field] = {}
     at = _HEAD
     for column, kind in zip(names, types, strict=True):
-        allowed = _TYPES_OF.get(column, _NUMBERS)
+        allowed = _TYPES_OF.get(column, _NUMBERS + _HUNDREDTHS * (column in (*rate, *acceleration)))
         if column in (*needed, *acceleration, *_OPTIONAL) and kind in allowed:
             fields.setdefault(column, Field(_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
@@ -320,14 +365,14 @@ def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message |
         return None, f"it has no column {lacking[0]}"
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
         return None, "it has no column of times"
-    return _Message(name, row_type(fields, size)), ""
+    return _Message(name, row_type(fields, size), dict(zip(names, types, strict=True))), ""
 
 
-def _samples(source: Source, rows: Rows, end: Int) -> list[ImuSamples]:
+def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int) -> list[ImuSamples]:
     """Return the samples in the records (k,) of one message, of each instance by itself; end (k,) is where they end."""
     columns = rows.dtype.names or ()
     instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), source.instance)
-    rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
+    rate, acceleration = (_vectors(rows, names, factors) for names in _VALUES[source.kind])
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
         acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
@@ -343,11 +388,11 @@ def _rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
     return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
 
 
-def _vectors(rows: Rows, columns: Sequence[str]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
+def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3), in their units; NaN where the rows do not have them."""
     if not set(columns) <= set(rows.dtype.names or ()):
         return np.full((len(rows), 3), np.nan)
-    return np.column_stack([rows[column].astype(np.float64) for column in columns])
+    return np.column_stack([rows[column].astype(np.float64) * factors[column] for column in columns])
 
 
 def _stamp(rows: Rows) -> Int:
