@@ -292,7 +292,9 @@ YAML = {
     "x: !!int zz": "'zz' is no int",
     f"x: {'9' * 5000}": "a number of 5000 characters, expected at most 64",
     "x: 99999999999999999999": "does not fit into 64 bits",
-    "[" * 5000: "nested deeper than 50",
+    "[" * 500: "nested deeper than 50",
+    # Newer versions of libyaml end this by a limit of their own.
+    "[" * 5000: "nest",
     "x: &x {y: *x}": r"the alias \*x stands for nothing before it",
     ALIASES: "more than 50000 values, aliases followed",
     "x: " + "[1, " * 10 + "1, " * 60_000 + "1]" * 10: "more than 50000 values",

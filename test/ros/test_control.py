@@ -164,7 +164,7 @@ while True:
 
 def test_the_single_threaded_executor_does_the_same_and_ends_at_a_second_signal_too(tmp_path) -> None:
     with monitoring(TWO_IMUS, tmp_path, executor="single") as (listener, process):
-        z = healthy(200)[1]
+        z = healthy(400)[1]
         z[100:, 4] += 0.3
         assert listener.settle()
         listener.play(z)

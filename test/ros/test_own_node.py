@@ -59,7 +59,8 @@ def test_channels_in_one_array(tmp_path) -> None:
         assert wait(lambda: listener.prime() or not listener.states()[-1].any())
         time.sleep(0.1)
         listener.clear()
-        omega, z = healthy(300)
+        # A name waits for half a second.
+        omega, z = healthy(450)
         z[150:, 4] += 0.3
         for k, values in enumerate(z.tolist()):
             listener.send_channels(values)
@@ -67,7 +68,7 @@ def test_channels_in_one_array(tmp_path) -> None:
                 for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
                     listener.outputs[0].publish(Float64MultiArray(data=wrong))
             time.sleep(1 / RATE)
-        assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
+        assert wait(lambda: len(listener.fused) == 450), len(listener.fused)
         stamps = [ImuSource.parse(data, 3)[0] for data in listener.fused]
         assert stamps == sorted(set(stamps))
         rates = np.array(list(listener.rates().values()))
