@@ -109,10 +109,7 @@ class CsvLog(FlightLog):
 def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Columns]:
     """Return what stands between columns, and those that are read, and go behind the line of names.
 
-    Raises
-    ------
-    BagError
-        If there is no such line, or it has no columns of gyros.
+    `BagError` if there is no such line, or it has no columns of gyros.
     """
     file.seek(0)
     line = _header(file)
@@ -136,13 +133,7 @@ def _header(file: BinaryIO) -> str:
 
 
 def _columns(file: BinaryIO, names: Sequence[str], note: Callable[[str], None]) -> Columns:
-    """Choose the columns, and say which.
-
-    Raises
-    ------
-    BagError
-        If there are none, or ``columns.yaml`` asks for others than there are.
-    """
+    """Choose the columns, and say which; `BagError` if there are none, or ``columns.yaml`` asks for others."""
     path = Path(file.name).parent / COLUMNS
     told = read_yaml(path, "file", BagError) if path.exists() else {}
     if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
@@ -185,13 +176,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _factor(unit: str, known: dict[str, float], default: float, name: str) -> float:
-    """Return what a unit is multiplied by.
-
-    Raises
-    ------
-    BagError
-        If it is not known.
-    """
+    """Return what a unit is multiplied by; `BagError` if it is not known."""
     if unit and unit not in known:
         raise BagError(f"column {name!r} has the unit {unit!r}, expected one of {', '.join(known)}")
     return known.get(unit, default)

@@ -125,12 +125,7 @@ _FIX = 3
 
 @compiled
 def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
-    """Return where the record at a position ends; other parameters as for `find_records`.
-
-    Returns
-    -------
-    The end; 0: there is no record; -1: the portion ends within it, or before it can be known.
-    """
+    """Return where the record at a position ends; 0: there is none; -1: the portion ends within it or just behind."""
     if data[position] != 0xA3 or data[position + 1] != 0x95:
         return 0
     number = data[position + 2]
@@ -145,22 +140,11 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
 
 @compiled
 def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int, int, int]:
-    """Find the records in a portion of a log.
+    """Find the records in a portion of a log, with which the log ends if it is the final one.
 
-    Parameters
-    ----------
-    data
-        The bytes.
-    sizes
-        (256,) bytes of a record of each message, 0: not known; filled in from FMT records, the first of each counts.
-    final
-        The log ends with the portion.
-    found
-        (2, room): number of the message and first byte of each record.
-
-    Returns
-    -------
-    The number of records, where the walk ended, and how many bytes before that are in no record.
+    ``sizes`` (256,): bytes of a record of each message, 0 if not known; filled in from FMT records, of which the first
+    counts. ``found`` (2, room) takes the number of the message and the first byte of each record. Returned are the
+    number of records, where the walk ended, and how many bytes before that are in no record.
     """
     count = lost = position = 0
     while position + _HEAD <= len(data):

@@ -65,17 +65,8 @@ _MOST_TEXTS = 1000
 class FlightLog(ABC):
     """An open log of a flight stack, read as a recording of Imu topics; each format derives from this.
 
-    Parameters
-    ----------
-    path
-        The file.
-    damage
-        Takes what cannot be read.
-
-    Raises
-    ------
-    BagError
-        If the file cannot be opened, is no such log, or has no two IMUs that are logged fast enough.
+    ``damage`` takes what cannot be read. `BagError` if the file cannot be opened, is no such log, or has no two IMUs
+    that are logged fast enough.
     """
 
     stack: ClassVar[str]

@@ -188,12 +188,7 @@ def copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Sou
 def possible_start(utc: Int, stamp: Int) -> int | None:
     """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
 
-    Parameters
-    ----------
-    utc
-        (k,) of each fix, us since 1970.
-    stamp
-        (k,) us since the start of the autopilot.
+    ``utc`` (k,) us since 1970, ``stamp`` (k,) us since the start.
     """
     good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc >= EARLIEST // 1000) & (utc <= LATEST // 1000 - LOG_SPAN)
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None

@@ -40,22 +40,10 @@ _HEAD = 22
 
 
 def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) -> tuple[bytes, str]:
-    """Decompress a chunk.
+    """Decompress a chunk (``zstd``, ``lz4`` or empty) to ``size`` bytes; a ``crc`` of 0 is not checked.
 
-    Parameters
-    ----------
-    data
-        Compressed bytes.
-    compression
-        ``zstd``, ``lz4`` or empty.
-    size, crc
-        Of the decompressed bytes; a crc of 0 is not checked.
-    cut
-        The chunk is known to be incomplete: what comes out of it is returned.
-
-    Returns
-    -------
-    The bytes, and what is wrong with them: empty if nothing.
+    Of one that is known to be cut off, what comes out is returned. With the bytes: what is wrong with them, empty if
+    nothing.
     """
     if max(size, len(data) if not compression else 0) > CHUNK_BYTES:
         return b"", f"claims {size} bytes, expected at most {CHUNK_BYTES}, and was left out"
@@ -78,19 +66,11 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
 
 
 def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, bytes]], int]:
-    """Find the records in a run of bytes.
+    """Find the records in a run of bytes; one that is incomplete ends the walk.
 
-    Parameters
-    ----------
-    data
-        The bytes; a record that is incomplete ends the walk.
-    outside
-        The records lie outside chunks: a chunk, the statistics and the footer end the walk, too.
-
-    Returns
-    -------
-    The messages, with the numbers of their channels as topics; opcode and content of schema and channel records; and
-    where the walk ended: the length of the data unless it is damaged, or another record stopped it.
+    Outside chunks a chunk, the statistics and the footer end it, too. Returned are the messages, with the numbers of
+    their channels as topics; opcode and content of schema and channel records; and where the walk ended: the length of
+    the data unless it is damaged, or another record stopped it.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     # How many there are is counted first.
@@ -104,20 +84,11 @@ def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, byt
 
 @compiled
 def find_records(data: Bytes, outside: bool, messages: Int, topics: Int) -> tuple[int, int, int]:
-    """Find the records in a run of bytes; those beyond the room that is there are only counted.
+    """Find the records in a run of bytes as `walk` does; those beyond the room that is there are only counted.
 
-    Parameters
-    ----------
-    data, outside
-        As for `walk`.
-    messages
-        (4, room): channel, log time, offset and length of each message, as in `Batch`.
-    topics
-        (room, 3): opcode, first byte and end of the content of each schema and channel record.
-
-    Returns
-    -------
-    The numbers of messages and of topics, and where the walk ended.
+    ``messages`` (4, room) takes channel, log time, offset and length of each message, as in `Batch`; ``topics`` (room,
+    3) opcode, first byte and end of the content of each schema and channel record. Returned are their numbers, and
+    where the walk ended.
     """
     found = described = position = 0
     while position + _PREFIX <= len(data):
@@ -172,21 +143,9 @@ class Piece:
 
 
 class McapFile:
-    """An open MCAP file.
+    """An open MCAP file, whose chunks may unpack to ``most`` bytes; ``damage`` takes what cannot be read.
 
-    Parameters
-    ----------
-    path
-        The file.
-    damage
-        Takes what cannot be read.
-    most
-        Bytes that the chunks may unpack to.
-
-    Raises
-    ------
-    BagError
-        If the file cannot be opened, is empty, or is no MCAP file.
+    `BagError` if the file cannot be opened, is empty, or is no MCAP file.
     """
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:

@@ -109,10 +109,7 @@ class Batch:
 def open_file(path: Path, magic: bytes, refusal: str) -> tuple[BinaryIO, int]:
     """Open a file that begins with some bytes, and read these; return it with its size, bytes.
 
-    Raises
-    ------
-    BagError
-        If it cannot be opened, is empty, or begins otherwise, for which the refusal is said.
+    `BagError` if it cannot be opened, is empty, or begins otherwise, for which the refusal is said.
     """
     try:
         file = open_regular(path)
@@ -177,19 +174,9 @@ MADE_BY_FDI = "fdi_ros"
 
 
 def find_files(path: Path, damage: Damage) -> RecordingFiles:
-    """Find the files of a recording.
+    """Find the files of a recording, a folder or a file; ``damage`` takes what is wrong with metadata.yaml.
 
-    Parameters
-    ----------
-    path
-        Of a folder or file.
-    damage
-        Takes what is wrong with metadata.yaml.
-
-    Raises
-    ------
-    BagError
-        If there is no recording.
+    `BagError` if there is no recording.
     """
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):

@@ -185,13 +185,7 @@ class Recording:
 
 
 def _refuse_pointer(path: Path) -> None:
-    """Refuse a file that stands for another one.
-
-    Raises
-    ------
-    BagError
-        If git has put it in the place of a large file.
-    """
+    """Refuse a file that git has put in the place of a large one (`BagError`)."""
     with contextlib.suppress(OSError), open_regular(path) as file:
         if file.read(len(LFS)) == LFS:
             raise BagError(f"{path} is a git-lfs pointer, not the recording: run git lfs pull")

@@ -70,21 +70,9 @@ class _Place:
 
 
 class Ros1File:
-    """An open bag of ROS 1.
+    """An open bag of ROS 1, whose chunks may unpack to ``most`` bytes; ``damage`` takes what cannot be read.
 
-    Parameters
-    ----------
-    path
-        The file.
-    damage
-        Takes what cannot be read.
-    most
-        Bytes that its chunks may unpack to.
-
-    Raises
-    ------
-    BagError
-        If the file cannot be opened, is no such bag, has no index, or one that is too large.
+    `BagError` if the file cannot be opened, is no such bag, has no index, or one that is too large.
     """
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:

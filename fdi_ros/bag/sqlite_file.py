@@ -36,23 +36,10 @@ Row = tuple[int, int, bytes]
 
 
 class SqliteFile:
-    """An open sqlite3 file.
+    """An open sqlite3 file, whose messages may come to ``most`` bytes; ``damage`` takes what cannot be read.
 
-    Parameters
-    ----------
-    path
-        The file.
-    damage
-        Takes what cannot be read.
-    compressed
-        Each message is compressed by zstd by itself.
-    most
-        Bytes that the messages may come to.
-
-    Raises
-    ------
-    BagError
-        If the file cannot be opened or is no rosbag2 database.
+    ``compressed``: each message is, by zstd, by itself. `BagError` if the file cannot be opened or is no rosbag2
+    database.
     """
 
     def __init__(self, path: Path, damage: Damage, compressed: bool, most: int) -> None:

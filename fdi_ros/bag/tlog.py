@@ -113,11 +113,9 @@ class Tlog(FlightLog):
         return series
 
     def _messages(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[tuple[int, int, Any]]:
-        """Find the messages with these ids that an autopilot has sent, and that pymavlink accepts.
+        """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts.
 
-        Yields
-        ------
-        Where the record begins and ends in the file, bytes, and the message as pymavlink decodes it.
+        Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
         """
         codec = dialect()
         parser = codec.MAVLink(None)
@@ -156,10 +154,7 @@ def record_end(data: bytes, at: int) -> int:
 def _start_utc(times: Int) -> int | None:
     """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true.
 
-    Parameters
-    ----------
-    times
-        (k, 3) of each sample: its time, us, and when it came, us since 1970; another.
+    ``times`` (k, 3) of each sample: its time, us, and when it came, us since 1970; another.
     """
     if not len(times):
         return None

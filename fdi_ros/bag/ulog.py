@@ -165,13 +165,7 @@ class Ulog(FlightLog):
 
 
 def _parsed(file: _Bounded, path: str) -> Any:
-    """Return a file as pyulog reads it.
-
-    Raises
-    ------
-    BagError
-        If it does not.
-    """
+    """Return a file as pyulog reads it; `BagError` if it does not."""
     from pyulog import ULog
     from pyulog.exceptions import ULogException, ULogIncompatibleFlagException
 
@@ -249,13 +243,7 @@ def _size(columns: Columns) -> int:
 
 
 def _array(columns: Columns, name: str) -> NDArray[Any]:
-    """Return a field that is an array, (k, length).
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Return a field that is an array, (k, length); `ValueError` if there is none."""
     there = takewhile(columns.__contains__, (f"{name}[{k}]" for k in count()))
     return np.stack([columns[one] for one in there], axis=1)
 

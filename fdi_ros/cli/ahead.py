@@ -38,9 +38,7 @@ def compile_for_workers(arguments: Namespace) -> None:
 def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
     """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
 
-    Returns
-    -------
-    Functions that had to be compiled.
+    Return how many functions had to be compiled.
     """
     # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
     parts: list[tuple[Any, ...]] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]

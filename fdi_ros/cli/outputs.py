@@ -44,18 +44,9 @@ _TICK = 1.0
 
 
 class Progress:
-    """A bar on the last line of a terminal, wiped at the end; elsewhere a line now and then.
+    """A bar on the last line of a terminal, wiped at the end; elsewhere a line now and then, begun with ``what``.
 
-    Parameters
-    ----------
-    stream
-        Where to draw.
-    quiet
-        Draw nothing.
-    what
-        Is done: begins the lines where there is no terminal.
-    timed
-        No share done is known: say what is done, and for how long already.
+    Timed: no share done is known, so it says what is done, and for how long already. Quiet: nothing is drawn.
     """
 
     def __init__(self, stream: TextIO, quiet: bool = False, what: str = "", timed: bool = False) -> None:
@@ -106,13 +97,7 @@ class Progress:
 
 
 class CompileBar(View):
-    """The share compiled, on the last line of a terminal while anything is compiled: a `View` of `announced`.
-
-    Parameters
-    ----------
-    stream
-        A terminal.
-    """
+    """The share compiled, on the last line of a terminal while anything is compiled: a `View` of `announced`."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -168,21 +153,9 @@ _KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}
 class Outputs:
     """What a verb was asked for: files, refused before any work is done and confirmed when it is, and words.
 
-    Parameters
-    ----------
-    arguments
-        Of the verb.
-    names
-        Of the options that say where to write, in the order in which that is confirmed.
-    sources
-        What is read, recording, config and so on: never overwritten, wherever its files lie; None: not given.
-    output
-        What is written where ``--output`` says; None: whoever writes it looks at what is there.
-
-    Raises
-    ------
-    BagError
-        If one may not be written, or two are one.
+    ``names``: of the options that say where to write, in the order in which that is confirmed. ``sources``: what is
+    read, never overwritten wherever its files lie; None: not given. ``output``: what is written where ``--output``
+    says; None: whoever writes it looks at what is there. `BagError` if one may not be written, or two are one.
     """
 
     def __init__(
@@ -211,12 +184,7 @@ class Outputs:
     def say(self, text: str, severity: Severity | None = None) -> None:
         """Print for people, unless they asked for quiet: to standard output, unless data goes there.
 
-        Parameters
-        ----------
-        text
-            What is said.
-        severity
-            Of its first line, where that is a verdict.
+        ``severity``: of the first line, where that is a verdict.
         """
         if not self._arguments.quiet:
             stream = sys.stderr if any(map(is_open_already, self._targets.values())) else sys.stdout
@@ -278,35 +246,15 @@ def about(arguments: argparse.Namespace, config: str, more: Mapping[str, str]) -
 
 
 def check_part(arguments: argparse.Namespace) -> None:
-    """Refuse a part of a recording that is none.
-
-    Raises
-    ------
-    ConfigError
-        If the end is not after the start.
-    """
+    """Refuse a part of a recording that is none: `ConfigError` if the end is not after the start."""
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
 
 
 def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()) -> None:
-    """Refuse to write where something is that should stay.
+    """Refuse to write where something is that should stay (`BagError`), before any work is done.
 
-    Parameters
-    ----------
-    path
-        Where it is to be written.
-    kind
-        What is to be written.
-    force
-        A former result of this kind there may be overwritten.
-    sources
-        What is read, recording, config and so on: never overwritten, wherever its files lie.
-
-    Raises
-    ------
-    BagError
-        If it may not be written; before any work is done.
+    A former result of this kind may be overwritten with ``force``; what is read (``sources``) never is.
     """
     if is_stream(path):
         if kind is Kind.FOLDER:

@@ -72,10 +72,7 @@ def _add_shipped(parser: ArgumentParser) -> None:
 def _shipped(arguments: Namespace) -> int:
     """Print the path of every shipped file, or of those of one name; with nodes, the file made for them.
 
-    Raises
-    ------
-    ConfigError
-        If no shipped file has that name, or it is not made for nodes.
+    `ConfigError` if no shipped file has that name, or it is not made for nodes.
     """
     from fdi_ros.cli.outputs import Outputs
 
@@ -101,17 +98,8 @@ def _shipped(arguments: Namespace) -> int:
 def made_for(nodes: Sequence[str], text: str) -> str:
     """Return the parameters of diagnostic_aggregator for monitors of certain names.
 
-    Parameters
-    ----------
-    nodes
-        Full name of each.
-    text
-        Those for any number of monitors of the default name, in any namespaces: the shipped file.
-
-    Raises
-    ------
-    ConfigError
-        If one is no name of a node, or given twice.
+    ``nodes``: full name of each. ``text``: the shipped file, for any number of monitors of the default name in any
+    namespaces. `ConfigError` if one is no name of a node, or given twice.
     """
     for name in nodes:
         if not _NODE_NAME.fullmatch(name):

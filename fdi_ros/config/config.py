@@ -183,13 +183,7 @@ def unknown_parameter(name: str) -> str:
 
 
 def check_lengths(config: Config, per: str, count: int) -> None:
-    """Check the lists that have values for each channel, or for each triad.
-
-    Raises
-    ------
-    ConfigError
-        If one is of another length.
-    """
+    """Check the lists that have values for each channel, or for each triad; `ConfigError` if one has another length."""
     values = config.parameters()
     for name, declared in PARAMETERS.items():
         if declared.per == per:
@@ -274,12 +268,8 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", *ALL_NODES, 
 def read_parameter_file(path: str | Path) -> dict[str, Any]:
     """Parameters of the monitor in a ROS 2 parameter file, as ``{"section.field": value}``.
 
-    Sections ``/**`` and then those of a node named fdi_node, in whatever namespace, are taken.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or is no parameter file.
+    Sections ``/**`` and then those of a node named fdi_node, in whatever namespace, are taken. `ConfigError` if the
+    file is missing or is no parameter file.
     """
     return parameters_in(read_yaml(path, "config", ConfigError), f"config {path}")
 
@@ -287,19 +277,8 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
 def parameters_in(document: Any, called: str, ros: bool = False) -> dict[str, Any]:
     """Parameters of the monitor in what a ROS 2 parameter file holds, as `read_parameter_file` returns them.
 
-    Parameters
-    ----------
-    document
-        What the file holds.
-    called
-        Its name, for errors.
-    ros
-        Those of ROS and of the node itself, instead of the settings.
-
-    Raises
-    ------
-    ConfigError
-        If it is no parameter file.
+    ``called``: its name, for errors. ``ros``: those of ROS and of the node itself, instead of the settings.
+    `ConfigError` if it is no parameter file.
     """
     if not isinstance(document, dict):
         raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")

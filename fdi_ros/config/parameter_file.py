@@ -40,27 +40,15 @@ _Dumper.add_representer(str, _Dumper.text)
 
 
 def parameters_of(text: str) -> dict[str, Any]:
-    """Return the parameters that the text of a parameter file holds, ``{"section.field": value}``.
-
-    Raises
-    ------
-    ConfigError
-        If it is no parameter file.
-    """
+    """Return the parameters in the text of a parameter file, ``{"section.field": value}``; `ConfigError` if none."""
     return parameters_in(parse_yaml(text, "config", ConfigError), "config")
 
 
 def parameter_file(parameters: Mapping[str, Any], origin: str, remarks: Mapping[str, str] | None = None) -> str:
-    """Return the text of a parameter file.
+    """Return the text of a parameter file with the parameters ``{"section.field": value}``.
 
-    Parameters
-    ----------
-    parameters
-        ``{"section.field": value}``.
-    origin
-        Lines of comment at the top: where the values come from.
-    remarks
-        What is to be said of single values besides unit and meaning, by parameter.
+    ``origin``: lines of comment at the top, where the values come from. ``remarks``: what is to be said of single
+    values besides unit and meaning, by parameter.
     """
     return _text("/**", {}, parameters, origin, remarks or {})
 
@@ -74,21 +62,9 @@ def with_parameters(
 ) -> str:
     """Return the text of a parameter file made from others, with the parameters of other nodes that they hold.
 
-    Parameters
-    ----------
-    files
-        Parameter files; later ones win.
-    changes
-        ``{"section.field": value}``: parameters that get other values.
-    origin, remarks
-        As of `parameter_file`.
-    without
-        Parameters that are left out, as the changes replace them.
-
-    Raises
-    ------
-    ConfigError
-        If a file is no parameter file.
+    Later files win. ``changes``: ``{"section.field": value}`` that get other values; ``without``: those that are left
+    out, as the changes replace them; ``origin`` and ``remarks`` as of `parameter_file`. `ConfigError` if a file is no
+    parameter file.
     """
     given: dict[str, Any] = {}
     ros: dict[str, Any] = {}

@@ -77,24 +77,10 @@ def fields_of(owner: Any) -> dict[str, Field]:
 
 
 def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
-    """Check a value and give it the type of its field.
+    """Check a value, which errors (of class ``error``) call ``name``, and give it the type of its field.
 
-    Parameters
-    ----------
-    field
-        What it may be.
-    value
-        As given: a list may be given as its only item, a number as text (PyYAML reads 1e-3, without a point, as text;
-        ROS reads it as the number it is).
-    name
-        The value is called this in errors.
-    error
-        Class of the errors.
-
-    Raises
-    ------
-    FdiError
-        Of that class, if the value is of another type or out of range.
+    A list may be given as its only item, a number as text (PyYAML reads 1e-3, without a point, as text; ROS reads it as
+    the number it is).
     """
     if field.kind not in ("numbers", "texts"):
         return _check_one(field, field.kind, value, name, error)
@@ -105,13 +91,7 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
 
 
 def check_length(field: Field, values: Any, count: int, name: str, error: type[FdiError]) -> None:
-    """Check the length of a list that has values for each of count channels or triads; name and error as of `check`.
-
-    Raises
-    ------
-    FdiError
-        If it is none of those that the field allows.
-    """
+    """Check the length of a list that has values for each of count channels or triads; name and error as of `check`."""
     lengths = (*field.other_lengths, field.each * count)
     if len(values) not in lengths:
         each = "one" if field.each == 1 else field.each

@@ -71,19 +71,11 @@ _IDLE, _FORMING, _RESTARTING = range(3)
 
 
 def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> NDArray[Any]:
-    """Return an `Aligner`, (1,).
+    """Return an `Aligner`, (1,), of a number of units.
 
-    Parameters
-    ----------
-    units
-        Number of units.
-    max_skew
-        Stamps this close count as one instant, ns.
-    timeout
-        A unit silent for longer than this by the stamps of the others is not waited for, ns.
-    delays
-        By how much the stamps of each unit are late, s, (units,): what they stand for was measured that much earlier.
-        Empty: not at all.
+    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent for longer than this by the
+    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,),
+    since what they stand for was measured that much earlier; empty: not at all.
     """
     if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= MAX_SPAN and 1 <= timeout <= MAX_SPAN):
         raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
@@ -427,20 +419,10 @@ def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
 def align_messages(
     rows: NDArray[Any], unit: Int, stamp: Int, rate: Array, start: int, samples: NDArray[Any]
 ) -> tuple[int, int]:
-    """Enter messages from number `start` on, as long as there is room for samples.
+    """Enter messages (M,) in order of arrival from number `start` on, as long as there is room for samples (S,).
 
-    Parameters
-    ----------
-    rows
-        `Aligner`, (1,).
-    unit, stamp, rate
-        (M,), (M,) ns, (M, 3) rad/s, in order of arrival.
-    samples
-        `Sample`, (S,): those formed.
-
-    Returns
-    -------
-    The number of the next message to be entered, and of samples formed. Fewer than S: all is done.
+    Of each: unit, stamp, ns, rate (M, 3) rad/s; the `Aligner` is in rows (1,). Returned are the number of the next
+    message to be entered, and of samples formed. Fewer than S: all is done.
     """
     aligner, count = rows[0], 0
     while count < len(samples):
@@ -457,13 +439,7 @@ def align_messages(
 
 
 class Alignment:
-    """An aligner for messages in arrays.
-
-    Parameters
-    ----------
-    units, max_skew, timeout, delays
-        As for `new_aligner`.
-    """
+    """An aligner for messages in arrays; parameters as for `new_aligner`."""
 
     def __init__(self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> None:
         self.rows = new_aligner(units, max_skew, timeout, delays)
@@ -545,24 +521,11 @@ def restamp(
     plain: int,
     out: NDArray[Any],
 ) -> int:
-    """Keep a sample, and give the values (n,) of the instant that it now stands for.
+    """Keep a sample, and give the values of the instant that it now stands for, into ``out`` (n,); NaN: none.
 
-    Parameters
-    ----------
-    line
-        The last samples.
-    n, units, members
-        Channels; units, and the bits of the channels of each.
-    late
-        (units,) by how much the stamps of each are late, s.
-    stamp, values, received, plain
-        Of the sample: ns, (n,) rad/s, bits, and those of finite values in range.
-    out
-        (n,) takes the values, NaN where there is none, rad/s.
-
-    Returns
-    -------
-    Bits of the channels that have a value, of the instant that the largest delay lies before the stamp.
+    Of the sample: stamp, ns, values (n,) rad/s, bits of those received and of those finite and in range. ``members``:
+    bits of the channels of each unit; ``late`` (units,): by how much their stamps are late, s. Returned are the bits of
+    the channels that have a value, of the instant that the largest delay lies before the stamp.
     """
     row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:

@@ -94,12 +94,7 @@ def prepare_limits(bias: Any) -> None:
 def f_quantile(probability: float, above: int, below: int) -> float:
     """Value that an F-distributed one exceeds with the given probability, 1e-4 to 0.5; within 0.1 %.
 
-    Parameters
-    ----------
-    probability
-        P(F > quantile).
-    above, below
-        Degrees of freedom of numerator and denominator.
+    ``above``, ``below``: degrees of freedom of numerator and denominator.
     """
     # F = (below / above) / tan^2(angle), with the density cos^(above - 1) sin^(below - 1).
     edges = np.linspace(0.0, np.pi / 2, 8001)
@@ -112,26 +107,10 @@ def f_quantile(probability: float, above: int, below: int) -> float:
 
 @compiled
 def update_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
-    """Take one sample into the average.
+    """Take one sample into the average; return whether it was used: False if with it the bias is learned.
 
-    Parameters
-    ----------
-    average
-        The average.
-    sensors
-        All channels, n.
-    stamp
-        ns.
-    z
-        (n,) rad/s, as delivered.
-    good
-        Bits of the channels that are finite and in range.
-    lost
-        Bits of the channels declared faulty or taken out: they are no evidence about rest, and keep their bias.
-
-    Returns
-    -------
-    Whether the sample was used; False if with it the bias is learned.
+    ``z`` (n,) rad/s, as delivered. ``good``: bits of the channels that are finite and in range. ``lost``: of those
+    declared faulty or taken out, which are no evidence about rest, and keep their bias.
     """
     if average.started and stamp >= average.start + average.duration:
         conclude(average, sensors, lost)

@@ -95,23 +95,8 @@ def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag
     """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
 
     Of the newest samples, until so many as wanted have changed; what is not received or out of range is no evidence.
-
-    Parameters
-    ----------
-    copies
-        Takes the sums.
-    line
-        The last samples.
-    source, target
-        First channel of the unit that may be the original, and of the one that may be the copy.
-    lag
-        Samples by which the copy comes later.
-    wanted
-        Changes.
-
-    Returns
-    -------
-    Whether there are so many, in no more than twice so many samples.
+    ``source``, ``target``: first channel of the unit that may be the original, and of the one that may be the copy,
+    which comes later by ``lag`` samples. Return whether there are so many, in no more than twice so many samples.
     """
     change, products, count = copies.change, copies.products, 0
     for i in range(6):

@@ -100,18 +100,10 @@ def is_cdr(data: Bytes, offset: int, length: int) -> bool:
 
 @compiled
 def place_after_header(data: Bytes, offset: int, length: int, before: int, total: int) -> int:
-    """Return where values stand among the doubles that follow a std_msgs/Header.
+    """Return where values stand among the doubles that follow a std_msgs/Header; or what is wrong, negative.
 
-    Parameters
-    ----------
-    data, offset, length
-        Bytes in which the message lies, its first one, and how many it has.
-    before, total
-        Doubles before the values, and all that there must be.
-
-    Returns
-    -------
-    The place of the first value; or what is wrong, negative.
+    The message lies in ``data`` from ``offset`` on. ``before``, ``total``: doubles before the values, and all that
+    there must be.
     """
     if not is_cdr(data, offset, length):
         return -NO_CDR
@@ -127,18 +119,9 @@ def place_after_header(data: Bytes, offset: int, length: int, before: int, total
 
 @compiled
 def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, rate: Array) -> int:
-    """Read the stamp of a std_msgs/Header, and three of the doubles that follow it.
+    """Read three of the doubles that follow a std_msgs/Header into rate (3,), and return its stamp, ns.
 
-    Parameters
-    ----------
-    data, offset, length, before, total
-        As for `place_after_header`.
-    rate
-        Takes them, (3,).
-
-    Returns
-    -------
-    The stamp, ns; or what is wrong, negative, then the rate is left as it was.
+    Or what is wrong, negative: then the rate is left as it was. Other parameters as for `place_after_header`.
     """
     at = place_after_header(data, offset, length, before, total)
     if at < 0:
@@ -154,17 +137,7 @@ def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, ra
 
 
 def explain(code: int, data: bytes, called: str) -> str:
-    """Explain in one line what is wrong with a message with a std_msgs/Header.
-
-    Parameters
-    ----------
-    code
-        One of those above.
-    data
-        Bytes of the message.
-    called
-        What it should be, "an Imu".
-    """
+    """Explain in one line what a code says is wrong with a message with a std_msgs/Header; called: "an Imu"."""
     size, order = len(data), byte_order(data)
     if code == NO_CDR:
         return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
@@ -220,20 +193,10 @@ def as_batch(data: bytes) -> tuple[Bytes, Int, Int]:
 
 @compiled
 def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) -> None:
-    """Write into one serialised Imu, little endian.
+    """Write stamp, ns, rate (3,) rad/s and covariance into one serialised Imu, made from an `ImuTemplate`.
 
-    Parameters
-    ----------
-    out
-        Bytes of the message, made from an `ImuTemplate`.
-    at
-        Where the rate begins, as the template says.
-    stamp
-        ns.
-    rate
-        (3,) rad/s.
-    covariance
-        Upper triangle of the covariance of the rate, (6,) (rad/s)^2.
+    ``at``: where the rate begins, as the template says. Of the covariance the upper triangle is given, (6,) (rad/s)^2.
+    Little endian.
     """
     seconds, rest = stamp // _NS, stamp % _NS
     for k in range(4):
@@ -266,11 +229,6 @@ class ImuTemplate:
     """Serialised sensor_msgs/Imu with a rate and its covariance; orientation and acceleration marked absent.
 
     Absent is told by -1 as the first element of the covariance (REP-145).
-
-    Parameters
-    ----------
-    frame_id
-        Of the header.
     """
 
     def __init__(self, frame_id: str) -> None:
@@ -292,13 +250,7 @@ class ImuTemplate:
 
 
 class ChannelsTemplate:
-    """Serialised std_msgs/Float64MultiArray of a fixed number of values, without dimensions.
-
-    Parameters
-    ----------
-    count
-        Number of values, at least 1.
-    """
+    """Serialised std_msgs/Float64MultiArray of a fixed number of values, at least 1, without dimensions."""
 
     def __init__(self, count: int) -> None:
         head = struct.pack("<4B4I", 0, 1, 0, 0, 0, 0, count, 0)

@@ -49,14 +49,7 @@ def factorise(a: Array, size: int, factor: Array) -> float:
 def invert(a: Array, size: int, out: Array) -> float:
     """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
 
-    Parameters
-    ----------
-    a
-        Lower triangle is read.
-    size
-        Rows in use.
-    out
-        Takes the inverse, both triangles; on the way the factor, then its inverse.
+    The lower triangle of a is read. ``out`` takes both triangles; on the way the factor, then its inverse.
     """
     log = factorise(a, size, out)
     for i in range(size):

@@ -109,12 +109,10 @@ def step(
     events: NDArray[Any],
     count: int,
 ) -> int:
-    """Work one sample; the output is ``core.last``.
+    """Work one sample; the output is ``core.last``. Return the number of events.
 
-    Returns
-    -------
-    The number of events; `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.input_mask``:
-    then the same sample is to be given again.
+    Or `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.input_mask``: then the same
+    sample is to be given again.
     """
     now = core.now
     if not now.waiting:
@@ -370,18 +368,8 @@ STEP_BACK = 100_000_000
 def receive_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) -> int:
     """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
 
-    What is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
-
-    Parameters
-    ----------
-    live, aligner
-        Records.
-    unit
-        Number of the unit.
-    stamp
-        Of the message, ns; or what is wrong with it, negative.
-    now
-        When the message arrived, ns; 0: not known.
+    ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it arrived, ns; 0: not known. What
+    is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
     """
     inlet = live.inlets[unit]
     inlet.received += 1
@@ -405,14 +393,7 @@ def receive_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: in
 def receive_arrived(live: Live, code: int, stamp: int) -> int:
     """Take what was read of a message of all channels, their values into `live.sample.z`; return `MALFORMED` or `MORE`.
 
-    Parameters
-    ----------
-    live
-        Record.
-    code
-        What reading said.
-    stamp
-        When the message arrived, ns.
+    ``code``: what reading said. ``stamp``: when the message arrived, ns.
     """
     inlet, sample = live.inlets[0], live.sample
     inlet.received += 1
@@ -446,22 +427,10 @@ def process(
     fused: Bytes,
     integrity: Bytes,
 ) -> int:
-    """Work the next sample that is complete.
+    """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
 
-    Parameters
-    ----------
-    core, bank, memory, subsets
-        As for `fdi_ros.core.path.run`.
-    aligner, live
-        (1,) records.
-    events
-        Takes the events of the sample.
-    fused, integrity
-        Take the messages to be published about it.
-
-    Returns
-    -------
-    Bits of `WORKED` and so on; 0: there is none before the next message.
+    ``events`` takes its events, ``fused`` and ``integrity`` the messages to be published about it; all else as for
+    `run`, `aligner` and `live` (1,) records.
     """
     monitor, main = live[0], core[0]
     if not monitor.ready:

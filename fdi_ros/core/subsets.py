@@ -89,17 +89,7 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
 
 
 def prepare_capability(subsets: NDArray[Any], geometry: Geometry, can_run: list[bool]) -> None:
-    """Note what a method can do with each set of channels.
-
-    Parameters
-    ----------
-    subsets
-        To be completed.
-    geometry
-        All channels.
-    can_run
-        Whether the method runs on k channels, (n + 1,).
-    """
+    """Complete subsets with what a method can do with each; can_run (n + 1,): whether it runs on k channels."""
     n = geometry.n
     bits = all_sets(n)
     count = bits.sum(axis=1)
@@ -125,22 +115,12 @@ def fill_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
 
 @compiled
 def fill_growth(n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array) -> None:
-    """How many times noise_std^2 the square of each channel's error in a sample is.
+    """How many times noise_std^2 the square of each channel's error in a sample is, into growth (n,).
 
-    How the biases that remain hang together is not known: an axis with gains G is off by G b with a standard deviation
-    of up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch et al. 2015), whose square is at most n times
-    that of independent ones.
-
-    Parameters
-    ----------
-    n
-        Number of channels.
-    noise_std, variance
-        (n,) rad/s; (rad/s)^2, of the sample.
-    remaining
-        (n,) what is not known of each channel's bias, standard deviation, rad/s.
-    growth
-        (n,) is filled.
+    ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): what is not known of each channel's bias, standard
+    deviation, rad/s. How the biases that remain hang together is not known: an axis with gains G is off by G b with a
+    standard deviation of up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch et al. 2015), whose square is
+    at most n times that of independent ones.
     """
     for i in range(n):
         growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (noise_std[i] * noise_std[i])

@@ -56,20 +56,11 @@ variances and of the last one's distance from it so many."""
 
 @compiled
 def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float) -> bool:
-    """Whether the rates of `REST_BLOCKS` blocks scatter as noise does, about zero.
+    """Whether the rates (`REST_BLOCKS`, c) of blocks, rad/s, scatter as noise does, about zero.
 
-    Parameters
-    ----------
-    rates
-        (`REST_BLOCKS`, c) rad/s, in any order: of the body, or as single channels measure it.
-    newest
-        Place of the last of them.
-    variance
-        (c,) of the noise of each, (rad/s)^2.
-    bias_variance
-        (c,) of what is not known of the biases, (rad/s)^2.
-    floor
-        Variance of the rate at rest, (rad/s)^2.
+    In any order, of the body or as single channels measure it; ``newest``: place of the last. ``variance``,
+    ``bias_variance`` (c,): of the noise of each and of what is not known of the biases, (rad/s)^2; ``floor``: of the
+    rate at rest.
     """
     scatter = largest = last = 0.0
     for a in range(rates.shape[1]):
@@ -334,17 +325,9 @@ def update_rest(params: Constants, kf: Estimator) -> None:
 def unlearnable(error: float, inside: float, square: float) -> float:
     """Variance of an error by a signal that no number of samples takes away, in units of one.
 
-    Vibration that units see differently is an error of both sides: of what a channel has, ``inside`` may be in the
-    signal. As long as it lasts, it looks like an error of the share that it has in the signal.
-
-    Parameters
-    ----------
-    error
-        Variance of the channel.
-    inside
-        Of the vibration that may be in the signal.
-    square
-        Of the signal.
+    Vibration that units see differently is an error of both sides: of what a channel has (variance ``error``),
+    ``inside`` may be in the signal (``square``). As long as it lasts, it looks like an error of the share that it has
+    in the signal.
     """
     return error / max(square, 1e-12) * min(1.0, inside / max(square, 1e-12))
 

@@ -126,23 +126,10 @@ def prepare_layout(
     priors: Mapping[str, float | Array],
     walks: Mapping[str, float | Array],
 ) -> None:
-    """Fill a record of `Layout`.
+    """Fill a record of `Layout`: unit (n,) has the number of the unit of each channel.
 
-    Parameters
-    ----------
-    layout
-        The record.
-    unit
-        (n,) number of the unit of each channel.
-    units
-        Number of units.
-    priors, walks
-        Standard deviations and random walks by the names of kinds, scalar or (n,), that stand in place of the table's.
-
-    Raises
-    ------
-    ValueError
-        If one is in neither.
+    ``priors``, ``walks``: standard deviations and random walks by the names of kinds, scalar or (n,), that stand in
+    place of the table's. `ValueError` if one is in neither.
     """
     n = len(unit)
     layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = n, MULTIPLIERS, -1, -1, -1
@@ -264,21 +251,9 @@ def update(
     """Take a measurement: x += D P C' A (y - C x), and with G = P C' A C P and D diagonal P -= D G + G D - D G D.
 
     As A M A = A, that is the covariance for any D (Joseph). D leaves every state the variance that it has at least.
-
-    Parameters
-    ----------
-    layout, states
-        The states.
-    at
-        Their projection.
-    information
-        A (n, n).
-    innovation
-        y - C x (n,), rad/s; that of channels left out is not read.
-    weight
-        Of the measurement, 0 to 1.
-    taught
-        Variance (states,) that each state keeps at least; takes D: the share of its gain that each takes.
+    ``information`` A (n, n); ``innovation`` y - C x (n,), rad/s, of which that of channels left out is not read;
+    ``weight`` of the measurement, 0 to 1; ``taught`` (states,): variance that each state keeps at least; takes D, the
+    share of its gain that each takes.
     """
     count = layout.count
     for j in range(layout.n):

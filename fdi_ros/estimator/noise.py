@@ -249,22 +249,10 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
 def update_sample_variance(
     noise: Noise, n: int, mask: int, length: int, blocks: int, adaptation_gain: float, expected: Array, learn: bool
 ) -> None:
-    """Learn the variance of samples from those of a block.
+    """Learn the variance of samples, beside the one expected (n,) (rad/s)^2, from those of a block.
 
-    Parameters
-    ----------
-    noise
-        The noise.
-    n, mask
-        Channels; those that delivered throughout.
-    length, blocks
-        Samples of a block; blocks so far.
-    adaptation_gain
-        Of the noise of the moment, per block.
-    expected
-        (n,) (rad/s)^2.
-    learn
-        Whether the learned variance follows.
+    ``mask``: channels that delivered throughout; ``length``, ``blocks``: samples of a block, blocks so far;
+    ``adaptation_gain``: of the noise of the moment, per block; ``learn``: the learned variance follows.
     """
     gain = 1.0 / min(blocks + 25.0, 100.0)
     for i in range(n):

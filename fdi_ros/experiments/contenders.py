@@ -107,13 +107,7 @@ class Evaluation(NamedTuple):
 
 
 class Contender:
-    """One method with a loose threshold; that of the common false-alarm rate is a multiple of it.
-
-    Parameters
-    ----------
-    detector
-        The method.
-    """
+    """One method with a loose threshold; that of the common false-alarm rate is a multiple of it."""
 
     def __init__(self, detector: Method) -> None:
         self.detector = detector
@@ -160,20 +154,10 @@ def build_contenders(
     own: Mapping[str, Mapping[str, Any]],
     factors: Mapping[str, float] | None = None,
 ) -> Contenders:
-    """Build methods for a geometry.
+    """Build methods of `METHODS` for channels, with loose thresholds of a probability of alarm per sample.
 
-    Parameters
-    ----------
-    names
-        Of `METHODS`.
-    geometry, noise
-        Of the channels.
-    alarm_probability
-        Per sample, of the loose threshold.
-    own
-        Options of a method by name; they win.
-    factors
-        Multiple of the loose threshold that each method is to have, where its verdict depends on its threshold.
+    ``own``: options of a method by name; they win. ``factors``: multiple of the loose threshold that each method is to
+    have, where its verdict depends on its threshold.
     """
     running, refused = {}, {}
     for name in names:
@@ -358,16 +342,8 @@ def log_normal(points: Array, covariance: Array) -> Array:
 def log_faulty(points: Array, direction: Array, sizes: Array, covariance: Array) -> Array:
     """Logarithm of the density (Q,) with a fault along one direction, each of its sizes and either sign alike.
 
-    Parameters
-    ----------
-    points
-        (Q, m).
-    direction
-        (m,) what a unit error adds.
-    sizes
-        (K,) of the error.
-    covariance
-        Of the other errors, (m, m).
+    At points (Q, m): direction (m,) is what a unit error adds, sizes (K,) are of the error, covariance (m, m) of all
+    other errors.
     """
     precise = np.linalg.inv(covariance)
     along, own = points @ (precise @ direction), float(direction @ precise @ direction)
@@ -402,12 +378,8 @@ def fault_of_size(geometry: Geometry, size: float) -> Limit:
 def lorden_delay(shift: float, run_length: float) -> float:
     """First-order bound on the worst-case mean delay, samples: ln(G) over the information ``shift^2 / 2`` of a sample.
 
-    Parameters
-    ----------
-    shift
-        Change of the mean of a standard normal, > 0: the fault in standard deviations times sqrt(S_ii).
-    run_length
-        Mean number G of samples to a false alarm.
+    ``shift`` > 0: change of the mean of a standard normal, the fault in standard deviations times sqrt(S_ii). G: mean
+    run length, samples to a false alarm.
     """
     return math.log(run_length) / (0.5 * shift**2)
 
@@ -424,14 +396,7 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 def cusum_run_length(limit: float, reference: float, mean: float) -> float:
     """Mean number of samples until a one-sided CUSUM ``s = max(0, s + x - reference)`` of normal x reaches its limit.
 
-    From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature.
-
-    Parameters
-    ----------
-    limit, reference
-        In standard deviations of x.
-    mean
-        Of x.
+    From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature; all in standard deviations of x.
     """
     if limit <= 0:
         return 1 / _above(reference - mean)

@@ -45,16 +45,8 @@ SCHEMAS = {name: protocol.schema for name, protocol in PROTOCOLS.items()}
 def run_block(kind: str, settings: str, preparation: str, seed: int, block: Block) -> Counts:
     """Run one block of trials, wherever: the result depends on the arguments alone.
 
-    Parameters
-    ----------
-    kind
-        Key of `PROTOCOLS`.
-    settings, preparation
-        As JSON: detectors are built once per process for each.
-    seed
-        Of the study; the block's own generator is spawned from it.
-    block
-        Which one.
+    Settings and preparation come as JSON: detectors are built once per process for each. The block's own generator is
+    spawned from the seed of the study.
     """
     protocol, prepared = _built(kind, settings, preparation)
     rng = np.random.default_rng(
@@ -103,13 +95,7 @@ class StudyResult:
 
 
 def load_study(path: str | Path, trials: int | None = None, seed: int | None = None) -> Study:
-    """Read a study file; trials per cell and seed win over it.
-
-    Raises
-    ------
-    StudyError
-        If it is missing or does not fit.
-    """
+    """Read a study file; trials per cell and seed win over it. `StudyError` if it is missing or does not fit."""
     return read_study(path, SCHEMAS).changed(trials, seed)
 
 
@@ -121,21 +107,9 @@ def run_study(
 ) -> StudyResult:
     """Run a study and return all figures and settings.
 
-    Parameters
-    ----------
-    study
-        What to run.
-    workers
-        Local processes; None: as many as there are cores. The figures do not depend on it.
-    cluster
-        Address of the scheduler of a Dask cluster that works instead.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    StudyError
-        If the study cannot be run.
+    ``workers``: local processes; None: as many as there are cores. The figures do not depend on it. ``cluster``:
+    address of the scheduler of a Dask cluster that works instead. ``progress`` is called with the share done.
+    `StudyError` if the study cannot be run.
     """
     protocols = [PROTOCOLS[one.kind](one.settings) for one in study.sections]
 

@@ -50,18 +50,9 @@ def vehicle_motion(
 ) -> Motion:
     """Motion of a small vehicle: a rest at the start, then rests, slow turns and fast manoeuvres as they come.
 
-    Parameters
-    ----------
-    duration
-        Length, s; the motion ends at rest at about this time.
-    rng
-        Random generator.
-    rest
-        Rest at the start, s.
-    max_rate
-        Largest rate of a component in a fast manoeuvre, rad/s; slow turns reach 0.15 of it.
-    max_acceleration
-        Largest angular acceleration of a component, rad/s^2.
+    It ends at rest after about ``duration``, s; the first rest takes ``rest``, s. ``max_rate``: largest rate of a
+    component in a fast manoeuvre, rad/s; slow turns reach 0.15 of it. ``max_acceleration``: largest angular
+    acceleration of a component, rad/s^2.
     """
     times: list[float] = [0.0, rest]
     rates: list[Array] = [np.zeros(3), np.zeros(3)]

@@ -71,19 +71,9 @@ class Study:
 
 
 def read_study(path: str | Path, schemas: Mapping[str, Schema]) -> Study:
-    """Read a study file.
+    """Read a study file; schemas: settings of every kind of section.
 
-    Parameters
-    ----------
-    path
-        Of the file.
-    schemas
-        Settings of every kind of section.
-
-    Raises
-    ------
-    StudyError
-        If the file is missing, is no study, or a setting does not fit.
+    `StudyError` if the file is missing, is no study, or a setting does not fit.
     """
     raw = read_yaml(path, "study", StudyError)
     if not isinstance(raw, dict):
@@ -122,13 +112,7 @@ def section_settings(kind: str, raw: Any, schema: Schema) -> dict[str, Any]:
 
 
 def checked(section: str, name: str, field: Field, value: Any) -> Any:
-    """Value of one setting, of its type and within its range; plain values that JSON can hold.
-
-    Raises
-    ------
-    StudyError
-        If it does not fit.
-    """
+    """Value of one setting, of its type and within its range (else `StudyError`); plain values that JSON can hold."""
     where = f"{section}.{name}"
     if field.kind == "detectors":
         named = replace(field, kind="texts", choices=field.choices or tuple(DETECTORS))
@@ -204,15 +188,10 @@ class Block(NamedTuple):
 
 
 class TrialProtocol(ABC, Generic[Cell]):
-    """One section of a study.
+    """One section of a study, with settings checked against `schema`.
 
     The first stage finds thresholds on healthy channels and whatever else trials need; the second runs the trials. A
     block's result depends on its settings, its seed and the first stage alone.
-
-    Parameters
-    ----------
-    settings
-        Checked against `schema`.
     """
 
     kind: ClassVar[str]

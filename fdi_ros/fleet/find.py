@@ -18,22 +18,11 @@ from fdi_ros.system.trusted_file import open_regular
 
 
 def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Find all recordings.
+    """Find all recordings in what is given: each a recording, or a folder, of which all below count, behind links too.
 
-    Parameters
-    ----------
-    given
-        Each a recording, or a folder, of which all recordings below count, those behind links too. A file of a rosbag2
-        folder stands for the folder.
-
-    Returns
-    -------
-    The recordings in order, each once; and what could not be searched, or is called like a recording and is none.
-
-    Raises
-    ------
-    BagError
-        If something given is not there, or nothing is found at all.
+    A file of a rosbag2 folder stands for the folder. Returned are the recordings in order, each once; and what could
+    not be searched, or is called like a recording and is none. `BagError` if something given is not there, or nothing
+    is found at all.
     """
     found: dict[str, Path] = {}
     unread: list[str] = []

@@ -53,25 +53,9 @@ def judge_all(
 ) -> None:
     """Judge the recordings that are not in the tables as they are now, and write the tables.
 
-    Parameters
-    ----------
-    paths
-        Of all recordings.
-    parameters
-        Text of a parameter file; empty: of each recording what ``fdi inspect`` writes for it.
-    calibrated
-        Calibrate each recording on itself.
-    tables
-        Take the rows.
-    workers, cluster
-        As `fdi_ros.system.jobs.run_jobs` takes them.
-    show
-        Called with the share done.
-
-    Raises
-    ------
-    FdiError
-        If nothing can be written, or the cluster is lost.
+    ``parameters``: text of a parameter file; empty: of each recording what ``fdi inspect`` writes for it.
+    ``calibrated``: each recording is calibrated on itself. ``workers`` and ``cluster`` as of `run_jobs`. ``show`` is
+    called with the share done. `FdiError` if nothing can be written, or the cluster is lost.
     """
     jobs = []
     for path in paths:

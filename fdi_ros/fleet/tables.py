@@ -86,23 +86,11 @@ class FlightEpisode:
 
 
 class Tables:
-    """The folder of a fleet: its rows as they are there, and as they come.
+    """The folder of a fleet, made if it is not there: its rows as they are there, and as they come.
 
-    Rows of recordings that are not given again stay.
-
-    Parameters
-    ----------
-    folder
-        Made if it is not there.
-    settings
-        What decides the results, ready for JSON: rows of other settings are of no use.
-    force
-        Begin anew where the folder holds rows of other settings.
-
-    Raises
-    ------
-    BagError
-        If the tables there are not of a fleet, or of other settings, or another run writes to the folder.
+    Rows of recordings that are not given again stay. ``settings``: what decides the results, ready for JSON; rows of
+    other settings are of no use, and with ``force`` it is begun anew where they are there. `BagError` if the tables
+    there are not of a fleet, or of other settings, or another run writes to the folder.
     """
 
     def __init__(self, folder: Path, settings: Row, force: bool = False) -> None:

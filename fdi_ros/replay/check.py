@@ -148,21 +148,10 @@ _MEASURES: dict[str, Callable[[Judgement], tuple[float, str]]] = {
 
 
 def parse_check(text: str, faults: int, geometry: Geometry | None = None) -> list[Condition]:
-    """Read conditions separated by blanks or commas; all must hold.
+    """Read conditions separated by blanks or commas, ``delay<1 isolated false=0``; all must hold.
 
-    Parameters
-    ----------
-    text
-        ``delay<1 isolated false=0``.
-    faults
-        Number of faults that are injected.
-    geometry
-        Of the monitor: its channels and units may be asked for.
-
-    Raises
-    ------
-    ConfigError
-        Naming the part that is wrong and what is allowed.
+    ``faults``: how many are injected. ``geometry``: of the monitor, whose channels and units may be asked for.
+    `ConfigError` names the part that is wrong and what is allowed.
     """
     parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
     if not parts:

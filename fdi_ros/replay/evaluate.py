@@ -31,15 +31,7 @@ _UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name 
 
 
 class Followed:
-    """One injected fault, and what has become of it so far.
-
-    Parameters
-    ----------
-    fault, channels
-        The fault, and the numbers of the channels that it is injected into.
-    names
-        Of all channels.
-    """
+    """One injected fault, the numbers of the channels that it is injected into, and what has become of it so far."""
 
     def __init__(self, fault: Fault, channels: Sequence[int], names: Sequence[str]) -> None:
         self.fault, self.channels = fault, channels
@@ -111,15 +103,7 @@ class Rms:
 
 
 class Evaluation:
-    """Scores one monitor on one stream, block after block.
-
-    Parameters
-    ----------
-    injector
-        Of the faults in the stream.
-    geometry
-        Of the monitor: for the plain least-squares rate of all channels.
-    """
+    """Scores one monitor on one stream with the faults of an injector, block after block."""
 
     def __init__(self, injector: Injector, geometry: Geometry) -> None:
         self.injector = injector
@@ -144,12 +128,7 @@ class Evaluation:
     def add(self, output: Output, clean: Array | None = None) -> None:
         """Take in the next samples.
 
-        Parameters
-        ----------
-        output
-            Of the monitor.
-        clean
-            (N, 3) what the same monitor fuses of them without the faults, rad/s; NaN: not to be compared.
+        ``clean`` (N, 3): what the same monitor fuses of them without the faults, rad/s; NaN: not to be compared.
         """
         if len(output) == 0:
             return

@@ -63,18 +63,10 @@ def standing(output: Output) -> tuple[Mask, Mask]:
 
 
 def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: float = np.inf) -> Scored:
-    """Say what came of a fault.
+    """Say what came of a fault of a channel (None: none is faulty); ``alone`` and ``among`` (N, n) as of `standing`.
 
-    Parameters
-    ----------
-    alone, among
-        (N, n) as of `standing`.
-    channel
-        That is faulty; None: none is.
-    since
-        (N,) s from the start of the fault.
-    within
-        A fault is isolated, or in a group, if it is by then, s; a false isolation counts at any time.
+    ``since`` (N,) s from the start of the fault. It is isolated, or in a group, if it is so ``within`` so many s; a
+    false isolation counts at any time.
     """
     if channel is None:
         isolated = detected = np.inf

@@ -33,17 +33,10 @@ _STATES = np.array([state.name for state in ChannelState])
 
 
 class CsvFile(Sink):
-    """A table of all samples.
+    """A table of all samples, in a file open for writing text.
 
     The columns: stamp, ns; fused rate and its standard deviation, rad/s; statistic, threshold, alarm; then of every
     channel what came in, rad/s, its residual, rad/s, and its state. Empty where there is nothing.
-
-    Parameters
-    ----------
-    file
-        Open for writing text.
-    names
-        Of the channels.
     """
 
     def __init__(self, file: TextIO, names: tuple[str, ...]) -> None:
@@ -73,13 +66,7 @@ def _text(value: float) -> str:
 
 
 class InputWatch:
-    """Describes the inputs of a recording by the clock of the recorder.
-
-    Parameters
-    ----------
-    config
-        Settings.
-    """
+    """Describes the inputs of a recording by the clock of the recorder."""
 
     def __init__(self, config: Config) -> None:
         self._source = source_of(config)
@@ -127,14 +114,7 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 class OutputBag(Sink):
     """A rosbag2 folder with one MCAP file, as `ros2 bag record` would leave it beside the running node.
 
-    Parameters
-    ----------
-    path
-        Folder to be made; it must not exist.
-    config
-        Topics and frame.
-    channels
-        Number of channels.
+    The folder must not exist.
     """
 
     stops_at_events = True

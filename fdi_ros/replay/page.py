@@ -57,18 +57,9 @@ SHOWN_AROUND = 2.0
 
 
 class Report(Sink):
-    """Collects the outputs of the monitor, in bounded memory, and lays them out.
+    """Collects the outputs of the monitor, in bounded memory, and lays them out in a unit; ``rate``: in Hz.
 
     A channel's reading of a body axis is the fused rate, moved along the channel's own axis until the channel agrees.
-
-    Parameters
-    ----------
-    geometry
-        Of the monitor.
-    rate
-        Samples per second, Hz.
-    unit
-        Of what is shown.
     """
 
     def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
@@ -125,15 +116,7 @@ class Report(Sink):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
-        """Lay out the page: the verdict, the picture, the episodes, the other plots, the tables.
-
-        Parameters
-        ----------
-        summary
-            Of the replay.
-        about
-            What was run: shown as a table.
-        """
+        """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
         scores, story, unit = summary.scores, summary.story, self._unit
         common = {
             "shapes": _shades(summary),

@@ -88,15 +88,7 @@ class _Open:
 
 
 class Recorder:
-    """Tells the story of one monitor on one stream, block after block; memory does not grow with its length.
-
-    Parameters
-    ----------
-    geometry
-        Of the monitor.
-    noise
-        Error model of its channels.
-    """
+    """Tells the story of one monitor on one stream, block after block; memory does not grow with its length."""
 
     def __init__(self, geometry: Geometry, noise: NoiseModel) -> None:
         self._geometry = geometry

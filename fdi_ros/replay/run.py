@@ -78,13 +78,7 @@ class Sink:
 
 
 class Kept(Sink):
-    """Keeps, for all samples, what a function makes of each output.
-
-    Parameters
-    ----------
-    columns_of
-        Returns arrays of as many rows as the output has samples.
-    """
+    """Keeps, for all samples, what a function makes of each output: arrays of as many rows."""
 
     def __init__(self, columns_of: Callable[[Output], Sequence[NDArray[Any]]]) -> None:
         self._columns_of = columns_of
@@ -101,16 +95,9 @@ class Kept(Sink):
 
 
 class Walk:
-    """One monitor on one stream, cut into stretches at gaps; with each of them it forgets what is declared.
+    """One monitor, taken as it is, on one stream, cut into stretches at gaps; with each it forgets what is declared.
 
     Biases stay: they are the same sensors'.
-
-    Parameters
-    ----------
-    pipeline
-        Takes the samples, as it is.
-    sinks
-        Take its outputs.
     """
 
     def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
@@ -169,12 +156,7 @@ def portions(block: Block) -> Iterator[Block]:
 class Judge(Walk):
     """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults.
 
-    Parameters
-    ----------
-    pipeline, sinks
-        As of `Walk`.
-    injector
-        Of the faults, with the stamp that times count from.
+    The injector has the stamp that times count from.
     """
 
     def __init__(self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
@@ -293,21 +275,9 @@ class Request:
 
 
 def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
-    """Replay a recording once.
+    """Replay a recording once; sinks take the outputs of the monitor, progress is called with the share done.
 
-    Parameters
-    ----------
-    request
-        What is to be replayed.
-    sinks
-        Take the outputs of the monitor.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    FdiError
-        If the recording, the settings or the faults do not fit.
+    `FdiError` if the recording, the settings or the faults do not fit.
     """
     begun, config = clock(), request.config
     injector = Injector(request.faults, build_geometry(config).channel_names)

@@ -68,16 +68,10 @@ class Size:
 
 
 class Batches:
-    """Means of an error over batches of time.
+    """Means of an error over batches of time, from ``begin`` on, s.
 
-    Parameters
-    ----------
-    begin
-        Time of the first sample, s.
-    noise
-        Standard deviation that noise alone gives the error in one sample, rad/s.
-    scale, bias
-        Standard deviation of what unknown scale factors make of the rate, as a share of it; of unknown biases, rad/s.
+    ``noise``: standard deviation that it alone gives the error in one sample, rad/s. ``scale``, ``bias``: standard
+    deviation of what unknown scale factors make of the rate, as a share of it, and of unknown biases, rad/s.
     """
 
     def __init__(self, begin: float, noise: float, scale: float = 0.0, bias: float = 0.0) -> None:

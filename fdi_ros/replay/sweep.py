@@ -95,10 +95,7 @@ class Swept:
 def parse_swept(text: str) -> tuple[Swept, ...]:
     """Read what is to be swept: ``kind=bias size=0.05,0.1,0.3``, one entry per size.
 
-    Raises
-    ------
-    FaultError
-        If it is not of that form, or a number does not fit its kind.
+    `FaultError` if it is not of that form, or a number does not fit its kind.
     """
     items = key_values(text)
     for name in items:
@@ -240,13 +237,7 @@ class Trial:
 
 
 def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Judge a recording as it is.
-
-    Raises
-    ------
-    BagError
-        If there is not a single sample.
-    """
+    """Judge a recording as it is; `BagError` if there is not a single sample."""
     if not len(block):
         raise BagError("its topics have no time in common: there is no sample of all channels")
     kept = Kept(_what_counts)
@@ -272,20 +263,9 @@ def rows_at(block: Block, at: float, watch: float) -> slice:
 
 
 def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[tuple[float, float]]:
-    """Find the times, s from the first sample, from which samples come for so long without a hole.
+    """Find the first and last times, s, of pieces in which samples come for so long (``watch``, s) without a hole.
 
-    Parameters
-    ----------
-    block
-        The recording.
-    begins, ends
-        When it is judged, s.
-    watch
-        s.
-
-    Returns
-    -------
-    First and last time of each piece that is long enough.
+    It is judged from ``begins`` to ``ends``; all times are from the first sample.
     """
     seconds = (block.stamp - block.stamp[0]) * 1e-9
     spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
@@ -379,10 +359,7 @@ class SweepResult:
 def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[float, ...]:
     """Spread the times of the faults evenly over what all of the monitors judge, s; none of them meets a gap.
 
-    Raises
-    ------
-    FaultError
-        If that is too short to watch a fault.
+    `FaultError` if that is too short to watch a fault.
     """
     begins, end = max(one.begins for one in baseline), min(one.duration for one in baseline)
     windows = windows_of(block, begins, end, plan.within)
@@ -403,23 +380,10 @@ def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[fl
 def sweep(
     subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
 ) -> tuple[SweepResult, ...]:
-    """Try every monitor with every fault of the plan, at the same times.
+    """Try every monitor, all with the same channels, with every fault of the plan, at the same times.
 
-    Parameters
-    ----------
-    subjects
-        With the same channels.
-    plan
-        The faults.
-    workers
-        Processes; 1: this one alone.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    FdiError
-        If no monitor judges the recording for long enough.
+    ``workers``: processes; 1: this one alone. ``progress`` is called with the share done. `FdiError` if no monitor
+    judges the recording for long enough.
     """
     tried = [_watched(subject) for subject in subjects]
     able = [k for k, one in enumerate(tried) if not one.refused]

@@ -30,15 +30,7 @@ MOST_LINES = 3
 
 
 class Spectrum:
-    """Amplitude density of n channels, averaged over a stream of samples.
-
-    Parameters
-    ----------
-    names
-        Of the channels.
-    rate
-        Samples per second, Hz.
-    """
+    """Amplitude density of n channels, averaged over a stream of ``rate`` samples per second."""
 
     def __init__(self, names: Sequence[str], rate: float) -> None:
         self._names, self._rate = names, rate

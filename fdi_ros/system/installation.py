@@ -41,10 +41,7 @@ def shipped_files() -> list[Path]:
 def resolve(path: str) -> Path:
     """Return a path as given; if nothing is there, the shipped file that it names, and say so.
 
-    Parameters
-    ----------
-    path
-        Given by a user. A name alone, and ``config/...`` as in a clone, names a shipped file.
+    A name alone, and ``config/...`` as in a clone, names a shipped file.
     """
     given = Path(path)
     if given.exists():
@@ -71,19 +68,9 @@ PACKAGES = {"serial": "pyserial"}
 
 
 def require(who: str, libraries: Sequence[str]) -> None:
-    """Check that libraries can be imported.
+    """Check that libraries can be imported, which ``who`` needs, in words for people.
 
-    Parameters
-    ----------
-    who
-        Needs them, for people.
-    libraries
-        Names to import.
-
-    Raises
-    ------
-    FdiError
-        If some are missing: one line with the command that brings them.
+    `FdiError` if some are missing: one line with the command that brings them.
     """
     missing = [library for library in libraries if not there(library)]
     if not missing:

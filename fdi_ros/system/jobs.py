@@ -52,13 +52,7 @@ ONE_THREAD = dict.fromkeys(
 
 
 def worker_count(workers: int | None) -> int:
-    """Return how many processes are asked for; None: as many as there are cores.
-
-    Raises
-    ------
-    StudyError
-        If they are too few or too many.
-    """
+    """Return how many processes are asked for; None: as many as there are cores. `StudyError`: too few or too many."""
     count = (os.cpu_count() or 1) if workers is None else workers
     if not 1 <= count <= MOST_WORKERS:
         raise StudyError(f"workers is {count}, expected 1 to {MOST_WORKERS}")
@@ -72,28 +66,12 @@ def run_jobs(
     cluster: str | None,
     lost: Lost | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Run all jobs and give (index, result) as they are done, in any order.
+    """Run all jobs, the arguments of a function that workers can import, and give (index, result) as they are done.
 
-    Parameters
-    ----------
-    function
-        Of a module that the workers can import.
-    jobs
-        Its arguments.
-    workers
-        Processes; 1: this process alone.
-    cluster
-        Address of the scheduler of a Dask cluster that works instead, ``tcp://host:port`` or ``tls://host:port``; None:
-        there is none.
-    lost
-        Makes the result of a job that kills its worker again and again. Without it such a job ends the run. In this
-        process alone there is no worker to be killed.
-
-    Raises
-    ------
-    StudyError
-        If the address is none, the scheduler is not there, or is lost, or workers die again and again and `lost` is not
-        given.
+    ``workers``: processes; 1: this one alone. ``cluster``: address of the scheduler of a Dask cluster that works
+    instead, ``tcp://host:port`` or ``tls://host:port``. ``lost`` makes the result of a job that kills its worker again
+    and again; without it such a job ends the run. In this process alone there is no worker to be killed. `StudyError`
+    if the address is none, the scheduler is not there or is lost, or workers die and ``lost`` is not given.
     """
     if not jobs:
         return iter(())

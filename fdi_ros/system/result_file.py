@@ -70,10 +70,7 @@ def real_path(path: Path) -> Path:
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a path to write a file to; it takes its place when all is written, and is gone if something fails.
 
-    Raises
-    ------
-    BagError
-        If it cannot be written.
+    `BagError` if it cannot be written.
     """
     if is_stream(path):
         with _scratch(path, None) as folder:
@@ -90,10 +87,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path) -> Iterator[Path]:
     """Give a path to make a folder at; it takes its place when all is written, and is gone if something fails.
 
-    Raises
-    ------
-    BagError
-        If it cannot be written.
+    `BagError` if it cannot be written.
     """
     path = real_path(path)
     with _scratch(path, path.parent) as folder:
@@ -110,25 +104,13 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text file, whole or not at all.
-
-    Raises
-    ------
-    BagError
-        If it cannot be written.
-    """
+    """Write a text file, whole or not at all; `BagError` if it cannot be written."""
     with whole_file(target) as path:
         path.write_text(text, encoding="utf-8", errors="replace")
 
 
 def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write figures as JSON, marked as of this package; None: not asked for.
-
-    Raises
-    ------
-    BagError
-        If it cannot be written.
-    """
+    """Write figures as JSON, marked as of this package; None: not asked for. `BagError` if it cannot be written."""
     if target is not None:
         write_text(target, json.dumps(plain({**MADE_BY, **figures}), indent=2, allow_nan=False) + "\n")
 

@@ -34,12 +34,7 @@ class DistrustError(OSError):
 def check(path: Path | str) -> None:
     """Check that a file or folder can have been written by this user and root alone; links are not followed.
 
-    Raises
-    ------
-    DistrustError
-        If that is not so.
-    OSError
-        If there is no such file.
+    `DistrustError` if that is not so, `OSError` if there is no such file.
     """
     _check(path, os.lstat(path))
 
@@ -47,12 +42,7 @@ def check(path: Path | str) -> None:
 def close_to_others(folder: Path | str) -> None:
     """Take from others the right to write a folder of this user, and check it; what lies in it must be checked still.
 
-    Raises
-    ------
-    DistrustError
-        If it belongs to another user, or is a link.
-    OSError
-        If there is no such folder, or it cannot be changed.
+    `DistrustError` if it belongs to another user, or is a link; `OSError` if there is none, or it cannot be changed.
     """
     about = os.lstat(folder)
     if about.st_mode & OTHERS and about.st_uid == os.geteuid() and stat.S_ISDIR(about.st_mode):
@@ -64,12 +54,7 @@ def close_to_others(folder: Path | str) -> None:
 def check_ancestor(folder: Path | str) -> None:
     """Check that in a folder above ours nobody else can put another in place of ours.
 
-    Raises
-    ------
-    DistrustError
-        If others can write it, and it is not sticky.
-    OSError
-        If there is no such folder.
+    `DistrustError` if others can write it, and it is not sticky; `OSError` if there is none.
     """
     mode = os.stat(folder).st_mode
     # That a group can is usual where every user has one of their own.
@@ -81,10 +66,7 @@ def check_ancestor(folder: Path | str) -> None:
 def lock(path: str) -> Iterator[None]:
     """Hold a lock file alone; where the file system has no locks there is nothing better.
 
-    Raises
-    ------
-    OSError
-        If it cannot be opened, or is a link; nothing is ever written to it.
+    `OSError` if it cannot be opened, or is a link; nothing is ever written to it.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(path, flags, 0o600), "rb", buffering=0) as file:
@@ -96,12 +78,7 @@ def lock(path: str) -> Iterator[None]:
 def read(path: Path, most: int) -> bytes:
     """Read a regular file that only this user or root can have written, so many bytes of it at most.
 
-    Raises
-    ------
-    DistrustError
-        If somebody else may have, or it is no regular file.
-    OSError
-        If it cannot be read.
+    `DistrustError` if somebody else may have, or it is no regular file; `OSError` if it cannot be read.
     """
     with open_regular(path, links=False) as file:
         _check(path, os.fstat(file.fileno()))
@@ -111,19 +88,7 @@ def read(path: Path, most: int) -> bytes:
 def open_regular(path: Path | str, links: bool = True) -> BinaryIO:
     """Open a regular file for reading, whoever has written it: no pipe, device or socket is opened or waited for.
 
-    Parameters
-    ----------
-    path
-        Of the file.
-    links
-        Links are followed.
-
-    Raises
-    ------
-    DistrustError
-        If it is another thing, or a link and these are not followed.
-    OSError
-        If it cannot be opened.
+    `DistrustError` if it is another thing, or a link and these are not followed; `OSError` if it cannot be opened.
     """
     _check_regular(path, os.stat(path) if links else os.lstat(path))
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if links else os.O_NOFOLLOW)
@@ -148,14 +113,9 @@ def _check_regular(path: Path | str, about: os.stat_result) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file that takes its place when all is written and on the disk, and is gone if something fails.
+    """Write a file that takes its place when all is written and on the disk, or is gone if something fails: `OSError`.
 
     It is written under a name that nobody can foresee, and created there: what lies at a name is never written to.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC

@@ -73,21 +73,9 @@ def _refused(mark: Any, words: str) -> _Refused:
 
 
 def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
-    """Read a YAML file.
+    """Read a YAML file, which errors (of class ``error``) call ``what``: ``config``.
 
-    Parameters
-    ----------
-    path
-        Of the file.
-    what
-        The file is called this in errors: ``config``.
-    error
-        Class of the errors.
-
-    Raises
-    ------
-    FdiError
-        Of that class, if the file cannot be read, is no YAML, or is beyond the limits.
+    They say that it cannot be read, is no YAML, or is beyond the limits.
     """
     try:
         with open_regular(path) as file:

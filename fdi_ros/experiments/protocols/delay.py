@@ -136,11 +136,9 @@ def _ratios(contender: Contender, z: Array) -> Array:
 def _delays(alarm: NDArray[np.bool_], lead: int) -> Counts:
     """Count delays, in samples with the first faulty one as 1, of streams whose fault begins at `lead`.
 
-    Returns
-    -------
-    Streams with an alarm before the fault, which are left out of all else, with one after it, and without.
-    ``waited``: samples until the alarm, or the end, of all streams. ``squares``: sum of the squared delays.
-    ``histogram``: streams by delay.
+    Streams with an alarm before the fault, which are left out of all else, with one after it, and without. ``waited``:
+    samples until the alarm, or the end, of all streams. ``squares``: sum of the squared delays. ``histogram``: streams
+    by delay.
     """
     early = alarm[:, :lead].any(axis=1)
     after = alarm[~early, lead:]

@@ -149,8 +149,6 @@ class Flight(TrialProtocol[str]):
 def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
     """Run the monitor over flights, and count what came of them.
 
-    Returns
-    -------
     ``right``: the faulty channel is isolated, and no other; ``wrong``: a healthy one is; ``ambiguous``: the faulty one
     is in an ambiguity group, and never isolated; ``silent``: none of these. ``without_rate``: samples from the onset on
     without a fused rate. ``delays``: flights by samples from the onset to the isolation. ``after`` and ``before`` the

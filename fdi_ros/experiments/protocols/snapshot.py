@@ -172,11 +172,9 @@ def _limit_key(cell: Cell) -> str:
 def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
     """Count what came of samples with faults in the channels struck (N, n); none struck: false alarms.
 
-    Returns
-    -------
-    ``identified``: the largest normalised residual is a faulty channel's; None: the method does not give it.
-    ``right``: declared, and the channel named first is faulty. ``covered``: declared, and every faulty channel is a
-    suspect. ``set_sizes``: samples by number of suspects, 0 to n.
+    ``identified``: the largest normalised residual is a faulty channel's; None: the method does not give it. ``right``:
+    declared, and the channel named first is faulty. ``covered``: declared, and every faulty channel is a suspect.
+    ``set_sizes``: samples by number of suspects, 0 to n.
     """
     declared = evaluation.ratio >= factor
     rows = np.arange(len(struck))
