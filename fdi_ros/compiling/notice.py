@@ -148,13 +148,7 @@ def announced(view: View | None = None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def refused(words: str) -> Iterator[None]:
-    """Compile nothing within.
-
-    Raises
-    ------
-    FdiError
-        With these words, when something within is to be compiled.
-    """
+    """Compile nothing within: `FdiError` with these words when something is to be compiled."""
 
     def hook(begins: bool) -> None:
         if begins:

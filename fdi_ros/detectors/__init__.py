@@ -35,13 +35,7 @@ DETECTORS = {
 
 
 def detector_class(name: str) -> type[Detector]:
-    """Class of a detector by name.
-
-    Raises
-    ------
-    DetectorError
-        If there is none of that name; the message lists those there are.
-    """
+    """Class of a detector by name; `DetectorError` if there is none of that name lists those there are."""
     if name not in DETECTORS:
         raise DetectorError(f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}")
     found: type[Detector] = pkgutil.resolve_name(f"{__name__}.{DETECTORS[name]}")

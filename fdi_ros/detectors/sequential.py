@@ -335,16 +335,11 @@ class Sequential(Detector):
     1987), and so neither does the mean of all R. Where that mean reaches `run_length`, the largest sum has to hold
     against the scatter within the time since its onset, as a Student ratio; and then an explanation of the mean since
     the onset against everything that is not known of the sensors, whose states go back to before the onset for it.
-
     While the alarm stands, channels, pairs, units as a whole, their gain and their delay explain the mean with certain
     odds, and the smallest set of these that holds the truth with `confidence` is named; `isolated` if all of it have a
     channel in common and the best of it leaves no more than noise. `Verdict.statistic` is the logarithm of one plus the
     mean of all sums: below the threshold without an alarm, never below it with one, and 0 while evidence is void.
-
-    Good at: steps, drifts, scale faults and small lasting errors, at rest and in motion; noise that is coloured,
-    unequal or changes; several faults; units that are wrong as a whole. Bad at: errors that wander no faster than
-    `bias_walk` allows, which pass into the states; changes of the noise, which are measured but no alarm; two parallel
-    gyros of three with equal errors, which look like the third's. docs/methods.md has the reasons.
+    docs/methods.md has the rest, and what it is good and bad at.
 
     Parameters
     ----------

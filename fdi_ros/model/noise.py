@@ -133,18 +133,10 @@ MUCH_NOISIER = 3.0
 
 
 def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int, float]]:
-    """Find channels that are much noisier than every channel of all other units.
+    """Find channels that are much noisier than every channel of all other units, with the noisiest of these, rad/s.
 
-    Parameters
-    ----------
-    noise
-        (n,) of each channel, rad/s; what is not finite is not compared.
-    units
-        Numbers of the channels of each unit; channels that fail alone are units of one.
-
-    Returns
-    -------
-    Number of each such channel, and the noise of the noisiest one of the other units, rad/s.
+    ``noise`` (n,) of each channel, rad/s; what is not finite is not compared. ``units``: numbers of the channels of
+    each; channels that fail alone are units of one.
     """
     found = []
     for k, unit in enumerate(units):
@@ -160,14 +152,8 @@ def noisier_words(
 ) -> str:
     """Say which channels are much noisier than the others, with figures; empty: none is.
 
-    Parameters
-    ----------
-    names
-        Of the channels.
-    noise, units
-        As `much_noisier` takes them.
-    unit, factor
-        Unit of rates in the words, and how many of it are 1 rad/s.
+    ``noise``, ``units`` as `much_noisier` takes them. ``unit``, ``factor``: unit of rates in the words, and how many of
+    it are 1 rad/s.
     """
     found = much_noisier(noise, units)
     if not found:

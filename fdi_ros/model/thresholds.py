@@ -68,10 +68,7 @@ class FalseAlarmRate:
     def per_sample(self) -> float:
         """Probability of a false alarm in one sample; `DEFAULT_PROBABILITY` if nothing is stated.
 
-        Raises
-        ------
-        ConfigError
-            If it is not between 0 and 1.
+        `ConfigError` if it is not between 0 and 1.
         """
         probability = DEFAULT_PROBABILITY if self.probability is None else self.probability
         if self.per_hour is not None and self.sample_rate is not None:
@@ -85,10 +82,7 @@ class FalseAlarmRate:
     def mean_run_length(self) -> float:
         """Mean samples to a false alarm; `DEFAULT_RUN_LENGTH` if nothing is stated.
 
-        Raises
-        ------
-        ConfigError
-            If it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`.
+        `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`.
         """
         samples = DEFAULT_RUN_LENGTH if self.run_length is None else self.run_length
         if self.per_hour is not None or self.probability is not None:
@@ -100,10 +94,7 @@ class FalseAlarmRate:
     def as_options(self, accepted: Collection[str] = OPTIONS) -> dict[str, float]:
         """Return the options of a detector that state the same.
 
-        Parameters
-        ----------
-        accepted
-            Options that the detector takes; one that takes a run length and no probability gets the run length.
+        One that takes a run length and no probability, of the options accepted, gets the run length.
         """
         options = self._named()
         if self.probability is not None and "run_length" in accepted and "false_alarm_probability" not in accepted:
@@ -146,16 +137,10 @@ def chi2_isf(probability: float, dof: int) -> float:
 def max_normal_threshold(directions: Array, probability: float) -> float:
     """Exact threshold of ``max_i |w_i|`` for standard normal w_i = directions_i . p, p white in m dimensions.
 
-    Up to m = 3 the chi-square tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged over the
-    unit sphere by quadrature. Above, over samples drawn beyond the threshold along each direction in turn
-    (Naiman and Priebe 2001), which keeps its relative accuracy far into the tail.
-
-    Parameters
-    ----------
-    directions
-        Unit vectors in parity space, (n, m).
-    probability
-        P(max_i |w_i| > threshold), 0 to 1.
+    The threshold is exceeded with a probability, 0 to 1; directions (n, m) are unit vectors. Up to m = 3 the chi-square
+    tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged over the unit sphere by quadrature.
+    Above, over samples drawn beyond the threshold along each direction in turn (Naiman and Priebe 2001), which keeps
+    its relative accuracy far into the tail.
     """
     unique = _distinct(directions)
     m = unique.shape[1]
@@ -305,16 +290,8 @@ def summary_line(
 ) -> str:
     """Return what a mounting can do, in one line: for the log of a node.
 
-    Parameters
-    ----------
-    geometry, noise
-        Of the monitor.
-    probability
-        False-alarm probability per sample.
-    unit, factor
-        Unit of the errors, and how much of it is 1 rad/s.
-    agree
-        The channels are not known to contradict each other: else nothing is said of what can be named.
+    ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the errors, and how much of it is 1
+    rad/s. ``agree``: the channels are not known to contradict each other; else nothing is said of what can be named.
     """
     smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
     seen = smallest[np.isfinite(smallest)]

@@ -60,24 +60,14 @@ def siegmund_run_length(threshold: float, reference: float) -> float:
 def threshold_for(run_length: float, reference: float, correlation: Array) -> float:
     """Threshold, in standard deviations, of correlated sums for the mean run length to the first false alarm of any.
 
-    Sums whose samples are correlated alarm together at times. Given that one crosses the threshold, its samples
-    drift by +k, those of another by ``(2 rho - 1) k``; the other is then at a normally distributed distance D from the
+    Sums whose samples are correlated alarm together at times. Given that one crosses the threshold, its samples drift
+    by +k, those of another by ``(2 rho - 1) k``; the other is then at a normally distributed distance D from the
     threshold, ``2 k D`` having mean mu = ``4 (1 - rho) k b`` and variance 2 mu, and goes on to cross it with
     probability exp(-2 k D). The mean of that is ``erfc(sqrt((1 - rho) k b))``. Crossings that are shared count once.
 
-    Parameters
-    ----------
-    run_length
-        Samples, of all sums together.
-    reference
-        k: what is subtracted from every sample, in standard deviations.
-    correlation
-        rho between the samples of the sums, (K, K).
-
-    Raises
-    ------
-    ConfigError
-        If the run length is so short that no threshold above zero gives it.
+    ``run_length``: samples, of all sums together. ``reference`` k: what is subtracted from every sample, in standard
+    deviations. ``correlation`` (K, K): rho between the samples of the sums. `ConfigError` if the run length is so short
+    that no threshold above zero gives it.
     """
     count, overshoot = len(correlation), mean_overshoot(reference)
     apart = 1 - np.clip(correlation[~np.eye(count, dtype=bool)], -1, 1)
@@ -260,30 +250,11 @@ class Cusum(Detector):
     r"""Two running sums per channel, ``max(0, S + w_i - k)`` and ``max(0, S - w_i - k)``, against one threshold.
 
     w_i is the whitened single-fault statistic of `likelihood_ratio`, ``k = shift / 2`` (Page, *Continuous inspection
-    schemes*, 1954). The threshold h follows from the mean run length to a false alarm, shared among both sides
-    of all channels that can be told apart, by Siegmund's approximation (`siegmund_run_length`). A shift d of w_i is
-    seen after about ``(h + 1.166) / (d - k)`` samples. Sums are kept below 1.5 h, so that a fault
-    which ends is forgotten after about h / shift samples, however long it lasted.
-
-    On alarm the sum that is largest sets the onset: the sample after it was last zero. z is averaged
-    from there, over `window` samples at most (the first ones), and `explain` names the channels that
-    explain this average: its noise is that of one sample over the square root of their number. Correlated channels,
-    whose sums rise as well, are thus rejected or kept as rivals by the same rule as in `likelihood_ratio`. The
-    onset is picked by the data, so the confidence of an isolation is somewhat less than for one sample.
-
-    Bias left after its correction (`bias_std`) and errors of scale factor and sampling instant are no white noise:
-    they keep their sign, for ever or while the motion lasts, and would add up to an alarm. So k grows by
-    `SYSTEMATIC` times the standard deviation that they have in w in that sample: only what they do not explain
-    counts, and the run length is at least the one asked for. It follows that a short average at start-up limits the
-    drift that can be found: a mean w below k never is. A calibrated bias, or a longer average, is better. In
-    the average, the same part is taken to be the same in all samples.
-
-    Noise that depends on rate and acceleration: w is whitened sample by sample, and so a fault, which passes for rate
-    in the statistics of the other channels, shrinks them. For the average, the whole sample is divided by
-    one factor instead, the largest standard deviation that any channel's statistic has in it.
-
-    Good at: small constant errors, slow drift, with an estimate of when it began. Bad at: noise that is not white;
-    drift that shows in motion alone; isolated spikes (one far beyond h alarms for h / shift samples).
+    schemes*, 1954). The threshold h follows from the mean run length to a false alarm, shared among both sides of all
+    channels that can be told apart, by Siegmund's approximation (`siegmund_run_length`). On alarm the largest sum sets
+    the onset, and `explain` names the channels that explain the average since then. Errors that keep their sign
+    (`bias_std`, scale, timing) raise k by `SYSTEMATIC` times the standard deviation that they have in w in that sample.
+    docs/methods.md has the rest, and when to take it.
 
     Parameters
     ----------
@@ -293,10 +264,8 @@ class Cusum(Detector):
         Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
     run_length
         Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8 (1e-3 an hour at 100 Hz).
-    false_alarms_per_hour
-        The other way to give it, with `sample_rate`.
-    sample_rate
-        Hz.
+    false_alarms_per_hour, sample_rate
+        The other way to give it, with the rate in Hz.
     confidence
         With which rivals are rejected, above 0.5 and below 1.
 

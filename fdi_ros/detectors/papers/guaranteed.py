@@ -33,12 +33,9 @@ from fdi_ros.model.samples import Array, Mask
 
 
 def circuits(axes: Array) -> Array:
-    """Return the checks of all circuits, (C, n): at most four entries of a row are not zero, and row @ axes = 0.
+    """Return the checks of all circuits of axes (n, 3), (C, n): at most four entries of a row are not zero.
 
-    Parameters
-    ----------
-    axes
-        Sensitivity axes, (n, 3).
+    A row times the axes is zero.
     """
     norm = np.linalg.norm(axes, axis=1)
     unit = axes / norm[:, None]
@@ -283,26 +280,19 @@ class Guaranteed(Detector):
     r"""Intervals that certainly contain each channel's error, and the channels that have certainly failed.
 
     A healthy channel's error is at most its bound b_i; at most `max_faults` channels, any, are arbitrary. For a set F
-    of channels left out the admissible rates are ``Q_F = {q : |z_i - h_i q| <= b_i, i not in F}``; the error of
-    channel i is ``z_i - h_i q`` over the union of all Q_F (*Determining failures of a redundant inertial sensor unit
-    by the guaranteeing estimation method*: its linear programmes and test (10), with the sign lost in print).
-    A channel has certainly failed when its whole interval lies beyond ``threshold * b_i``.
-
-    No programme is solved: each is decided at a vertex of its dual, and the vertices are the circuits of the
-    axes (see `circuits`), known in advance. A sample whose circuits all keep their bounds needs no fault.
+    of channels left out the admissible rates are ``Q_F = {q : |z_i - h_i q| <= b_i, i not in F}``; the error of channel
+    i is ``z_i - h_i q`` over the union of all Q_F (*Determining failures of a redundant inertial sensor unit by the
+    guaranteeing estimation method*: its linear programmes and test (10), with the sign lost in print). A channel has
+    certainly failed when its whole interval lies beyond ``threshold * b_i``. No programme is solved: each is decided at
+    a vertex of its dual, and the vertices are the circuits of the axes (see `circuits`). docs/methods.md has when to
+    take it.
 
     - `statistic`: the size in bounds of the largest error in the mildest explanation of the sample with at most
-      `max_faults` faults. At least one channel is certainly off by that much. inf: no such explanation, the sample
-      contradicts `max_faults` (or the bounds). `threshold`: as given. With max_faults = 0 the statistic is the factor
-      by which all bounds would have to grow, its threshold 1.
-    - `suspects`: channels that have failed in some explanation; `isolated`: each of them has in all. All channels
-      when there is no explanation.
+      `max_faults` faults; inf: there is none, it contradicts `max_faults` or the bounds. With max_faults = 0 the
+      factor by which all bounds would have to grow, its threshold 1.
+    - `suspects`: channels that have failed in some explanation, all when there is none; `isolated`: each has in all.
     - `scores`: least possible size of each channel's error in bounds; 0 while the sample needs no fault.
     - `error`: midpoint of the interval; 0 where it is unbounded or empty.
-
-    Good at: certainty without statistics, two simultaneous faults, any axes. Bad at: noise without a hard limit (a
-    bound of 3 standard deviations is exceeded); the larger the bound the blinder. Faults below about ``threshold``
-    bounds stay unseen by choice.
 
     Parameters
     ----------

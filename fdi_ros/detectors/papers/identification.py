@@ -92,28 +92,14 @@ class Projector(SingleFaultDetector):
 
     U2 (n, n - 3) spans the space in which the body rate cancels, ``U2' H = 0``: the last columns of the orthogonal
     factor of the SVD or of the QR decomposition of H. ``e0 = U2 U2' z = G z`` is the least error that explains the
-    sample, g_k the columns of G. For every channel (section 2):
+    sample, g_k the columns of G. For every channel (section 2) ``kappa_k = g_k' e0 / |g_k|^2`` is its error were it
+    alone at fault, rad/s, and ``J(k) = |g_k kappa_k - e0|^2`` what that leaves, (rad/s)^2: the failed channel is the
+    argmin. With ``norm="l1"`` it has the largest ``|e_k|`` of the error e of least 1-norm with ``U2' e = U2' z``, found
+    by trying every set of n - 3 channels.
 
-    - ``kappa_k = g_k' e0 / |g_k|^2``: its error were it alone at fault, rad/s;
-    - ``J(k) = |g_k kappa_k - e0|^2``: what that leaves, (rad/s)^2. The failed channel is the argmin.
-
-    ``norm="l1"``: the error e of least 1-norm with ``U2' e = U2' z``. Such an e has at most n - 3 entries that are not
-    zero, so it is found exactly by trying every set of n - 3 channels; the failed channel has the largest ``|e_k|``.
-    kappa_k is then still the one above: the estimate were k alone at fault.
-
-    ``scores``: J(k), or ``|e_k|`` for `l1`. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
-    Threshold: the level that the largest of ``|kappa_k|`` / std over all channels exceeds with the false-alarm
-    probability asked for. With equal white noise kappa_k over its deviation is w_k and the argmin of J the argmax of
-    ``|w_k|``: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper
-    bound.
-
-    Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
-    channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity
-    direction lies within the hull of the others', however large its fault, but another: both are suspects then and
-    neither is isolated. On symmetric axes there is none such, on arbitrary ones often. Its cost grows as the number
-    of sets of n - 3 channels: 20 at n = 6, 84 at n = 9, 220 at 12.
-
-    With 4 channels it detects and isolates nothing.
+    ``scores``: J(k), or ``|e_k|``. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
+    Threshold: the level that the largest of these over all channels exceeds with the false-alarm probability asked for;
+    an upper bound for `l1`, or unequal noise. docs/methods.md has when to take it.
 
     Parameters
     ----------
@@ -172,10 +158,7 @@ class Projector(SingleFaultDetector):
 def parity_basis(axes: Array, construction: str) -> Array:
     """U2 (n, n - 3): orthonormal columns with ``U2' axes = 0``, from the SVD or the QR decomposition of axes (n, 3).
 
-    Raises
-    ------
-    ConfigError
-        If there is no such construction.
+    `ConfigError` if there is no such construction.
     """
     if construction not in CONSTRUCTIONS:
         raise ConfigError(f"construction is {construction!r}, expected one of: {', '.join(CONSTRUCTIONS)}")
@@ -255,29 +238,16 @@ def judge_innovations(params: Innovations, state: NoState, sample: SampleInput, 
 class Recursive(SingleFaultDetector):
     """The channel whose equation, taken last, breaks a recursion that went well until then.
 
-    The equations ``z_i = a_i x`` are solved one by one (section 3):
-    ``x+ = x + P a' Y (z - a x)``, ``Y = (sigma^2 + a P a')^-1``, ``P+ = P - P a' Y a P``. Those that find the rate
-    (three, with axes that span space) have no innovation; each other gives ``k_s = nu^2 Y``, chi-square with one
-    degree of freedom while the model holds. This is done for all n cyclic permutations of the equations. The ratio
-    of the last two k_s of a permutation is largest when the failed channel comes last.
+    The equations ``z_i = a_i x`` are solved one by one (section 3): ``x+ = x + P a' Y (z - a x)``, ``Y = (sigma^2 + a P
+    a')^-1``, ``P+ = P - P a' Y a P``, for all n cyclic permutations. Those that find the rate have no innovation; each
+    other gives ``k_s = nu^2 Y``, chi-square with one degree of freedom while the model holds. The ratio of the last two
+    k_s of a permutation is largest when the failed channel comes last. Innovations are fixed linear forms of z,
+    precomputed with the resting noise of each channel.
 
-    Innovations are fixed linear forms of z: those of all permutations are precomputed, with sigma_i the resting noise
-    of each channel.
-
-    ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last. The channel
-    named has the largest.
-
-    Statistic: the largest k_s of all equations and permutations. Threshold k_s,max: the level that it exceeds with
-    the false-alarm probability asked for, exact for constant noise: the innovations are normal with known correlation.
-    Where the noise depends on rate or acceleration, nu^2 is divided by its variance in that sample.
-
-    Assumes one fault at a time. Good: one equation at a time is how a filter takes them; it names the channel of a
-    large fault on any axes. With five channels the last two k_s add up to the whole parity vector, and it names what
-    `projector` names. Bad: with more, the ratio divides by a figure that noise alone makes large or small: a fault
-    of 8 sigma on the two-triad cone is named correctly in 84 % of samples, by `projector` in 98 %.
-
-    With 4 channels there is one innovation a permutation and no ratio: it detects, isolates nothing, and the scores
-    are NaN.
+    ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last; NaN with 4
+    channels. Statistic: the largest k_s of all equations and permutations. Threshold k_s,max: the level that it exceeds
+    with the false-alarm probability asked for, exact for constant noise. Where the noise depends on rate or
+    acceleration, nu^2 is divided by its variance in that sample. docs/methods.md has when to take it.
 
     Parameters
     ----------
@@ -315,18 +285,9 @@ class Recursive(SingleFaultDetector):
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:
-    """Innovations over their standard deviation as linear forms of z.
+    """Innovations over their standard deviation as linear forms of z, (n - 3, n, n); axes (n, 3), noise_std (n,).
 
-    Parameters
-    ----------
-    axes
-        Sensitivity axes, (n, 3).
-    noise_std
-        Standard deviation of each channel, (n,) rad/s.
-
-    Returns
-    -------
-    Forms (n - 3, n, n): ``[k, i]`` is the k-th innovation of the permutation that puts channel i last.
+    ``[k, i]`` is the k-th innovation of the permutation that puts channel i last.
     """
     n = len(axes)
     forms = np.zeros((n - 3, n, n))
@@ -448,26 +409,14 @@ def largest_root(powers: Four, poles: Four) -> float:
 class Determinant(SingleFaultDetector):
     """Five channels: the one without which axes and sample are consistent.
 
-    Form ``[H z]`` (5, 4) and strike row j (section 4): ``d_j = |det|``. Without noise d_j is zero for the failed
-    channel and only there; with noise the failed channel is the argmin. The determinant is linear in z, its
-    coefficients are the cofactors of H, precomputed. In terms of parity d_j is the residual of the one equation left
-    without row j, times a factor that does not depend on z.
-
-    ``criterion="condition_number"``: the failed channel has the largest condition number (2-norm) of the four by four
-    matrix. H is fixed and only its last column changes: the extreme singular values are roots of a secular equation
-    of rank one, found by Newton's method.
+    Form ``[H z]`` (5, 4) and strike row j (section 4): ``d_j = |det|``, linear in z with the cofactors of H. Without
+    noise d_j is zero for the failed channel and only there; with noise the failed channel is the argmin. With
+    ``criterion="condition_number"`` it has the largest condition number (2-norm) of the four by four matrix: H is fixed
+    and only its last column changes, so the extreme singular values are roots of a secular equation of rank one, found
+    by Newton's method. docs/methods.md has when to take it.
 
     ``scores``: d_j, rad/s, or the condition numbers. Statistic, for both: the largest d_j over its standard deviation.
-    Without a fault all five are noise; a fault leaves only its own so. Threshold: the level that the statistic exceeds
-    with the false-alarm probability asked for; exact for constant noise.
-
-    Assumes one fault at a time, five channels. Good: cheap, and as sure as `projector` on symmetric axes. Bad: d_j is
-    not scaled by how well a fault of channel j is seen; on lopsided axes badly seen channels are preferred. The
-    condition number is wrong where the fault outweighs the body rate: at rest the matrix that holds the fault is the
-    worse conditioned one. It serves in motion, or not at all; and it costs about nine times as much.
-
-    With 4 channels, after an isolation, striking a row leaves nothing to compare: it is refused, as is every other
-    number.
+    Threshold: the level that it exceeds with the false-alarm probability asked for; exact for constant noise.
 
     Parameters
     ----------

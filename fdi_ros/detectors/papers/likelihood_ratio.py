@@ -77,25 +77,10 @@ class Scratch:
 
 
 def prepare_hypotheses(params: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:
-    """Fill a record of `Hypotheses`.
+    """Fill a record of `Hypotheses`, noise with one value per channel.
 
-    Parameters
-    ----------
-    params
-        The record.
-    geometry
-        Sensitivity axes.
-    noise
-        Error model, one value per channel.
-    confidence
-        With which rivals are rejected, above 0.5 and below 1.
-    fixed
-        Whether the weights are those of noise_std in every sample.
-
-    Raises
-    ------
-    ConfigError
-        If the confidence is out of its range.
+    ``confidence``: with which rivals are rejected, above 0.5 and below 1 (else `ConfigError`). ``fixed``: the weights
+    are those of noise_std in every sample.
     """
     if not 0.5 < confidence < 1:
         raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
@@ -414,29 +399,19 @@ def judge(params: Constants, room: Scratch, sample: SampleInput, verdict: Sample
 class LikelihoodRatio(Detector):
     r"""Largest whitened residual, with an exact false-alarm probability, and the channels that explain it.
 
-    Under "channel i is off by an unknown amount" the logarithm of the likelihood rises by ``w_i^2 / 2``, with
-    ``w_i = (z_i - h_i omega_i) / std``: omega_i the weighted least-squares rate of the other channels, std the
-    standard deviation of the difference. With constant noise of equal size ``w_i = r_i / (sigma sqrt(S_ii))``.
-    The statistic is ``max_i |w_i|``; its threshold is exact for correlated w_i (`max_normal_threshold`), at the
-    weights of noise_std alone. On alarm `explain` says which channels may be faulty: one, its rivals, or pairs.
-
-    Noise that depends on rate and acceleration: the variances for channel i are taken at the rate which the
-    other channels give (least squares), so a fault never hides itself by inflating the rate: w_i grows in
-    proportion to it. It does inflate the variances of the other channels' statistics, which favours the true one.
-
-    Good at: steps in one sample, any axes, unequal and rate-dependent noise. Bad at: slow drift below the
-    threshold (see `cusum`); a wrong noise_std (20 % too small turns 1e-3 into 1e-2).
+    Under "channel i is off by an unknown amount" the logarithm of the likelihood rises by ``w_i^2 / 2``, with ``w_i =
+    (z_i - h_i omega_i) / std``: omega_i the weighted least-squares rate of the other channels, std the standard
+    deviation of the difference. With constant noise of equal size ``w_i = r_i / (sigma sqrt(S_ii))``. The statistic is
+    ``max_i |w_i|``; its threshold is exact for correlated w_i (`max_normal_threshold`), at the weights of noise_std
+    alone. On alarm `explain` says which channels may be faulty: one, its rivals, or pairs. docs/methods.md has the
+    rest, and when to take it.
 
     Parameters
     ----------
     geometry, noise
         As of every `Detector`.
-    false_alarm_probability
-        Per sample, 0 to 1; default 1e-6.
-    false_alarms_per_hour
-        The other way to give it, with `sample_rate`.
-    sample_rate
-        Hz.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        Per sample, 0 to 1, or per hour at a sample rate in Hz; default 1e-6 per sample.
     confidence
         With which rivals are rejected, above 0.5 and below 1.
 

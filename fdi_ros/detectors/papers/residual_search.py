@@ -65,25 +65,11 @@ class ResidualSearch(SingleFaultDetector):
     - ``rate_deviation``, eqs. (12)-(16): mean over j and x, y, z of ``(G_i z - G_ij z)^2``; least.
     - ``max_residual``, eqs. (17)-(19): ``|z_i - z_ip|``, ``z_ip = h_i G_i z``; greatest.
 
-    ``scores`` are these figures, rad/s or its square. Each is a sum of absolute values or of squares of fixed linear
-    forms of z: nothing is inverted or projected per sample. A channel j that nothing predicts once i is left out
-    is no evidence about i and is left out of the mean.
-
-    Tolerance of the worst channel:
-
-    - ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s, threshold ``3 sqrt(sigma_0^2 + sigma_k^2 z_ip^2)``. It
-      leaves out the error of the prediction itself, and is exceeded by 14-18 % of healthy samples on the paper's axes.
-    - ``calibrated``: statistic ``|z_i - z_ip|`` over its standard deviation, prediction included; threshold that the
-      largest of them over all channels exceeds with the false-alarm probability asked for.
-
-    Assumes one fault at a time and normal errors (`calibrated`). Good: simple, every figure in rad/s; on symmetric
-    axes the four name the same channel, the most likely one. Bad: on arbitrary axes `max_residual` never names a
-    channel k for which another i has ``|S_ik| > S_ii``, however large the fault, but i: then both are suspects and
-    neither is isolated. The other three come close to the most likely channel. There the worst channel need not have
-    the largest normalised residual, so that false alarms are fewer than asked for.
-
-    With 4 channels there is one parity equation: it is detected that something is wrong, not where. The first three
-    scores do not exist there and are NaN.
+    ``scores`` are these figures, rad/s or its square; with 4 channels the first three do not exist and are NaN.
+    Tolerance ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s of the worst channel, threshold ``3 sqrt(sigma_0^2 +
+    sigma_k^2 z_ip^2)``. ``calibrated``: that statistic over its standard deviation, prediction included; threshold that
+    the largest of them over all channels exceeds with the false-alarm probability asked for. docs/methods.md has when
+    to take which.
 
     Parameters
     ----------
@@ -187,10 +173,8 @@ class MaxResidual(ResidualSearch):
 def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:
     """For each channel i whose faults are seen, the prediction errors among the others.
 
-    Returns
-    -------
-    List of i, forms (k, n) ``z_j - h_j G_ij z`` of the k channels j that the remaining ones predict, and the columns
-    j of G_i (3, k).
+    List of i, forms (k, n) ``z_j - h_j G_ij z`` of the k channels j that the remaining ones predict, and the columns j
+    of G_i (3, k).
     """
     found: list[tuple[int, Array, Array]] = []
     for i in map(int, np.flatnonzero(geometry.detectable)):
