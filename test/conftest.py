@@ -9,12 +9,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 import pytest
-from commands import Refused, Run, Said
+from commands import Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
@@ -22,7 +20,7 @@ LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
-def take_domain() -> tuple[str, IO[str]]:
+def take_domain():
     """Take a ROS domain that no other run of the tests on this machine has, until the lock is closed."""
     # Domains above 101 collide with the ports that Linux gives to other programs.
     for k in range(100):
@@ -52,18 +50,18 @@ settings.register_profile("suite", deadline=None, derandomize=True)
 settings.load_profile("suite")
 
 
-def pytest_unconfigure() -> None:
+def pytest_unconfigure():
     """Leave no logs behind."""
     shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Begin with what takes longest, so that at the end no process is left alone with it."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture
-def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def quiet_domain(monkeypatch):
     """Give the processes that a test starts a ROS domain in which nobody else speaks."""
     domain, lock = take_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
@@ -72,7 +70,7 @@ def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+def compiled(tmp_path_factory):
     """All compiled code is there: no process that a test starts has to wait for it, or says that it compiles."""
     # Once in all the processes of a run: they share the folder above their own.
     shared = tmp_path_factory.getbasetemp()
@@ -87,13 +85,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(scope="session")
-def root() -> Path:
+def root():
     """Folder of the package's sources."""
     return ROOT
 
 
 @pytest.fixture(scope="session")
-def recording() -> Path:
+def recording():
     """Rosbag2 folder of three real IMUs."""
     if not RECORDING.exists():
         pytest.skip(f"the recording of three real IMUs is not here: {RECORDING}")
@@ -101,27 +99,27 @@ def recording() -> Path:
 
 
 @pytest.fixture(scope="session")
-def flight() -> Path:
+def flight():
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"
 
 
 @pytest.fixture
-def fdi(capsys: pytest.CaptureFixture[str]) -> Run:
+def fdi(capsys):
     """Run a command of `fdi` in this process."""
     from fdi_ros.cli.command_line import main
 
-    def run(*words: object) -> Said:
+    def run(*words):
         return Said(main([str(word) for word in words]), *capsys.readouterr())
 
     return run
 
 
 @pytest.fixture
-def refused(fdi: Run) -> Refused:
+def refused(fdi):
     """Run a command of `fdi` that is refused: the one line that it says."""
 
-    def run(*words: object) -> str:
+    def run(*words):
         code, out, err = fdi(*words)
         assert (code, out) == (2, "")
         assert err.startswith("fdi: ")

@@ -3,8 +3,6 @@
 
 """The package as a user of Python or of a notebook meets it."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -27,27 +25,27 @@ FAULT = "channel=imu_2.y kind=bias size=0.15 start=28"
 
 
 @pytest.fixture(scope="module")
-def config() -> fdi_ros.Config:
+def config():
     return fdi_ros.Config.from_file(Path(__file__).parents[1] / "config" / "two_imus.yaml")
 
 
-def cells(table: str) -> list[str]:
+def cells(table):
     """Texts of the cells of a table; every tag has to be closed."""
     return [one.text or "" for one in ElementTree.fromstring(table).iter() if one.tag in ("td", "th")]
 
 
 @given(st.lists(st.lists(st.text(max_size=20), min_size=2, max_size=2), max_size=3))
-def test_a_table_shows_any_text_as_it_is(rows: list[list[str]]) -> None:
+def test_a_table_shows_any_text_as_it_is(rows):
     said = cells(html_table("a < b", ("one", "two"), rows))
     assert said == ["one", "two", *(shown(text) for row in rows for text in row)]
 
 
-def test_dir_shows_what_there_is() -> None:
+def test_dir_shows_what_there_is():
     assert {"Config", "Event", "Geometry", "Output", "Pipeline", "read", "replay"} <= set(dir(fdi_ros))
     assert all(getattr(fdi_ros, name) is not None for name in dir(fdi_ros))
 
 
-def test_a_recording_is_read_in_blocks(flight: Path, config: fdi_ros.Config) -> None:
+def test_a_recording_is_read_in_blocks(flight, config):
     whole = read_block(flight, config, 1.0, 9.0)
     blocks = joined(list(fdi_ros.read(flight, config, 1.0, 9.0)))
     np.testing.assert_array_equal(blocks.stamp, whole.stamp)
@@ -58,7 +56,7 @@ def test_a_recording_is_read_in_blocks(flight: Path, config: fdi_ros.Config) -> 
         fdi_ros.read("nowhere")
 
 
-def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config, root: Path) -> None:
+def test_a_replay_says_what_the_verb_says(flight, config, root):
     fault = {"channel": "imu_2.y", "kind": "bias", "size": 0.15, "start": 28}
     same = run_replay(Request(flight, config, (parse_fault(FAULT),), end=31.0)).scores
     assert same.isolated == 1
@@ -71,12 +69,12 @@ def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config, 
         fdi_ros.replay(flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}])
 
 
-def test_without_settings_units_that_are_turned_are_refused(flight: Path) -> None:
+def test_without_settings_units_that_are_turned_are_refused(flight):
     with pytest.raises(fdi_ros.FdiError, match=r"imu_2 is turned by 109 deg against imu_1.*fdi setup"):
         fdi_ros.replay(flight)
 
 
-def test_the_bundled_crash_needs_no_settings(root: Path) -> None:
+def test_the_bundled_crash_needs_no_settings(root):
     result = fdi_ros.replay(root / "bags" / "copter_crash.tlog")
     [fault] = result.story.declared
     assert fault.channels == ("imu_0.x",)
@@ -88,12 +86,12 @@ def test_the_bundled_crash_needs_no_settings(root: Path) -> None:
     assert 0.0 <= (named.index[0] - onset).total_seconds() < 0.2
 
 
-def test_times_that_are_no_dates_count_from_the_start() -> None:
+def test_times_that_are_no_dates_count_from_the_start():
     assert time_index([5 * 10**9])[0] == pandas.Timedelta(5, "s")
     assert time_index([]).tz is not None
 
 
-def test_things_say_what_they_are(flight: Path, config: fdi_ros.Config) -> None:
+def test_things_say_what_they_are(flight, config):
     pipeline = fdi_ros.Pipeline(config)
     block = fdi_ros.read(flight, config, end=10.0)
     outputs = [pipeline.process(one) for one in block]
@@ -118,7 +116,7 @@ def test_things_say_what_they_are(flight: Path, config: fdi_ros.Config) -> None:
         assert any(words in cell for cell in cells(one._repr_html_())), one
 
 
-def test_an_output_becomes_a_table(flight: Path, config: fdi_ros.Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_becomes_a_table(flight, config, monkeypatch):
     pipeline = fdi_ros.Pipeline(config)
     output = pipeline.process(read_block(flight, config, 0.0, 5.0))
     table = output.to_pandas()

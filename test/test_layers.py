@@ -7,7 +7,6 @@ import ast
 import graphlib
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -59,7 +58,7 @@ ASKED_FOR = {"monitor.output": ("pandas",)}
 NUMPY_ALONE = {"model", "compiling", "core", "estimator", "detectors", "sources", "monitor", "errors"}
 
 
-def imports(tree: ast.Module) -> Iterator[str]:
+def imports(tree):
     """Full names of all modules that a module imports, wherever it does."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -72,12 +71,12 @@ def imports(tree: ast.Module) -> Iterator[str]:
 
 
 @cache
-def imported(path: Path) -> tuple[str, ...]:
+def imported(path):
     """Full names of all modules that a file imports."""
     return tuple(imports(ast.parse(path.read_text())))
 
 
-def violations(module: str, names: Iterable[str]) -> list[str]:
+def violations(module, names):
     """What a module, named without the package, may not import of these."""
     part, found = module.partition(".")[0], []
     for name in names:
@@ -98,20 +97,20 @@ def violations(module: str, names: Iterable[str]) -> list[str]:
     return sorted(set(found))
 
 
-def modules() -> dict[str, Path]:
+def modules():
     """Module names and files, the package's own front left out."""
     files = (path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
     return {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in files}
 
 
-def test_no_import_points_up() -> None:
+def test_no_import_points_up():
     known = modules()
     assert {module.split(".")[1] for module in known} - LEVEL.keys() == set(), "they have no place in the layers"
     found = {module: violations(module.partition(".")[2], imported(path)) for module, path in known.items()}
     assert {module: told for module, told in found.items() if told} == {}
 
 
-def test_no_import_goes_in_a_circle() -> None:
+def test_no_import_goes_in_a_circle():
     known = modules()
     graph = {
         module: {
@@ -138,11 +137,11 @@ def test_no_import_goes_in_a_circle() -> None:
         ("core.path", "from numba import njit", "only compiling knows the compiler"),
     ],
 )
-def test_an_import_that_breaks_the_layers_is_found(part: str, line: str, words: str) -> None:
+def test_an_import_that_breaks_the_layers_is_found(part, line, words):
     assert any(words in violation for violation in violations(part, imports(ast.parse(line))))
 
 
-def test_the_core_imports_without_ros_and_bag_libraries() -> None:
+def test_the_core_imports_without_ros_and_bag_libraries():
     """In a fresh interpreter, so that nothing loaded before hides a missing library; and only what is used."""
     code = (
         "import sys, fdi_ros; dir(fdi_ros); assert 'numpy' not in sys.modules;"
@@ -160,7 +159,7 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
 OFFLINE = {"bag", "replay", "experiments", "report", "setup"}
 
 
-def test_a_live_node_imports_nothing_that_is_for_offline_use() -> None:
+def test_a_live_node_imports_nothing_that_is_for_offline_use():
     """All that it has imported when it has been configured and activated."""
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     code = """

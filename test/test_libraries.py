@@ -3,15 +3,11 @@
 
 """What an installation needs: a live node what a distribution has, everything else asked for by one line."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numba
@@ -27,12 +23,12 @@ WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(installation
 """As if some libraries were not installed; where they are not, this changes nothing."""
 
 
-def python(code: str, *words: object) -> subprocess.CompletedProcess[str]:
+def python(code, *words):
     command = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_a_build_farm_has_all_that_the_manifest_names(root: Path) -> None:
+def test_a_build_farm_has_all_that_the_manifest_names(root):
     known = yaml.safe_load((root / "test" / "rosdep_keys.yaml").read_text())
     assert not any(key.endswith("-pip") for key in known["rosdep"])
     elements = ElementTree.parse(root / "package.xml").getroot()
@@ -41,7 +37,7 @@ def test_a_build_farm_has_all_that_the_manifest_names(root: Path) -> None:
     assert named <= {*known["rosdep"], *known["jazzy"]}
 
 
-def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(root: Path) -> None:
+def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(root):
     known = yaml.safe_load((root / "test" / "rosdep_keys.yaml").read_text())["rosdep"]
     asked = dict(
         re.findall(
@@ -57,19 +53,19 @@ def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(ro
     assert set(tested) == {"numpy", "numba", "PyYAML"}
 
 
-def test_numba_is_bounded_by_the_version_that_is_tested_here(root: Path) -> None:
+def test_numba_is_bounded_by_the_version_that_is_tested_here(root):
     """How results are kept rests on names of its own that a next version may change."""
     (bound,) = re.findall(r'"numba>=[0-9.]+,<([0-9.]+)"', (root / "setup.py").read_text())
     assert tuple(map(int, numba.__version__.split(".")[:2])) < tuple(map(int, bound.split(".")))
 
 
-def test_libraries_named_as_required_are_those_of_setup_py(root: Path) -> None:
+def test_libraries_named_as_required_are_those_of_setup_py(root):
     (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
     names = set(re.findall(r'"(\w+)>=', required))
     assert names == {*installation.REQUIRED, "numpy", "numba", "PyYAML"}
 
 
-def run_on_import(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+def run_on_import(body):
     """What is no function, of a module or a class in it, nor needed for types only."""
     for node in body:
         if isinstance(node, ast.ClassDef):
@@ -78,7 +74,7 @@ def run_on_import(body: list[ast.stmt]) -> Iterator[ast.stmt]:
             yield node
 
 
-def imported_on_the_way(path: Path, function: str) -> set[str]:
+def imported_on_the_way(path, function):
     """Modules that a function imports, or one of its module that it uses."""
     functions = {node.name: node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
     waiting, used, found = [function], set(), set()
@@ -92,7 +88,7 @@ def imported_on_the_way(path: Path, function: str) -> set[str]:
     return found
 
 
-def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> None:
+def test_every_verb_names_the_libraries_that_its_modules_import(root):
     """All that is imported on the way, not within functions of other modules: those ask for themselves."""
     outside = {*installation.REQUIRED, "scipy", "pyarrow"}
     sources = {
@@ -101,10 +97,10 @@ def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> N
     }
 
     @functools.cache
-    def imported(module: str) -> frozenset[str]:
+    def imported(module):
         return frozenset(imports(ast.Module(list(run_on_import(ast.parse(sources[module].read_text()).body)), [])))
 
-    def needed(module: str, seen: set[str]) -> set[str]:
+    def needed(module, seen):
         seen.add(module)
         mine = {name.partition(".")[0] for name in imported(module)} & outside
         for name in imported(module):
@@ -132,7 +128,7 @@ for words, lacking in eval(sys.argv[1]):
 """
 
 
-def test_without_a_library_a_verb_says_what_brings_it(tmp_path: Path) -> None:
+def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     """Also as after `make demo`, which installs no more than it needs."""
     config, out = ["--config", PACKAGE.parent / "config" / "two_imus.yaml"], ["--output", tmp_path / "out"]
     more = {"replay": config, "sweep": config, "calibrate": [*config, *out], "convert": out, "setup": out}
@@ -156,7 +152,7 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path: Path) -> None:
     ]
 
 
-def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:
+def test_without_what_reads_recordings_the_player_says_what_brings_it():
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     done = python(WITHOUT_BAGS + "from fdi_ros.ros.process import run; sys.exit(run('player_node', []))")
     assert done.returncode == 2
@@ -164,7 +160,7 @@ def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:
     assert done.stderr == f"player_node: {words}\n"
 
 
-def test_the_command_is_one_that_pip_obeys_here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_command_is_one_that_pip_obeys_here(monkeypatch, tmp_path):
     """The Python of Debian and Ubuntu refuses a plain pip install outside of an environment (PEP 668)."""
     (tmp_path / "EXTERNALLY-MANAGED").write_text("")
     monkeypatch.setattr(installation.sysconfig, "get_path", lambda name: str(tmp_path))

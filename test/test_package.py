@@ -3,8 +3,6 @@
 
 """The package as a ROS workspace and the Dockerfile build it: installed where ros2 run and ros2 launch look."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import json
@@ -14,9 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -37,29 +33,29 @@ INIT = ["tini", "--", "/ros_entrypoint.sh"]
 """Of the entry of the image."""
 
 
-def steps(root: Path) -> list[tuple[str, str]]:
+def steps(root):
     """Instructions of the Dockerfile and what they are given."""
     text = re.sub(r"\\\n\s*", "", re.sub(r"^#.*\n", "", (root / "Dockerfile").read_text(), flags=re.MULTILINE))
     return [(word, rest) for word, _, rest in (line.partition(" ") for line in text.splitlines()) if word]
 
 
-def run(command: list[str] | str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+def run(command, folder, **options):
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False, **options)
     assert done.returncode == 0, (command, done.stdout, done.stderr)
     return done
 
 
-def colcon() -> str:
+def colcon():
     return shutil.which("colcon") or f"{Path(sys.executable).parent}/colcon"
 
 
-def with_compiled(command: str, root: Path) -> str:
+def with_compiled(command, root):
     """Have the programs that were installed run the modules of the clone, where all is compiled: it takes minutes."""
     return re.sub(r"(\. install/local_setup\.(ba)?sh)", rf"\1 && export PYTHONPATH={root}:$PYTHONPATH", command)
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def workspace(tmp_path_factory):
     """The workspace as the RUN instructions of the Dockerfile leave it, from the build on; no image is built."""
     root, place = Path(__file__).parents[1], tmp_path_factory.mktemp("fdi_ws")
     (place / "src").mkdir()
@@ -75,12 +71,12 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def install(workspace: Path) -> Path:
+def install(workspace):
     """Install space of the package."""
     return workspace / "install" / "fdi_ros"
 
 
-def test_every_executable_has_something_to_run(install: Path) -> None:
+def test_every_executable_has_something_to_run(install):
     names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
     assert {"fdi", "fdi_node"} <= names
     (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
@@ -92,7 +88,7 @@ def test_every_executable_has_something_to_run(install: Path) -> None:
         assert callable(getattr(importlib.import_module(module), function))
 
 
-def test_the_index_the_manifest_and_all_settings_are_installed(root: Path, install: Path) -> None:
+def test_the_index_the_manifest_and_all_settings_are_installed(root, install):
     share = install / "share"
     assert (share / "ament_index/resource_index/packages/fdi_ros").exists()
     assert (share / "fdi_ros/package.xml").exists()
@@ -102,7 +98,7 @@ def test_the_index_the_manifest_and_all_settings_are_installed(root: Path, insta
         assert sources <= {path.relative_to(installed) for path in installed.rglob(pattern)}
 
 
-def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install: Path, tmp_path: Path) -> None:
+def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install, tmp_path):
     setup, fdi = install.parent / "local_setup.bash", install / "lib" / "fdi_ros" / "fdi"
     script = f". {setup} && {fdi} shipped two_imus.yaml && exec {fdi} geometry config/two_imus.yaml"
     done = run(["bash", "-c", script], tmp_path)
@@ -111,7 +107,7 @@ def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install:
     assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
 
 
-def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root: Path, tmp_path: Path) -> None:
+def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root, tmp_path):
     """The clone's folder has the package's name: a folder on the path must not come before the install."""
     clone = tmp_path / "fdi_ros"
     clone.mkdir()
@@ -129,13 +125,13 @@ def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root: Path, 
     assert told.stdout.split() == [fdi_ros.__version__, str(clone / "fdi_ros" / "__init__.py")]
 
 
-def test_one_version_everywhere(root: Path) -> None:
+def test_one_version_everywhere(root):
     manifest = ElementTree.parse(root / "package.xml").getroot()
     assert manifest.findtext("version") == fdi_ros.__version__
     assert f'version="{fdi_ros.__version__}"' in (root / "setup.py").read_text()
 
 
-def test_the_changelog_is_one_that_bloom_reads(root: Path) -> None:
+def test_the_changelog_is_one_that_bloom_reads(root):
     """REP-132; what is not released yet stands under Forthcoming, which the release replaces by version and date."""
     catkin = pytest.importorskip("catkin_pkg.changelog")
     text = (root / "CHANGELOG.rst").read_text()
@@ -147,11 +143,11 @@ def test_the_changelog_is_one_that_bloom_reads(root: Path) -> None:
     assert changelog.get_content_of_version(fdi_ros.__version__)
 
 
-def test_every_source_file_has_copyright_and_licence(root: Path) -> None:
+def test_every_source_file_has_copyright_and_licence(root):
     assert run([sys.executable, "tools/license_headers.py", "--check"], root).stdout == ""
 
 
-def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
+def test_the_manifest_names_every_ros_package_in_use(root):
     manifest = ElementTree.parse(root / "package.xml").getroot()
     named = {str(element.text) for element in manifest.iter("exec_depend")}
     used = {
@@ -163,14 +159,14 @@ def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
     assert used <= named
 
 
-def test_make_help_lists_every_target(root: Path) -> None:
+def test_make_help_lists_every_target(root):
     said = run(["make", "-s", "help"], root)
     (targets,) = re.findall(r"^\.PHONY: (.*)$", (root / "Makefile").read_text(), flags=re.MULTILINE)
     listed = [re.fullmatch(r"make (\w+) +\S.*", line) for line in said.stdout.splitlines()]
     assert sorted(match[1] for match in listed if match) == sorted(targets.split())
 
 
-def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root: Path) -> None:
+def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root):
     order = steps(root)
     assert order[0] == ("FROM", "ros:jazzy-ros-base")
     runs = [rest for word, rest in order if word == "RUN"]
@@ -189,9 +185,7 @@ def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root: Pat
     assert {".git", "**/__pycache__", ".venv*"} <= set(ignored)
 
 
-def test_the_steps_build_it_and_a_user_runs_it_without_compiling(
-    workspace: Path, root: Path, quiet_domain: None
-) -> None:
+def test_the_steps_build_it_and_a_user_runs_it_without_compiling(workspace, root, quiet_domain):
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     if os.geteuid() != 0 or not shutil.which("setpriv"):
         pytest.skip("only root can start it as another user")

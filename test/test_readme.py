@@ -30,7 +30,7 @@ ELSEWHERE = ("fdi montecarlo", "fdi compile", "fdi watch")
 QUICK = [command for command in dict.fromkeys(COMMANDS) if not command.startswith(ELSEWHERE)]
 
 
-def python_of(page: Path) -> str:
+def python_of(page):
     """All Python of a page, one block after the other."""
     pattern = r"^```python\n([\s\S]*?)^```$|^\.\. code-block:: python\n\n((?:    .*\n|\n)+)"
     return "\n".join(
@@ -38,7 +38,7 @@ def python_of(page: Path) -> str:
     )
 
 
-def resolved(name: str) -> bool:
+def resolved(name):
     """Whether there is a module, or an attribute of one, of this name."""
     try:
         pkgutil.resolve_name(name)
@@ -55,9 +55,7 @@ PAGES_WITH_PYTHON = [
 
 
 @pytest.mark.parametrize("command", QUICK)
-def test_every_offline_command_runs(
-    command: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_every_offline_command_runs(command, root, tmp_path, monkeypatch, capfd):
     for folder in ("bags", "config"):
         (tmp_path / folder).symlink_to(root / folder)
     monkeypatch.chdir(tmp_path)
@@ -70,14 +68,14 @@ def test_every_offline_command_runs(
         assert (tmp_path / "out.json").stat().st_size > 0
 
 
-def test_every_verb_is_shown_with_files_that_are_there(root: Path) -> None:
+def test_every_verb_is_shown_with_files_that_are_there(root):
     assert {command.split()[1] for command in COMMANDS} == set(VERBS)
     named = {word for command in COMMANDS for word in command.split() if word.startswith(("bags/", "config/"))}
     assert [word for word in named if not (root / word).exists()] == []
 
 
 @pytest.mark.parametrize("page", PAGES_WITH_PYTHON, ids=lambda page: page.name)
-def test_the_python_of_a_page_runs(page: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_a_page_runs(page, root, monkeypatch):
     monkeypatch.chdir(root)
     rng = np.random.default_rng(3)
     names = {"stamp": 10**16 + 10**7 * np.arange(600), "z": rng.normal(0.0, 0.0025, (600, 6))}
@@ -88,26 +86,26 @@ def test_the_python_of_a_page_runs(page: Path, root: Path, monkeypatch: pytest.M
     assert "table" not in names or str(names["table"].index.tz) == "UTC"
 
 
-def test_every_name_of_the_package_in_a_page_is_there() -> None:
+def test_every_name_of_the_package_in_a_page_is_there():
     for page in (ROOT / "docs").rglob("*.[mr][ds]*"):
         for name in re.findall(r"[`( ](fdi_ros(?:\.[a-zA-Z_]+)+)", page.read_text()):
             assert resolved(name), f"{page.name}: {name}"
 
 
-def test_the_numbers_of_the_states_are_those_of_the_code() -> None:
+def test_the_numbers_of_the_states_are_those_of_the_code():
     stated = {name: int(number) for number, name in re.findall(r"(\d) ([A-Z]+)\b", GUIDES["docs/live.md"])}
     assert stated == {state.name: int(state) for state in ChannelState}
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "bags/README.md"])
-def test_every_link_leads_to_a_file(name: str, root: Path) -> None:
+def test_every_link_leads_to_a_file(name, root):
     """Those of the pages of the site are checked where it is built, anchors too: make docs."""
     links = [link for link in re.findall(r"\]\(([^)]+)\)", (root / name).read_text()) if "://" not in link]
     targets = [(root / name).parent / link.partition("#")[0] for link in links]
     assert [target for target in targets if not target.exists()] == []
 
 
-def test_the_notebook_runs_and_shows_what_it_says(root: Path, tmp_path: Path) -> None:
+def test_the_notebook_runs_and_shows_what_it_says(root, tmp_path):
     nbformat, nbclient = (
         pytest.importorskip(name, reason="nbclient is not installed") for name in ("nbformat", "nbclient")
     )
@@ -125,7 +123,7 @@ def test_the_notebook_runs_and_shows_what_it_says(root: Path, tmp_path: Path) ->
     assert any("image/png" in data for data in shown)
 
 
-def test_tables_that_follow_from_the_code_are_up_to_date(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_that_follow_from_the_code_are_up_to_date(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "docs"))
     reference = importlib.import_module("reference")
     for page in reference.PAGES:

@@ -3,8 +3,6 @@
 
 """Recordings of vehicles with units on random mounts, late stamps and biases that move, and the truth behind them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,12 +41,12 @@ class Vehicle:
     """(units,) by how much their stamps are late against those of the first, s."""
 
     @property
-    def nominal(self) -> Geometry:
+    def nominal(self):
         """Axes as configured."""
         return Geometry.from_triads(list(np.reshape(self.config.imus.mounts, (-1, 3, 3))))
 
 
-def turns_by_hand(begins: float) -> tuple[list[float], list[Array]]:
+def turns_by_hand(begins):
     """Knots of turns about every axis, back and forth, some 1 rad/s, with rests between."""
     time, rates = [begins], [np.zeros(3)]
     for axis in np.eye(3):
@@ -60,7 +58,7 @@ def turns_by_hand(begins: float) -> tuple[list[float], list[Array]]:
     return time, rates
 
 
-def flight(rng: Rng, begins: float, lasts: float, rate: float) -> tuple[list[float], list[Array]]:
+def flight(rng, begins, lasts, rate):
     """Knots of a flight: smooth steps between random rates of this size about every axis, 0.3 to 0.9 s each."""
     time, rates = [begins], [np.zeros(3)]
     while time[-1] < begins + lasts:
@@ -69,7 +67,7 @@ def flight(rng: Rng, begins: float, lasts: float, rate: float) -> tuple[list[flo
     return [*time, time[-1] + 0.5], [*rates, np.zeros(3)]
 
 
-def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) -> Vehicle:
+def vehicle(seed, kind, units=3, sample_rate=100.0):
     """Simulate a vehicle with units on random mounts.
 
     Parameters

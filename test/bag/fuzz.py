@@ -7,8 +7,6 @@ Each case is drawn from its number alone. A case passes if the verb ends by itse
 in one clear line, prints nothing that a terminal obeys, and leaves whole outputs or none.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import faulthandler
@@ -89,26 +87,26 @@ class Case(NamedTuple):
 class Draw(random.Random):
     """Choices of one case; some share of what it makes is odd."""
 
-    def __init__(self, seed: str) -> None:
+    def __init__(self, seed):
         super().__init__(seed)
         self.oddness = self.choice((0.0, 0.002, 0.02, 0.1))
 
-    def odd(self) -> bool:
+    def odd(self):
         return self.random() < self.oddness
 
-    def number(self, value: int, width: int = 8) -> int:
+    def number(self, value, width=8):
         return self.choice(NUMBERS) % 256**width if self.odd() else value
 
-    def pack(self, form: str, *values: int) -> bytes:
+    def pack(self, form, *values):
         widths = {"B": 1, "H": 2, "I": 4, "Q": 8}
         return struct.pack(f"<{form}", *(self.number(v, widths[c]) for c, v in zip(form, values, strict=True)))
 
-    def text(self, text: str) -> bytes:
+    def text(self, text):
         data = (self.choice(NAMES) if self.odd() else text).encode("utf-8", "surrogatepass")
         data += b"\xff\xfe" if self.odd() else b""
         return self.pack("I", len(data)) + data
 
-    def damaged(self, data: bytes) -> bytes:
+    def damaged(self, data):
         """Flip, cut, repeat or insert bytes; mostly nothing."""
         if self.random() > 3 * self.oddness + 0.03 or not data:
             return data
@@ -132,7 +130,7 @@ SOUND.oddness = 0.0
 # Recordings ----------------------------------------------------------------------------------------------------------
 
 
-def messages(draw: Draw) -> tuple[list[tuple[str, str]], list[tuple[int, int, bytes]]]:
+def messages(draw):
     """Topics (name, type), and messages (topic, time, bytes) in one of many patterns."""
     topics = [(name, IMU) for name in TOPICS]
     topics += [(draw.choice(NAMES), draw.choice((IMU, ARRAY, "std_msgs/msg/String", "")))] * (draw.random() < 0.4)
@@ -158,11 +156,11 @@ def messages(draw: Draw) -> tuple[list[tuple[str, str]], list[tuple[int, int, by
     return topics, found
 
 
-def record(draw: Draw, opcode: int, content: bytes) -> bytes:
+def record(draw, opcode, content):
     return draw.pack("BQ", opcode, len(content)) + content
 
 
-def mcap(draw: Draw) -> bytes:
+def mcap(draw):
     """An MCAP file of records, chunks and indexes, some of them odd."""
     topics, sent = messages(draw)
     about = b""
@@ -197,7 +195,7 @@ def mcap(draw: Draw) -> bytes:
     return draw.damaged(out)
 
 
-def chunk(draw: Draw, inside: bytes, kind: str, sent: list[tuple[int, int, bytes]], k: int) -> bytes:
+def chunk(draw, inside, kind, sent, k):
     packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(kind, bytes)(inside)
     start = sent[min(k, len(sent) - 1)][1] if sent else 0
     crc = zlib.crc32(inside) * draw.choice((0, 1))
@@ -205,7 +203,7 @@ def chunk(draw: Draw, inside: bytes, kind: str, sent: list[tuple[int, int, bytes
     return record(draw, 6, head + draw.damaged(packed))
 
 
-def database(draw: Draw, path: Path) -> None:
+def database(draw, path):
     """A rosbag2 database with odd tables and values."""
     topics, sent = messages(draw)
     base = sqlite3.connect(path)
@@ -242,7 +240,7 @@ def database(draw: Draw, path: Path) -> None:
         path.write_bytes(draw.damaged(path.read_bytes()))
 
 
-def recording(draw: Draw, folder: Path) -> Path:
+def recording(draw, folder):
     """A bare file, or a folder with metadata.yaml."""
     if draw.random() < 0.15:
         return flight_log(draw, folder / "bag")
@@ -268,7 +266,7 @@ def recording(draw: Draw, folder: Path) -> Path:
     return bag
 
 
-def flight_log(draw: Draw, stem: Path) -> Path:
+def flight_log(draw, stem):
     """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
     made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
     kind = draw.choice(
@@ -295,7 +293,7 @@ def flight_log(draw: Draw, stem: Path) -> Path:
     return path
 
 
-def table(draw: Draw, path: Path, made: list[logs.Unit]) -> Path:
+def table(draw, path, made):
     """A table of text, with odd names and cells, and now and then a file that says what they are."""
     names = ["t", *(f"imu_{k}.{axis}" for k in range(len(made)) for axis in "xyz")]
     about = {"time": "t", "time_unit": "s", "imus": [["imu_0.x", "imu_0.y", "imu_0.z"]] * draw.choice((1, 2, 900))}
@@ -311,7 +309,7 @@ def table(draw: Draw, path: Path, made: list[logs.Unit]) -> Path:
     return path
 
 
-def storage(draw: Draw, stem: Path) -> Path:
+def storage(draw, stem):
     if draw.random() < 0.3:
         path = stem.with_name(f"{stem.name}.db3")
         database(draw, path)
@@ -341,7 +339,7 @@ def storage(draw: Draw, stem: Path) -> Path:
 # Text ----------------------------------------------------------------------------------------------------------------
 
 
-def odd_yaml(draw: Draw, text: str) -> str:
+def odd_yaml(draw, text):
     """Put odd values in place of some of a YAML text."""
     lines = text.split("\n")
     for k, line in enumerate(lines):
@@ -356,7 +354,7 @@ def odd_yaml(draw: Draw, text: str) -> str:
     return "\n".join(lines)
 
 
-def parameters(draw: Draw) -> str:
+def parameters(draw):
     settings = dict(PARAMETERS)
     if draw is not SOUND and draw.random() < 0.2:
         settings = {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "two_triad_cone"}
@@ -366,7 +364,7 @@ def parameters(draw: Draw) -> str:
     return odd_yaml(draw, "\n".join(["/**:", "  ros__parameters:", *lines]))
 
 
-def words_of(draw: Draw, folder: Path) -> list[str]:
+def words_of(draw, folder):
     """Make the files of a case, and the command line that reads them."""
     verb = draw.choice(
         (*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, *["convert"] * 2, "geometry")
@@ -399,9 +397,9 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
     return words + replay_words(draw, folder)
 
 
-def replay_words(draw: Draw, folder: Path) -> list[str]:
+def replay_words(draw, folder):
     """Options of a replay."""
-    words: list[str] = []
+    words = []
     for option, name in (("--json", "s.json"), ("--csv", "s.csv"), ("--output", "bag")):
         words += [option, str(folder / "out" / name)] * (draw.random() < 0.3)
     if draw.random() < 0.2:
@@ -417,7 +415,7 @@ def replay_words(draw: Draw, folder: Path) -> list[str]:
 # Cases ---------------------------------------------------------------------------------------------------------------
 
 
-def run_case(number: int, seed: str = "fdi") -> Case:
+def run_case(number, seed="fdi"):
     """Make a case, run it, and look at what it leaves."""
     folder = Path(tempfile.mkdtemp(prefix="fdi_fuzz_"))
     try:
@@ -446,18 +444,18 @@ def run_case(number: int, seed: str = "fdi") -> Case:
         shutil.rmtree(folder)
 
 
-def inputs(folder: Path) -> dict[str, tuple[int, int]]:
+def inputs(folder):
     """Size and time of all files of a case, but for its outputs."""
     files = {path: path.lstat() for path in folder.rglob("*") if (folder / "out") not in (path, *path.parents)}
     return {str(path): (about.st_size, about.st_mtime_ns) for path, about in files.items()}
 
 
-def peak() -> int:
+def peak():
     """Memory of this process at its largest so far, bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def verb(words: list[str]) -> int:
+def verb(words):
     if words[0] != "study":
         return command_line.main(words)
     try:
@@ -468,7 +466,7 @@ def verb(words: list[str]) -> int:
     return 0
 
 
-def look(folder: Path, words: list[str], code: int, said: str, errors: str) -> str:
+def look(folder, words, code, said, errors):
     """What is wrong with what a case said and left; empty if nothing."""
     made = sorted(os.listdir(folder / "out"))
     shown = said + (errors if words[0] != "study" else "")
@@ -494,7 +492,7 @@ def look(folder: Path, words: list[str], code: int, said: str, errors: str) -> s
     return ""
 
 
-def main() -> int:
+def main():
     """Run many cases and report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)

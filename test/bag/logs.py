@@ -3,11 +3,8 @@
 
 """Flight logs for the tests: dataflash, ULog and telemetry logs of given rates, as their programs write them."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -56,7 +53,7 @@ def units(count=3, seconds=20.0, rate=100.0, seed=0, start=10.0, apart=0):
 # Dataflash -----------------------------------------------------------------------------------------------------------
 
 
-def record_type(form: str, columns: str) -> np.dtype:
+def record_type(form, columns):
     fields = [("head", "S2"), ("type", "u1"), *zip(columns.split(","), (FORMATS[c] for c in form), strict=True)]
     return np.dtype(fields)
 
@@ -82,12 +79,12 @@ SIZES = {"n": 4, "N": 16, "c": 2, "L": 4, "e": 4, "E": 4, "b": 1, "d": 8} | {
 }
 
 
-def format_record(number: int, name: str, form: str, columns: str) -> bytes:
+def format_record(number, name, form, columns):
     size = 3 + sum(SIZES[c] for c in form)
     return HEAD + struct.pack("<BBB4s16s64s", 128, number, size, name.encode(), form.encode(), columns.encode())
 
 
-def write_dataflash(path: Path, units, kind="IMU", gps=True, vehicle=b"ArduCopter V4.5.7", extra=b"") -> Path:
+def write_dataflash(path, units, kind="IMU", gps=True, vehicle=b"ArduCopter V4.5.7", extra=b""):
     """A log as ArduPilot writes it; kind IMU or GYR (with instances), or one of `INSTANCES`."""
     old = kind in ("TimeMS", "GYR1")
     described = {"PARM": MESSAGES["PARM"], "GPS": OLD_GPS if old else MESSAGES["GPS"], "MSG": MESSAGES["MSG"]}
@@ -115,7 +112,7 @@ def write_dataflash(path: Path, units, kind="IMU", gps=True, vehicle=b"ArduCopte
     return path
 
 
-def _samples(unit: Unit, k: int, messages) -> np.ndarray:
+def _samples(unit, k, messages):
     number, form, columns = messages[k % len(messages)]
     out = np.zeros(len(unit.stamp), dtype=record_type(form, columns))
     names = out.dtype.names
@@ -141,13 +138,13 @@ def _samples(unit: Unit, k: int, messages) -> np.ndarray:
     return out
 
 
-def _old_fix(at: int) -> bytes:
+def _old_fix(at):
     """A GPS record before 3.3: its own time in T, that of the week in TimeMS."""
     values = (3, MS + (at - FIX) // 1000, WEEK, 14, 80, 473977420, 85455940, 0, 48800, 10, 0, 0.0, at // 1000)
     return HEAD + struct.pack("<BBIHBhiiiiIifI", 65, *values)
 
 
-def _fix(at: int) -> bytes:
+def _fix(at):
     """A GPS record with a 3D fix."""
     ms = MS + (at - FIX) // 1000
     return HEAD + struct.pack(
@@ -174,13 +171,13 @@ FIFO_SAMPLES = 8
 SCALE = np.float32(np.radians(2000.0) / 32768.0)
 
 
-def ulog_message(kind: bytes, content: bytes) -> bytes:
+def ulog_message(kind, content):
     return struct.pack("<H", len(content)) + kind + content
 
 
-def ulog_type(name: str) -> np.dtype:
+def ulog_type(name):
     """The data message of a topic; what pads its end is not logged."""
-    fields: list[tuple] = [("size", "<u2"), ("kind", "S1"), ("id", "<u2")]
+    fields = [("size", "<u2"), ("kind", "S1"), ("id", "<u2")]
     for field in ULOG_FORMATS[name].rstrip(";").split(";"):
         kind, _, name_of = field.partition(" ")
         kind, _, count = kind.partition("[")
@@ -189,7 +186,7 @@ def ulog_type(name: str) -> np.dtype:
     return np.dtype(fields)
 
 
-def write_ulog(path: Path, units, kind="sensor_gyro", gps=True, extra=b"") -> Path:
+def write_ulog(path, units, kind="sensor_gyro", gps=True, extra=b""):
     """A log as PX4 writes it."""
     out = [ULOG_HEAD, struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)), ulog_message(b"B", bytes(40))]
     out.append(extra)
@@ -207,12 +204,12 @@ def write_ulog(path: Path, units, kind="sensor_gyro", gps=True, extra=b"") -> Pa
     return path
 
 
-def _interleaved(parts) -> list[bytes]:
+def _interleaved(parts):
     samples = np.concatenate(parts)
     return [samples[np.argsort(samples["timestamp"], kind="stable")].tobytes()]
 
 
-def _ulog_samples(unit: Unit, number: int, kind: str) -> np.ndarray:
+def _ulog_samples(unit, number, kind):
     if kind == "sensor_gyro_fifo":
         return _fifo(unit, number)
     out = _empty(kind, len(unit.stamp), number)
@@ -227,7 +224,7 @@ def _ulog_samples(unit: Unit, number: int, kind: str) -> np.ndarray:
     return out
 
 
-def _fifo(unit: Unit, number: int) -> np.ndarray:
+def _fifo(unit, number):
     """Eight samples a message; its time is that of the last of them."""
     full = len(unit.stamp) // FIFO_SAMPLES
     stamp = unit.stamp[: full * FIFO_SAMPLES].reshape(full, FIFO_SAMPLES)
@@ -241,13 +238,13 @@ def _fifo(unit: Unit, number: int) -> np.ndarray:
     return out
 
 
-def _empty(kind: str, count: int, number: int) -> np.ndarray:
+def _empty(kind, count, number):
     out = np.zeros(count, dtype=ulog_type(kind))
     out["size"], out["kind"], out["id"] = out.dtype.itemsize - 3, b"D", number
     return out
 
 
-def _gps(number: int, at: int) -> bytes:
+def _gps(number, at):
     out = _empty("sensor_gps", 1, number)
     out["timestamp"] = out["timestamp_sample"] = at
     out["time_utc_usec"], out["fix_type"] = UTC // 1000 + at - FIX, 3
@@ -257,7 +254,7 @@ def _gps(number: int, at: int) -> bytes:
 # Telemetry log ------------------------------------------------------------------------------------------------------
 
 
-def write_tlog(path: Path, units) -> Path:
+def write_tlog(path, units):
     """A log as a ground station writes it of ArduPilot's SCALED_IMU, SCALED_IMU2 and SCALED_IMU3, each 20 ms late."""
     kinds = (
         mavlink.MAVLink_scaled_imu_message,

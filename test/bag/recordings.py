@@ -3,13 +3,10 @@
 
 """Recordings of every make for the tests, and messages of every shape."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
 import struct
-from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
@@ -39,14 +36,14 @@ def write_config(path, parameters=PARAMETERS):
     return path
 
 
-def imu(stamp: int, rate, frame: str = "imu", order: str = "<") -> bytes:
+def imu(stamp, rate, frame="imu", order="<"):
     name = frame.encode() + b"\0"
     out = struct.pack(order + "iII", *divmod(stamp, 10**9), len(name)) + name
     out += bytes(-len(out) % 8) + struct.pack(order + "37d", *range(13), *rate, *range(21))
     return bytes([0, order == "<", 0, 0]) + out
 
 
-def array(values, labels=(), order: str = "<") -> bytes:
+def array(values, labels=(), order="<"):
     out = struct.pack(order + "I", len(labels))
     for label in labels:
         name = label.encode() + b"\0"
@@ -57,7 +54,7 @@ def array(values, labels=(), order: str = "<") -> bytes:
     return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
 
 
-def imu_messages(stamp, z, topics=TOPICS, apart: int = 0):
+def imu_messages(stamp, z, topics=TOPICS, apart=0):
     """Messages (topic, log time, bytes) of IMUs: samples z (samples, 3 units), each unit logged `apart` ns later."""
     return [
         (topic, at + apart * k, imu(at, row[3 * k : 3 * k + 3], f"imu_{k + 1}"))
@@ -66,7 +63,7 @@ def imu_messages(stamp, z, topics=TOPICS, apart: int = 0):
     ]
 
 
-def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
+def flight(samples=600, seed=0, rate=100.0):
     """Messages (topic, log time, bytes) of two IMUs in motion, and the rates that they carry, (samples, 6)."""
     random = np.random.default_rng(seed)
     step = round(1e9 / rate)
@@ -119,7 +116,7 @@ def split(path, messages, storage):
     return path
 
 
-def write_ros1(path: Path, messages, compression: Ros1Writer.CompressionFormat | None = None, types=None) -> Path:
+def write_ros1(path, messages, compression=None, types=None):
     """A bag of ROS 1, as its recorder or roscpp write it; a message that is none of the type is written as it is."""
     writer = Ros1Writer(path)
     if compression is not None:

@@ -3,8 +3,6 @@
 
 """Tables of text: which columns are read by their names or as asked, their units and times, and what is damaged."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Files that are damaged, or made to be too large or without end: each ends soon, in bounded memory, in words."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import resource

@@ -3,8 +3,6 @@
 
 """Flight logs: the values, times and frames of their IMUs, whole or damaged, and the verdicts that come of them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import random

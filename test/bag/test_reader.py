@@ -3,8 +3,6 @@
 
 """Reading recordings of every make, whole and damaged."""
 
-from __future__ import annotations
-
 import bz2
 import contextlib
 import os
@@ -296,7 +294,7 @@ records = st.lists(
 lengths = st.sampled_from([0, 21, 2**31, 2**62, 2**63 - 1, 2**63, 2**64 - 1])
 
 
-def plainly_read(data: bytes, outside: bool):
+def plainly_read(data, outside):
     """Messages (channel, log time, content), schemas and channels (opcode, content), and the end, record by record."""
     messages, topics, at = [], [], 0
     while at + 9 <= len(data):

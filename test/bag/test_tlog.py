@@ -3,10 +3,7 @@
 
 """Telemetry logs of ground stations: read as pymavlink reads them, of one autopilot, damaged or not."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +22,7 @@ UTC = 1_790_000_000_000_000
 SCALED = {26: 50.0, 116: 50.0, 129: 50.0}
 
 
-def record(*autopilots: Autopilot, seconds: float = 6.0, latency: int = 4000, version: int = 2) -> bytes:
+def record(*autopilots, seconds=6.0, latency=4000, version=2):
     """What a ground station writes down: each message some ms after it was sent."""
     out = b""
     for now in range(0, round(seconds * NS), 1_000_000):
@@ -36,32 +33,32 @@ def record(*autopilots: Autopilot, seconds: float = 6.0, latency: int = 4000, ve
     return out
 
 
-def as_version_1(autopilot: Autopilot, data: bytes) -> bytes:
+def as_version_1(autopilot, data):
     (message,) = autopilot.inbound.parse_buffer(data)
     return bytes(message.pack(autopilot.mav, force_mavlink1=True))
 
 
-def messages(path: Path, topic: str) -> dict[int, tuple[float, ...]]:
+def messages(path, topic):
     with Recording(path) as recording:
         batches = list(recording.batches([topic]))
         return dict(ImuSource.parse(batch.message(k), 3) for batch in batches for k in range(len(batch)))
 
 
-def written(path: Path, data: bytes) -> Path:
+def written(path, data):
     path.write_bytes(data)
     return path
 
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("stack", ["px4", "ardupilot"])
-def test_values_and_times_are_those_that_pymavlink_reads(tmp_path: Path, stack: str, version: int) -> None:
+def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, version):
     rates = {**SCALED, 27: 10.0, 105: 10.0}
     path = written(tmp_path / "FLIGHT.TLOG", record(Autopilot(stack, rates=rates), version=version))
     with Recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [(f"/imu_{k}", 300) for k in range(3)]
         assert not recording.damage
     log = mavutil.mavlink_connection(str(path))
-    theirs: dict[str, list[tuple]] = {}
+    theirs = {}
     while (message := log.recv_match(type=["SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"])) is not None:
         rate = (message.xgyro * 1e-3, -message.ygyro * 1e-3, -message.zgyro * 1e-3)
         theirs.setdefault(message.get_type(), []).append((message.time_boot_ms, rate, message._timestamp))
@@ -79,7 +76,7 @@ def test_values_and_times_are_those_that_pymavlink_reads(tmp_path: Path, stack: 
     assert max(late) < 0.012
 
 
-def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path: Path) -> None:
+def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path):
     """What its ground stations ask for (RAW_SENS) is RAW_IMU, SCALED_IMU2 and SCALED_IMU3."""
     path = written(tmp_path / "a.tlog", record(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0, 129: 50.0})))
     first, second = messages(path, "/imu_0"), messages(path, "/imu_1")
@@ -87,7 +84,7 @@ def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path: Path) -> None:
     assert np.abs(np.array(list(first.values())) - list(second.values())).max() < 0.02
 
 
-def test_of_two_vehicles_the_first_is_read(tmp_path: Path) -> None:
+def test_of_two_vehicles_the_first_is_read(tmp_path):
     one, other = Autopilot("px4", rates=SCALED, system=5), Autopilot("ardupilot", rates=SCALED, system=9, seed=4)
     mixed, alone = tmp_path / "mixed.tlog", tmp_path / "alone.tlog"
     written(mixed, record(one, other))
@@ -95,7 +92,7 @@ def test_of_two_vehicles_the_first_is_read(tmp_path: Path) -> None:
     assert list(messages(mixed, "/imu_1").values()) == list(messages(alone, "/imu_1").values())
 
 
-def test_ten_a_second_are_enough_and_two_are_not(tmp_path: Path) -> None:
+def test_ten_a_second_are_enough_and_two_are_not(tmp_path):
     path = written(tmp_path / "slow.tlog", record(Autopilot(rates=dict.fromkeys(SCALED, 10.0))))
     assert len(messages(path, "/imu_2")) == 60
     written(path, record(Autopilot(rates=dict.fromkeys(SCALED, 2.0)), seconds=20.0))
@@ -103,7 +100,7 @@ def test_ten_a_second_are_enough_and_two_are_not(tmp_path: Path) -> None:
         Recording(path)
 
 
-def test_a_log_without_imus_or_of_no_log_is_refused(tmp_path: Path) -> None:
+def test_a_log_without_imus_or_of_no_log_is_refused(tmp_path):
     path = written(tmp_path / "some.tlog", record(Autopilot()))
     with pytest.raises(BagError, match="has no SCALED_IMU"):
         Recording(path)
@@ -111,7 +108,7 @@ def test_a_log_without_imus_or_of_no_log_is_refused(tmp_path: Path) -> None:
         Recording(written(tmp_path / "text.tlog", b"FMT, 128, 89"))
 
 
-def test_raw_counts_of_other_autopilots_are_not_taken_for_rates(tmp_path: Path) -> None:
+def test_raw_counts_of_other_autopilots_are_not_taken_for_rates(tmp_path):
     autopilot = Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)
     data = record(autopilot)
     assert len(messages(written(tmp_path / "a.tlog", data), "/imu_0")) == 300
@@ -127,7 +124,7 @@ LOG = record(Autopilot("px4", rates=SCALED), seconds=3.0)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> set[tuple[float, ...]]:
+def whole(tmp_path_factory):
     """Rates of the first IMU in the whole log."""
     return set(messages(written(tmp_path_factory.mktemp("tlog") / "whole.tlog", LOG), "/imu_0").values())
 
@@ -137,7 +134,7 @@ def whole(tmp_path_factory) -> set[tuple[float, ...]]:
     places=st.lists(st.tuples(st.integers(0, len(LOG) - 1), st.binary(max_size=40)), min_size=1, max_size=6),
     cut=st.integers(0, len(LOG)),
 )
-def test_damage_is_read_around(tmp_path_factory, whole, places, cut: int) -> None:
+def test_damage_is_read_around(tmp_path_factory, whole, places, cut):
     """Whatever is overwritten or missing: what is read was in the log, and the rest is counted."""
     data = bytearray(LOG)
     for at, piece in places:

@@ -3,8 +3,6 @@
 
 """The command line: what a user types, what it says, and how it fails."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -493,7 +491,7 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
     words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config)]
     words += ["--output", str(tmp_path / "out"), "--csv", str(tmp_path / "s.csv")]
 
-    def hear_it() -> None:
+    def hear_it():
         # A shell lets what it starts in the background ignore SIGINT, and these tests may have been started so.
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

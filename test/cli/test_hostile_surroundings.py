@@ -3,8 +3,6 @@
 
 """Files that are no files, names that a terminal obeys, signals at any moment, what killed runs leave."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil
@@ -13,11 +11,9 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pyarrow as arrow
 import pytest
-from commands import Refused, Run
 from pyarrow import parquet
 
 from fdi_ros.errors import FdiError
@@ -34,7 +30,7 @@ LIMIT = 60
 def in_time():
     """A wait for a pipe fails instead of lasting for ever."""
 
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise TimeoutError("it waits for what never comes")
 
     before = signal.signal(signal.SIGALRM, fail)
@@ -45,12 +41,12 @@ def in_time():
 
 
 @pytest.fixture
-def config(root: Path) -> Path:
+def config(root):
     return root / "config" / "two_imus.yaml"
 
 
 @pytest.fixture(params=["pipe", "socket", "device"])
-def no_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def no_file(request, tmp_path):
     path = tmp_path / "other.yaml"
     if request.param == "device":
         path.symlink_to("/dev/zero")
@@ -78,16 +74,14 @@ def no_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
         ["geometry", "FILE"],
     ],
 )
-def test_what_is_no_regular_file_is_never_read(
-    words: list[str], no_file: Path, flight: Path, config: Path, tmp_path: Path, refused: Refused
-) -> None:
+def test_what_is_no_regular_file_is_never_read(words, no_file, flight, config, tmp_path, refused):
     meant = {"FLIGHT": flight, "CONFIG": config, "FILE": no_file, "OUT": tmp_path / "out"}
     said = refused(*(meant.get(word, word) for word in words))
     assert "other.yaml: it is no regular file" in said
     assert not (tmp_path / "out").exists()
 
 
-def test_metadata_keys_and_recordings_that_are_no_files(no_file: Path, flight: Path, tmp_path: Path, fdi: Run) -> None:
+def test_metadata_keys_and_recordings_that_are_no_files(no_file, flight, tmp_path, fdi):
     bag = tmp_path / "bag"
     shutil.copytree(flight, bag)
     (bag / "metadata.yaml").unlink()
@@ -103,13 +97,13 @@ def test_metadata_keys_and_recordings_that_are_no_files(no_file: Path, flight: P
         (tmp_path / name).rename(bag / "metadata.yaml")
 
 
-def test_a_fleet_waits_for_no_pipe(flight: Path, tmp_path: Path, refused: Refused) -> None:
+def test_a_fleet_waits_for_no_pipe(flight, tmp_path, refused):
     os.mkfifo(tmp_path / ".lock")
     os.mkfifo(tmp_path / "flights.parquet")
     assert "it is no regular file" in refused("fleet", flight, "--output", tmp_path)
 
 
-def test_a_fleet_that_is_refused_leaves_nothing(flight: Path, tmp_path: Path, refused: Refused) -> None:
+def test_a_fleet_that_is_refused_leaves_nothing(flight, tmp_path, refused):
     mine = tmp_path / "mine"
     mine.mkdir()
     parquet.write_table(arrow.table({"x": [1]}), mine / "flights.parquet")
@@ -120,7 +114,7 @@ def test_a_fleet_that_is_refused_leaves_nothing(flight: Path, tmp_path: Path, re
     assert not (tmp_path / "out").exists()
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     left, young, other, held = (
         tmp_path / name for name in (".a.json.01234567", ".a.json.89abcdef", ".b.json.01234567", ".a.json.fedcba98")
     )
@@ -136,7 +130,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", young.name, other.name, held.name}
 
 
-def test_a_killed_replay_leaves_no_more_than_the_next_removes(flight: Path, config: Path, tmp_path: Path) -> None:
+def test_a_killed_replay_leaves_no_more_than_the_next_removes(flight, config, tmp_path):
     words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config), "--end", "1"]
     words += ["--csv", str(tmp_path / "s.csv")]
     slow = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
@@ -156,7 +150,7 @@ def test_a_killed_replay_leaves_no_more_than_the_next_removes(flight: Path, conf
 NAME = "a\x1b[2J\x07\u202egpj\u2066x"
 
 
-def test_names_are_shown_and_not_obeyed(flight: Path, config: Path, tmp_path: Path, fdi: Run) -> None:
+def test_names_are_shown_and_not_obeyed(flight, config, tmp_path, fdi):
     bag, own, out = tmp_path / NAME, tmp_path / f"{NAME}.yaml", tmp_path / "out"
     shutil.copytree(flight, bag)
     shutil.copy(config, own)
@@ -186,7 +180,7 @@ def test_names_are_shown_and_not_obeyed(flight: Path, config: Path, tmp_path: Pa
         assert "\\u202egpj" in text, path.name
 
 
-def test_texts_of_plots_are_shown_as_they_are() -> None:
+def test_texts_of_plots_are_shown_as_they_are():
     trace = {"type": "scatter", "x": [0.0], "y": [1.0], "name": NAME}
     text = page(NAME, [NAME], [Section(NAME, NAME, [NAME], [{"data": [trace], "layout": {"title": NAME}}])])
     # In a script, \\u202e would be that character again.
@@ -210,7 +204,7 @@ sys.exit(fdi())
 
 
 @pytest.mark.parametrize("moment", ["fdi_ros.cli.command_line", "argparse", "numpy", "numba", "fdi_ros.replay.run"])
-def test_a_signal_while_it_is_loaded_is_no_traceback(moment: str, flight: Path, config: Path) -> None:
+def test_a_signal_while_it_is_loaded_is_no_traceback(moment, flight, config):
     words = [sys.executable, "-c", INTERRUPTED, "replay", flight, "--config", config, moment]
     done = subprocess.run([*map(str, words)], capture_output=True, text=True, timeout=LIMIT, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

@@ -3,8 +3,6 @@
 
 """Alignment of sensor units: what each sample may hold, when it is formed, and that recorded and live are one."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -22,7 +20,7 @@ SKEW, TIMEOUT = 2 * MS, 100 * MS
 START = 1_700_000_000_000_000_000
 
 
-def ramp(stamp: int) -> tuple[float, float, float]:
+def ramp(stamp):
     """A rate that tells its own instant: on a line, so that an interpolated one does as well."""
     seconds = (stamp - START) / 1e9
     return seconds, 2 * seconds, -seconds
@@ -34,11 +32,11 @@ def run(messages, units=2, skew=SKEW, timeout=TIMEOUT, flush=False):
     return aligner, samples + (list(aligner.flush()) if flush else [])
 
 
-def stamps_of(samples) -> list[int]:
+def stamps_of(samples):
     return [int(s["stamp"]) for s in samples]
 
 
-def ms(samples) -> list[float]:
+def ms(samples):
     return [(stamp - START) / MS for stamp in stamps_of(samples)]
 
 
@@ -58,7 +56,7 @@ def waiting(aligner, j):
     return unit["messages"]["stamp"][numbers % len(unit["messages"])].tolist()
 
 
-def at(*pairs: tuple[int, float]) -> list[tuple[int, int]]:
+def at(*pairs):
     return [(j, START + round(t * MS)) for j, t in pairs]
 
 
@@ -100,7 +98,7 @@ def blocks_of(messages, units, cuts=(), skew=SKEW, timeout=TIMEOUT):
     ]
 
 
-def same(samples, blocks, units) -> None:
+def same(samples, blocks, units):
     assert np.concatenate([b.stamp for b in blocks]).tolist() == stamps_of(samples)
     assert np.vstack([b.z for b in blocks]).tobytes() == values(samples, units).tobytes()
     told = np.vstack([b.delivered for b in blocks])
@@ -109,7 +107,7 @@ def same(samples, blocks, units) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(streams())
-def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(case) -> None:
+def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(case):
     units, messages = case
     aligner, samples = run(messages, units, flush=True)
     stamps = np.array(stamps_of(samples))
@@ -136,7 +134,7 @@ def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(cas
 
 @settings(max_examples=50, deadline=None)
 @given(streams(), st.lists(st.integers(-100_000, 100_000), min_size=4, max_size=4))
-def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness) -> None:
+def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness):
     units, messages = case
     unit, stamps, rates = arrays(messages)
     delays = [1e-6 * d for d in lateness[:units]]
@@ -153,10 +151,10 @@ def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lat
 
 @settings(max_examples=150, deadline=None)
 @given(streams())
-def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case) -> None:
+def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case):
     units, messages = case
     aligner = Alignment(units, SKEW, TIMEOUT)
-    newest: dict[int, int] = {}
+    newest = {}
     # How far each other unit has come since the last message of one.
     since = np.zeros((units, units), dtype=np.int64)
     for j, stamp in messages:
@@ -174,7 +172,7 @@ def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case) -> No
 
 @settings(max_examples=100, deadline=None)
 @given(streams(), st.lists(st.integers(0, 200), max_size=4))
-def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(case, cuts) -> None:
+def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(case, cuts):
     units, messages = case
     live, samples = run(messages, units)
     recorded, blocks = blocks_of(messages, units, [min(c, len(messages)) for c in cuts])
@@ -194,7 +192,7 @@ anything = st.one_of(
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), anything), max_size=120), st.sampled_from([(SKEW, TIMEOUT), (0, 1)]))
-def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(messages, spans) -> None:
+def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(messages, spans):
     aligner, samples = run(messages, 4, *spans, flush=True)
     assert all(a < b for a, b in itertools.pairwise(stamps_of(samples)))
     # Without its shift a sample stands at the stamp of a message, and shift or not, at most one at each message.
@@ -212,7 +210,7 @@ def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(
 
 
 @pytest.mark.parametrize("stamp", [MAX_STAMP, -MAX_STAMP, 2**63 - 1, -(2**63)])
-def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
+def test_a_stamp_that_no_message_can_have_changes_nothing(stamp):
     aligner, _ = run(at(*rounds(5)))
     before, rate = aligner.rows.tobytes(), aligner.rows["rate"].copy()
     for j in (0, 1, 2, -1):
@@ -222,7 +220,7 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert aligner.rows.tobytes() == before
 
 
-def test_one_lost_message_is_bridged_and_two_are_not() -> None:
+def test_one_lost_message_is_bridged_and_two_are_not():
     def lose(*lost):
         return run(at(*[m for m in rounds(30) if m not in [(1, 10.0 * k) for k in lost]]))
 
@@ -235,7 +233,7 @@ def test_one_lost_message_is_bridged_and_two_are_not() -> None:
     assert aligner.counters[1]["missing"] == 2
 
 
-def test_the_one_after_a_lost_message_is_not_taken_for_it() -> None:
+def test_the_one_after_a_lost_message_is_not_taken_for_it():
     # At 1 kHz the next message is within the skew of 2 ms.
     messages = [m for m in rounds(30, period=1.0) if m != (1, 10.0)]
     _, samples = run(at(*messages))
@@ -244,7 +242,7 @@ def test_the_one_after_a_lost_message_is_not_taken_for_it() -> None:
     np.testing.assert_allclose(z[:, 3], z[:, 0])
 
 
-def test_a_silent_unit_holds_the_rest_up_once_for_the_timeout_and_comes_back_by_itself() -> None:
+def test_a_silent_unit_holds_the_rest_up_once_for_the_timeout_and_comes_back_by_itself():
     messages = [m for m in rounds(60) if not (m[0] == 1 and 100 < m[1] < 400)]
     aligner = Alignment(2, SKEW, TIMEOUT)
     wait = []
@@ -263,7 +261,7 @@ ALONE = [(0, t) for t in TENS[:30]]
 
 
 @pytest.mark.parametrize("behind", [45, 5000])
-def test_clock_offset_is_waited_out_and_named(behind) -> None:
+def test_clock_offset_is_waited_out_and_named(behind):
     aligner, samples = run(at(*[m for t in TENS for m in ((0, t), (1, t - behind))]))
     assert aligner.lag == [0, behind * MS]
     whole = values(samples)[received(samples).all(axis=1)]
@@ -293,7 +291,7 @@ def test_clock_offset_is_waited_out_and_named(behind) -> None:
         ([*ALONE[:20], (0, 1e9), (0, -1e9), *ALONE[20:]], TENS[:30], 0, {}),
     ],
 )
-def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, formed, restarts, counted) -> None:
+def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, formed, restarts, counted):
     aligner, samples = run(at(*messages))
     assert ms(samples) == formed
     assert (aligner.restarts, aligner.shift) == (restarts, 0)
@@ -301,7 +299,7 @@ def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, forme
         assert {kind: aligner.counters[j][kind] for kind in counts} == counts
 
 
-def test_all_clocks_set_back_shift_the_time_base() -> None:
+def test_all_clocks_set_back_shift_the_time_base():
     messages = rounds(20) + [(j, t - 3_600_000) for j, t in rounds(20)]
     aligner, samples = run(at(*messages))
     assert aligner.restarts == 1
@@ -310,7 +308,7 @@ def test_all_clocks_set_back_shift_the_time_base() -> None:
     assert samples[-1]["shift"] == aligner.shift
 
 
-def test_the_only_unit_left_is_believed_after_the_timeout() -> None:
+def test_the_only_unit_left_is_believed_after_the_timeout():
     messages = [(0, 10.0 * k) for k in range(30)] + [(0, 10.0 * k - 9000) for k in range(30)]
     aligner, samples = run(at(*messages), 2)
     assert aligner.restarts == 1
@@ -318,7 +316,7 @@ def test_the_only_unit_left_is_believed_after_the_timeout() -> None:
     assert len(samples) == 30 + 20
 
 
-def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait() -> None:
+def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait():
     aligner = Alignment(2, SKEW, TIMEOUT)
     aligner.push(1, 0, (0.0, 0.0, 0.0))
     count = 0
@@ -328,7 +326,7 @@ def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait() -> N
     assert count >= 2 * MAX_PENDING
 
 
-def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout() -> None:
+def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout():
     period = MAX_BRIDGE * TIMEOUT / MS + 1
     fast = [(0, 5.0 * k) for k in range(60)]
     slow = [(1, 1.0 + period * k) for k in range(10)]
@@ -344,7 +342,7 @@ def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout() -> None:
         ({"imus.delays": [0.004], "input": "channels"}, r"imus.delays is given, but input is 'channels'"),
     ],
 )
-def test_delays_that_do_not_fit_are_refused_in_one_line(parameters, words) -> None:
+def test_delays_that_do_not_fit_are_refused_in_one_line(parameters, words):
     with pytest.raises(ConfigError, match=words) as refused:
         Config.from_parameters({"input": "imus", "imus.topics": ["/a", "/b"], **parameters})
     assert "\n" not in str(refused.value)
@@ -364,14 +362,14 @@ KINDS = ("jumped", "late", "jumped", "late", "jumped", "backward", "jumped")
 """As what messages with the stamps of these clocks are counted."""
 
 
-def samples_of(clock: str) -> int:
+def samples_of(clock):
     """At 100 Hz: clocks that are hardly wrong part after minutes."""
     return 72_000 if clock in ("fast", "slow") else 6000
 
 
 @pytest.mark.parametrize("odd", [0, 2])
 @pytest.mark.parametrize(("clock", "kind"), [*zip(CLOCKS, KINDS, strict=True)])
-def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, kind, odd) -> None:
+def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, kind, odd):
     rng, count = np.random.default_rng(odd), samples_of(clock)
     measured = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(3) + rng.uniform(0, 3e-4, (count, 3))
     arrival = (measured + rng.uniform(0, 0.005, (count, 3))).ravel()
@@ -391,7 +389,7 @@ def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, kind
 
 @pytest.mark.parametrize("odd", [0, 1])
 @pytest.mark.parametrize("clock", [*CLOCKS][:5])
-def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd) -> None:
+def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd):
     count = samples_of(clock)
     clocks = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(2)
     clocks[:, odd] = CLOCKS[clock](clocks[:, odd])
@@ -408,7 +406,7 @@ def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd) -> None:
     assert aligner.are_parted == (clock != "leaping")
 
 
-def test_two_clocks_that_come_together_again_are_believed_again() -> None:
+def test_two_clocks_that_come_together_again_are_believed_again():
     seconds = np.arange(3000) * 0.01
     apart = np.interp(seconds, [5.0, 10.0, 15.0, 20.0], [0.0, 2.0, 2.0, 0.0]) * TIMEOUT / 1e9
     clocks = np.column_stack([seconds, seconds + 0.001 - apart])
@@ -423,7 +421,7 @@ def test_two_clocks_that_come_together_again_are_believed_again() -> None:
     assert not aligner.are_parted
 
 
-def test_of_two_units_one_that_jumps_is_left_and_one_that_was_held_up_costs_nothing() -> None:
+def test_of_two_units_one_that_jumps_is_left_and_one_that_was_held_up_costs_nothing():
     jumped, _ = run(at(*rounds(100), *[m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + 5000.0))]))
     assert not jumped.are_parted
     # The link of the second keeps its messages for a second, and then delivers them one after the other.
@@ -434,7 +432,7 @@ def test_of_two_units_one_that_jumps_is_left_and_one_that_was_held_up_costs_noth
     assert received(samples)[:, 0].all()
 
 
-def test_a_unit_that_is_left_alone_goes_on_without_a_hole() -> None:
+def test_a_unit_that_is_left_alone_goes_on_without_a_hole():
     aligner, samples = run(at(*[m for m in rounds(100, units=3) if m[0] == 1 or m[1] < 300]), units=3)
     assert np.diff(ms(samples)).max() == 10.0
     assert aligner.restarts == 0

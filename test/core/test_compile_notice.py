@@ -3,8 +3,6 @@
 
 """What is seen of compiling: before it begins, while it goes on, and in no figure of what comes after."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os
@@ -15,7 +13,6 @@ import subprocess
 import sys
 import termios
 import time
-from pathlib import Path
 
 import numba
 import pytest
@@ -30,7 +27,7 @@ def new_function():
     return numba.njit(lambda x: x + 1)
 
 
-def test_compiling_is_announced_before_or_refused(caplog) -> None:
+def test_compiling_is_announced_before_or_refused(caplog):
     one, two = new_function(), new_function()
     with announced():
         one(1)
@@ -43,7 +40,7 @@ def test_compiling_is_announced_before_or_refused(caplog) -> None:
     assert caplog.messages == [WORDS]
 
 
-def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog) -> None:
+def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog):
     monkeypatch.setattr(compile_notice, "LOG_PERIOD", 0.0)
     view = compile_notice.View()
     view.begin()
@@ -57,7 +54,7 @@ def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog) -> None:
     ]
 
 
-def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled() -> None:
+def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled():
     wall, own, compiled = time.perf_counter(), clock(), compiling_seconds()
     new_function()(1)
     spent = compiling_seconds() - compiled
@@ -70,14 +67,14 @@ def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled() -> None
 
 
 @pytest.mark.usefixtures("compiled")
-def test_nothing_is_missing_once_all_is_compiled(root) -> None:
+def test_nothing_is_missing_once_all_is_compiled(root):
     # In a process of its own: tests compile functions, too.
     count = "import fdi_ros.cli.settings; from fdi_ros.compiling.notice import missing; print(missing())"
     done = subprocess.run([sys.executable, "-c", count], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout == "0\n"
 
 
-def on_a_terminal(command: list[str], folder: Path, **environment: str) -> str:
+def on_a_terminal(command, folder, **environment):
     """What a command writes to a terminal of 24 lines of 90 characters."""
     terminal, other = os.openpty()
     fcntl.ioctl(other, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 90, 0, 0))
@@ -95,7 +92,7 @@ def on_a_terminal(command: list[str], folder: Path, **environment: str) -> str:
     return said.decode()
 
 
-def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight) -> None:
+def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight):
     """The first on a machine; of those after it, none."""
     command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(flight)]
     # Another kind of compiled code than that of the package, which would be taken over.

@@ -3,8 +3,6 @@
 
 """Where compiled code is kept, and that nothing of it can go wrong in a way that stops a start."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import pickle
@@ -38,7 +36,7 @@ print("says", core["decision"]["faulty"][0], core["decision"]["ambiguous"][0])
 """
 
 
-def place(folder: Path, package: Path, *left_out: str) -> Path:
+def place(folder, package, *left_out):
     """A copy of the package, beside a home and a folder for temporary files."""
     shutil.copytree(package / "fdi_ros", folder / "copy" / "fdi_ros", ignore=shutil.ignore_patterns(*left_out))
     (folder / "home").mkdir()
@@ -47,13 +45,13 @@ def place(folder: Path, package: Path, *left_out: str) -> Path:
 
 
 @pytest.fixture
-def copy(tmp_path: Path, root: Path) -> Path:
+def copy(tmp_path, root):
     """A copy of the package that nothing was compiled in."""
     return place(tmp_path, root, "__pycache__")
 
 
 @pytest.fixture(scope="module")
-def started(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+def started(tmp_path_factory):
     """A copy in which it was started once, where that has kept what it compiled, and a copy of both."""
     folder = tmp_path_factory.mktemp("started")
     package = place(folder / "at", Path(__file__).parents[2], "__pycache__")
@@ -65,7 +63,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
 
 
 @pytest.fixture
-def warm(started: tuple[Path, Path, Path]) -> tuple[Path, Path]:
+def warm(started):
     """That copy as it was then, which a test may change, and where its results are: they belong to its place."""
     package, kept, original = started
     shutil.rmtree(package.parent)
@@ -73,7 +71,7 @@ def warm(started: tuple[Path, Path, Path]) -> tuple[Path, Path]:
     return package, kept
 
 
-def start(copy: Path, **environment: str) -> subprocess.Popen[str]:
+def start(copy, **environment):
     place = {"PYTHONPATH": str(copy), "HOME": str(copy.parent / "home"), "TMPDIR": str(copy.parent / "temporary")}
     inherited = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
     command = [sys.executable, "-B", "-c", SCRIPT]
@@ -87,7 +85,7 @@ def start(copy: Path, **environment: str) -> subprocess.Popen[str]:
     )
 
 
-def outcome(process: subprocess.Popen[str]) -> tuple[Path, str, str]:
+def outcome(process):
     """Where it keeps what it compiles, what it says, and its whole output."""
     output = process.communicate(timeout=300)[0]
     assert process.returncode == 0, output
@@ -96,12 +94,12 @@ def outcome(process: subprocess.Popen[str]) -> tuple[Path, str, str]:
     return Path(lines["kept"].removeprefix("in ")), lines["says"], output
 
 
-def cannot_be_written(folder: Path) -> None:
+def cannot_be_written(folder):
     """Put a file where a folder would have to be made: which fails for every user, root too."""
     folder.write_text("")
 
 
-def test_first_starts_at_once_then_a_load(copy: Path) -> None:
+def test_first_starts_at_once_then_a_load(copy):
     both = [start(copy), start(copy)]
     (kept, says, output), second = (outcome(process) for process in both)
     assert says == "0 0"
@@ -114,7 +112,7 @@ def test_first_starts_at_once_then_a_load(copy: Path) -> None:
     assert "compiled it in" not in warm[2]
 
 
-def test_installation_that_cannot_be_written(copy: Path) -> None:
+def test_installation_that_cannot_be_written(copy):
     cannot_be_written(copy / "fdi_ros" / "__pycache__")
     kept, _, output = outcome(start(copy))
     assert kept.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
@@ -122,7 +120,7 @@ def test_installation_that_cannot_be_written(copy: Path) -> None:
     assert "compiled it in" not in outcome(start(copy))[2]
 
 
-def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm: tuple[Path, Path]) -> None:
+def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
     """An image: compiled when it was built, started by a user who can write nothing there and has no home."""
     copy, made = warm
     # Prepared results are there, and no new file can be made among them: even root cannot replace this.
@@ -139,7 +137,7 @@ def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_writte
     assert "compiled it in" not in output
 
 
-def test_user_without_a_home_whatever_the_umask(copy: Path) -> None:
+def test_user_without_a_home_whatever_the_umask(copy):
     cannot_be_written(copy / "fdi_ros" / "__pycache__")
     before = os.umask(0)
     try:
@@ -160,15 +158,15 @@ def test_user_without_a_home_whatever_the_umask(copy: Path) -> None:
 class Planted:
     """What a stranger leaves among the results: loaded, it runs."""
 
-    def __init__(self, mark: Path) -> None:
+    def __init__(self, mark):
         self.mark = mark
 
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return Path.touch, (self.mark,)
 
 
 @pytest.mark.parametrize("what", ["mine", "open to all", "a link", "a stranger's", "a stranger's folder"])
-def test_code_that_somebody_else_may_have_put_there_is_not_run(warm: tuple[Path, Path], what: str) -> None:
+def test_code_that_somebody_else_may_have_put_there_is_not_run(warm, what):
     if "stranger" in what and os.geteuid() != 0:
         pytest.skip("only root can give a file to another user")
     copy, made = warm
@@ -202,7 +200,7 @@ def test_code_that_somebody_else_may_have_put_there_is_not_run(warm: tuple[Path,
         assert not mark.exists()
 
 
-def test_a_change_of_a_called_function_is_compiled(warm: tuple[Path, Path]) -> None:
+def test_a_change_of_a_called_function_is_compiled(warm):
     """Numba alone looks at the file of the caller only."""
     copy, _ = warm
     assert "compiled it in" not in outcome(start(copy))[2]
@@ -214,7 +212,7 @@ def test_a_change_of_a_called_function_is_compiled(warm: tuple[Path, Path]) -> N
     assert outcome(start(copy))[1] == "0 5"
 
 
-def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path: Path) -> None:
+def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path):
     kept = [_Kept(str(tmp_path), "function", "stamp") for _ in range(4)]
     keys = list(itertools.product(range(len(kept)), range(20)))
     with ThreadPoolExecutor(len(kept)) as threads:
@@ -222,16 +220,14 @@ def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path: Path) ->
     assert [kept[0].load(key) for key in keys] == [str(key) for key in keys]
 
 
-def test_results_that_cannot_be_kept_are_said_and_stop_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_results_that_cannot_be_kept_are_said_and_stop_nothing(tmp_path, caplog):
     # A verb that another test ran may have been told to be quiet.
     caplog.set_level("WARNING", logger="fdi_ros")
     _Kept(str(tmp_path / "gone"), "function", "stamp").save("key", "data")
     assert caplog.messages == [f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"]
 
 
-def test_a_field_may_not_hide_behind_an_attribute_of_plain_records() -> None:
+def test_a_field_may_not_hide_behind_an_attribute_of_plain_records():
     class Hidden:
         sum: Real
 
@@ -241,7 +237,7 @@ def test_a_field_may_not_hide_behind_an_attribute_of_plain_records() -> None:
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"stamp", bytes(range(256))])
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
-def test_results_that_were_cut_off_are_made_anew(kind: str, content: bytes, tmp_path: Path) -> None:
+def test_results_that_were_cut_off_are_made_anew(kind, content, tmp_path):
     kept = _Kept(str(tmp_path), "function", "stamp")
     kept.save("key", "data")
     for path in tmp_path.glob(f"*.{kind}"):
@@ -252,7 +248,7 @@ def test_results_that_were_cut_off_are_made_anew(kind: str, content: bytes, tmp_
     assert _Kept(str(tmp_path), "function", "stamp").load("key") == "data"
 
 
-def test_a_planted_lock_is_neither_followed_nor_waited_for(tmp_path: Path) -> None:
+def test_a_planted_lock_is_neither_followed_nor_waited_for(tmp_path):
     victim, inside = tmp_path / "victim", tmp_path / "cache"
     victim.write_text("precious")
     inside.mkdir()

@@ -3,10 +3,6 @@
 
 """The error states against textbook formulas: elimination of the rate, the filter, the layout; and the delay line."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 import pytest
 from detectors.detector_trials import random_axes
@@ -37,7 +33,7 @@ PRIORS = {"bias": 0.01, "scale": 0.02, "delay": 0.01, "bias rate": 1e-4, "clock 
 WALKS = {"bias": 1e-3, "scale": 1e-4, "delay": 1e-4}
 
 
-def random_channels(seed: int, n: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray]:
+def random_channels(seed, n):
     """Axes (n, 3) that span space by a wide margin, and a covariance (n, n) of errors."""
     rng = np.random.default_rng(seed)
     axes = random_axes(rng, n).axes
@@ -47,7 +43,7 @@ def random_channels(seed: int, n: int) -> tuple[np.random.Generator, np.ndarray,
     return rng, axes.copy(), root @ root.T
 
 
-def padded(matrix: np.ndarray) -> np.ndarray:
+def padded(matrix):
     full = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
     full[: len(matrix), : len(matrix)] = matrix
     return full
@@ -55,7 +51,7 @@ def padded(matrix: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12), absent=st.integers(0, 4))
-def test_information_is_that_of_the_parity_vector(seed: int, n: int, absent: int) -> None:
+def test_information_is_that_of_the_parity_vector(seed, n, absent):
     """A = V' (V M V')^-1 V with any basis V of the null space, of the channels that are there; G is least squares."""
     rng, axes, covariance = random_channels(seed, n)
     gone = rng.choice(n, min(absent, n - 4), replace=False)
@@ -76,7 +72,7 @@ def test_information_is_that_of_the_parity_vector(seed: int, n: int, absent: int
     np.testing.assert_allclose(parity["gain"][:, kept], gain, atol=1e-6 * np.abs(gain).max())
 
 
-def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def estimator(n, units):
     layout, states, unit = allocate(Layout), allocate(ErrorStates), np.arange(n) * units // n
     prepare_layout(layout[0], unit, units, PRIORS, WALKS)
     begin_states(layout[0], states[0], np.full(n, 0.01))
@@ -85,7 +81,7 @@ def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9]))
-def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed: int, n: int) -> None:
+def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed, n):
     """The joint filter of states and rate, with a prior of the rate as wide as that of the elimination."""
     rng, axes, noise = random_channels(seed, n)
     layout, states, _ = estimator(n, n // 3)
@@ -120,7 +116,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.2))
-def test_no_state_is_known_better_than_it_can_be_taught(seed: int, share: float) -> None:
+def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
     """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
     rng, axes, noise = random_channels(seed, 6)
     layout, states, _ = estimator(6, 2)
@@ -148,7 +144,7 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed: int, share: float)
 
 @settings(max_examples=20)
 @given(seconds=st.floats(0.01, 5000.0))
-def test_time_passes_as_in_the_linear_model(seconds: float) -> None:
+def test_time_passes_as_in_the_linear_model(seconds):
     """The mean by the matrix exponential; that the steps are cut does not matter to it."""
     layout, states, _ = estimator(6, 2)
     count, rng = int(layout["count"]), np.random.default_rng(1)
@@ -167,9 +163,7 @@ def test_time_passes_as_in_the_linear_model(seconds: float) -> None:
 ALL = 0b111111
 
 
-def restamped(
-    late: tuple[float, float], samples: Iterable[tuple[int, np.ndarray, int]]
-) -> Iterator[tuple[int, np.ndarray]]:
+def restamped(late, samples):
     """Channels and values (6,) that two units of three channels are given, of stamps, values and what is plain."""
     line, out, members = allocate(DelayBuffer)[0], np.zeros(MAX_CHANNELS), np.array([0b111, 0b111000, 0, 0])
     for stamp, values, plain in samples:
@@ -180,7 +174,7 @@ def restamped(
 
 @settings(max_examples=30)
 @given(late=st.floats(-0.05, 0.05), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
-def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None:
+def test_late_units_are_brought_to_one_instant(late, rate):
     """Straight lines in time come out as they went in: all of one instant, that of the latest unit."""
     slope, late = np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0]), late if abs(late) >= 1e-6 else 0.0
     stamps = np.arange(200) * round(1e9 / rate)
@@ -191,7 +185,7 @@ def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None
     np.testing.assert_allclose(out, slope * (1e-9 * stamps[-1] - max(late, 0.0)), atol=1e-8)
 
 
-def test_a_hole_is_not_bridged() -> None:
+def test_a_hole_is_not_bridged():
     stamps = [*range(0, 300_000_000, 10_000_000), 390_000_000]
     *_, (found, out) = restamped((0.0, 0.025), ((stamp, np.arange(6.0), ALL) for stamp in stamps))
     # The first unit stands back by 25 ms: into the hole.
@@ -200,7 +194,7 @@ def test_a_hole_is_not_bridged() -> None:
 
 
 @pytest.mark.parametrize("bad", [1e9, np.inf, np.nan])
-def test_a_value_out_of_range_reaches_no_other_instant(bad: float) -> None:
+def test_a_value_out_of_range_reaches_no_other_instant(bad):
     wild = np.array([1.0, bad, 1.0, 1.0, 1.0, 1.0])
     samples = [(k * 10_000_000, wild if k == 30 else np.ones(6), 0b111101 if k == 30 else ALL) for k in range(60)]
     told = list(restamped((0.0, 0.025), samples))

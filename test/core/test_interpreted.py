@@ -3,14 +3,11 @@
 
 """The sample path as plain Python, for a debugger: slow, and the same to the bit."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,11 +28,11 @@ FAULTS = (
 )
 
 
-def digest(parts: list[np.ndarray | bytes]) -> str:
+def digest(parts):
     return hashlib.sha256(b"".join(np.asarray(part).tobytes() for part in parts)).hexdigest()
 
 
-def flight(detector: str) -> tuple[str, int]:
+def flight(detector):
     """Of messages in and out, with three faults, a lost and a cut message; and how many events there were."""
     biases = {"bias__startup_bias_duration": 0.3, "bias__max_rest_rate": 10.0}
     decision = {"decision__latch": False, "decision__clean_time": 0.2}
@@ -48,7 +45,7 @@ def flight(detector: str) -> tuple[str, int]:
     return digest([*ear.fused, *ear.integrity, events]), len(ear.events)
 
 
-def verdicts() -> tuple[str, int]:
+def verdicts():
     """Of all variants of all detectors, after fewer trials at their making than usual; and how many alarms."""
     parts, alarms = [], 0
     with pytest.MonkeyPatch.context() as patch:
@@ -65,12 +62,12 @@ def verdicts() -> tuple[str, int]:
     return digest(parts), alarms
 
 
-def digests() -> dict[str, list[str | int]]:
+def digests():
     found = {"verdicts": verdicts(), **{name: flight(name) for name in ("likelihood_ratio", "sequential")}}
     return {name: list(one) for name, one in found.items()}
 
 
-def test_plain_python_gives_the_same_bits(root: Path) -> None:
+def test_plain_python_gives_the_same_bits(root):
     path = {"PYTHONPATH": os.pathsep.join([str(root / "test"), str(root)])}
     done = subprocess.run(
         [sys.executable, "-m", "core.test_interpreted"],

@@ -3,18 +3,14 @@
 
 """Samples and figures that the tests of several detectors share."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 
-from fdi_ros import Geometry, NoiseModel
+from fdi_ros import Geometry
 from fdi_ros.detectors import DETECTORS
-from fdi_ros.detectors.base import Detector
 
-VARIANTS: list[tuple[str, dict[str, Any]]] = [
+VARIANTS = [
     *((name, {}) for name in sorted(DETECTORS)),
     ("mean_abs_residual", {"tolerance": "paper"}),
     ("rate_deviation", {"tolerance": "paper"}),
@@ -36,18 +32,18 @@ FIVE = np.array(
 FIVE_RATE = np.array([1.0, 2.0, 3.0])
 
 
-def usual_geometry(name: str) -> Geometry:
+def usual_geometry(name):
     """Axes that a detector works on."""
     return Geometry.cone(5) if name == "determinant" else Geometry.two_triad_cone()
 
 
-def random_axes(rng: np.random.Generator, n: int) -> Geometry:
+def random_axes(rng, n):
     """Gaussian rows, normalised."""
     axes = rng.standard_normal((n, 3))
     return Geometry(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
-def lopsided(rng: np.random.Generator, n: int) -> Geometry:
+def lopsided(rng, n):
     """Random axes of random lengths, at times with two parallel or three in one plane."""
     while True:
         axes = rng.standard_normal((n, 3))
@@ -60,7 +56,7 @@ def lopsided(rng: np.random.Generator, n: int) -> Geometry:
             return Geometry(axes)
 
 
-def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows: int) -> tuple[np.ndarray, np.ndarray]:
+def sound(rng, geometry, noise, rows):
     """Samples of healthy channels in motion, as the noise model describes them, and the angular acceleration."""
     n = geometry.n
     model = noise.for_channels(n)
@@ -73,7 +69,7 @@ def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows:
     return z, acceleration
 
 
-def alarms(detector: Detector, noise: NoiseModel, rows: int, seed: int) -> int:
+def alarms(detector, noise, rows, seed):
     """Number of alarms among samples of healthy channels."""
     rng, total = np.random.default_rng(seed), 0
     for start in range(0, rows, 100_000):
@@ -82,12 +78,12 @@ def alarms(detector: Detector, noise: NoiseModel, rows: int, seed: int) -> int:
     return total
 
 
-def within_standard_errors(count: int, rows: int, probability: float, errors: float = 3.0) -> bool:
+def within_standard_errors(count, rows, probability, errors=3.0):
     """Whether a number of alarms fits a probability."""
     return abs(count - rows * probability) <= errors * math.sqrt(rows * probability * (1 - probability))
 
 
-def paper_trials(rng: np.random.Generator, trials: int, amplitude: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+def paper_trials(rng, trials, amplitude=0.1):
     """Samples (trials, 5, 5) of the five-channel example, [k, i] with a fault of 1 in channel i, and their noise."""
     noise = rng.uniform(-amplitude, amplitude, (trials, 5))
     return FIVE @ FIVE_RATE + noise[:, None, :] + np.eye(5), noise
@@ -105,7 +101,7 @@ TABLE_2 = np.array(
 """Table 2 of the paper: [i, j] is d_j with a fault of 1 in channel i."""
 
 
-def table_noise() -> np.ndarray:
+def table_noise():
     """Noise (5,) of least size behind Table 2: it is not printed, but its parity follows from the entries.
 
     Off the diagonal the fault outweighs the noise, so its sign is that of the determinant: the entries are linear in
@@ -119,6 +115,6 @@ def table_noise() -> np.ndarray:
     return np.linalg.lstsq(rows, left, rcond=None)[0]
 
 
-def signed_determinant(z: np.ndarray, j: int) -> float:
+def signed_determinant(z, j):
     """Determinant of [A z] without row j."""
     return float(np.linalg.det(np.delete(np.column_stack([FIVE, z]), j, axis=0)))

@@ -3,14 +3,10 @@
 
 """What every registered detector must do, whatever its method."""
 
-from __future__ import annotations
-
 import math
 import re
-from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
-from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -42,7 +38,7 @@ each = pytest.mark.parametrize("name", NAMES)
 each_variant = pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
 
 
-def detector_of(name: str, noise: NoiseModel = CONSTANT, lopsided: bool = False, **options: Any) -> Detector:
+def detector_of(name, noise=CONSTANT, lopsided=False, **options):
     """A detector without memory of earlier tests; building one anew takes longer than most tests."""
     detector = built(name, noise, lopsided, tuple(options.items()))
     detector.reset()
@@ -50,14 +46,14 @@ def detector_of(name: str, noise: NoiseModel = CONSTANT, lopsided: bool = False,
 
 
 @cache
-def built(name: str, noise: NoiseModel, lopsided: bool, options: tuple[tuple[str, Any], ...]) -> Detector:
+def built(name, noise, lopsided, options):
     geometry = usual_geometry(name)
     if lopsided:
         geometry = random_axes(np.random.default_rng(geometry.n), geometry.n)
     return create_detector(name, geometry, noise, **dict(options))
 
 
-def stream(rng: np.random.Generator, geometry: Geometry, rows: int) -> tuple[np.ndarray, np.ndarray]:
+def stream(rng, geometry, rows):
     """Noisy samples in motion with some faults of all sizes, and the angular acceleration."""
     rate = np.cumsum(rng.normal(0, 0.05, (rows, 3)), axis=0)
     z = rate @ geometry.axes.T + rng.normal(0, SIGMA, (rows, geometry.n))
@@ -66,24 +62,24 @@ def stream(rng: np.random.Generator, geometry: Geometry, rows: int) -> tuple[np.
     return z, rng.normal(0, 5.0, (rows, 3))
 
 
-def lose(rng: np.random.Generator, z: np.ndarray, share: float) -> None:
+def lose(rng, z, share):
     gone = rng.random(z.shape) < share
     z[gone] = rng.choice([np.nan, np.inf, -np.inf], size=int(gone.sum()))
 
 
-def faulty(geometry: Geometry, channel: int, size: float = 50 * SIGMA, samples: int = 40) -> np.ndarray:
+def faulty(geometry, channel, size=50 * SIGMA, samples=40):
     z = np.tile(geometry.axes @ [0.3, -0.2, 0.5], (samples, 1))
     z[:, channel] += size
     return z
 
 
-def in_pieces(detector: Detector, z: np.ndarray, acceleration: np.ndarray | None, cuts: list[int]) -> Verdict:
+def in_pieces(detector, z, acceleration, cuts):
     edges = [0, *sorted(cuts), len(z)]
     parts = [detector.detect(z[a:b], None if acceleration is None else acceleration[a:b]) for a, b in pairwise(edges)]
     return Verdict(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-def assert_same_bits(one: Verdict, other: Verdict) -> None:
+def assert_same_bits(one, other):
     for field, a, b in zip(Verdict._fields, one, other, strict=True):
         assert a.tobytes() == b.tobytes(), f"{field} differs"
 
@@ -91,7 +87,7 @@ def assert_same_bits(one: Verdict, other: Verdict) -> None:
 class TestVerdict:
     @each
     @pytest.mark.parametrize("rows", [0, 1, 2, 33])
-    def test_shapes_and_types(self, name: str, rows: int) -> None:
+    def test_shapes_and_types(self, name, rows):
         detector = detector_of(name)
         z, _ = stream(np.random.default_rng(rows), detector.geometry, rows)
         before = z.copy()
@@ -106,7 +102,7 @@ class TestVerdict:
 
     @each_variant
     @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_fields_agree_with_each_other(self, name: str, options: dict[str, Any], noise: NoiseModel) -> None:
+    def test_fields_agree_with_each_other(self, name, options, noise):
         detector = detector_of(name, noise, lopsided=True, **options)
         if name == "sequential" and not noise.constant:
             pytest.skip("a motion that changes from sample to sample explains more than the fault")
@@ -126,7 +122,7 @@ class TestVerdict:
 
     @each
     @pytest.mark.parametrize("shape", [(3,), (3, 4), (2, 3, 6)])
-    def test_wrong_shape_is_refused(self, name: str, shape: tuple[int, ...]) -> None:
+    def test_wrong_shape_is_refused(self, name, shape):
         with pytest.raises(DetectorError, match="expected"):
             detector_of(name).detect(np.zeros(shape))
 
@@ -143,16 +139,7 @@ class TestStream:
         noise=st.sampled_from([CONSTANT, MOVING]),
         lopsided=st.booleans(),
     )
-    def test_cut_anywhere(
-        self,
-        name: str,
-        options: dict[str, Any],
-        seed: int,
-        cuts: list[int],
-        lost: float,
-        noise: NoiseModel,
-        lopsided: bool,
-    ) -> None:
+    def test_cut_anywhere(self, name, options, seed, cuts, lost, noise, lopsided):
         rng = np.random.default_rng(seed)
         detector = detector_of(name, noise, lopsided, **options)
         z, turning = stream(rng, detector.geometry, 60)
@@ -163,7 +150,7 @@ class TestStream:
         assert_same_bits(whole, in_pieces(detector, z, acceleration, cuts))
 
 
-def on_channels(detector: Detector, kept: np.ndarray) -> Detector | str:
+def on_channels(detector, kept):
     """The same method on some of the channels, or why it cannot run on them."""
     try:
         geometry, noise = detector.geometry.subset(kept), detector.noise.subset(kept)
@@ -175,7 +162,7 @@ def on_channels(detector: Detector, kept: np.ndarray) -> Detector | str:
 class TestAbsentChannels:
     @pytest.mark.parametrize(("name", "options"), BY_SETS, ids=str)
     @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_the_others_judge_as_if_built_alone(self, name: str, options: dict[str, Any], noise: NoiseModel) -> None:
+    def test_the_others_judge_as_if_built_alone(self, name, options, noise):
         detector = detector_of(name, noise, lopsided=True, **options)
         rng, judged = np.random.default_rng(13), 0
         z, acceleration = stream(rng, detector.geometry, 300)
@@ -199,7 +186,7 @@ class TestAbsentChannels:
         assert judged > 100
 
     @pytest.mark.parametrize("gone", [(0,), (4,), (1, 5)])
-    def test_without_some_throughout_it_is_as_if_built_without_them(self, gone: tuple[int, ...]) -> None:
+    def test_without_some_throughout_it_is_as_if_built_without_them(self, gone):
         detector = detector_of("sequential", MOVING, lopsided=True)
         z, _ = stream(np.random.default_rng(23), detector.geometry, 1000)
         z[700:, 2] += LASTING["sequential"]
@@ -215,7 +202,7 @@ class TestAbsentChannels:
 
     @each
     @pytest.mark.parametrize("left", [0, 1, 3])
-    def test_too_few_channels_is_not_healthy_but_unknown(self, name: str, left: int) -> None:
+    def test_too_few_channels_is_not_healthy_but_unknown(self, name, left):
         detector = detector_of(name)
         z, _ = stream(np.random.default_rng(14), detector.geometry, 5)
         z[:, left:] = np.nan
@@ -224,7 +211,7 @@ class TestAbsentChannels:
         assert np.isnan(verdict.threshold).all()
         assert not verdict.alarm.any()
 
-    def test_more_sets_of_channels_than_are_kept(self) -> None:
+    def test_more_sets_of_channels_than_are_kept(self):
         detector = create_detector("max_residual", Geometry.cone(10), CONSTANT, tolerance="paper")
         rng = np.random.default_rng(15)
         z, _ = stream(rng, detector.geometry, 1 << 10)
@@ -238,9 +225,7 @@ class TestAbsentChannels:
 class TestWhatIsMeasured:
     @each_variant
     @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_fault_of_50_sigma_is_named_on_every_isolable_channel(
-        self, name: str, options: dict[str, Any], sign: float
-    ) -> None:
+    def test_fault_of_50_sigma_is_named_on_every_isolable_channel(self, name, options, sign):
         geometry = usual_geometry(name)
         assert geometry.isolable.all()
         for channel in range(geometry.n):
@@ -253,7 +238,7 @@ class TestWhatIsMeasured:
 
     @each_variant
     @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_value_no_gyro_can_measure(self, name: str, options: dict[str, Any], noise: NoiseModel) -> None:
+    def test_value_no_gyro_can_measure(self, name, options, noise):
         """The squares of such values would overflow, and a NaN statistic is no alarm."""
         acceleration = np.ones((40, 3))
         for channel in range(usual_geometry(name).n):
@@ -270,7 +255,7 @@ class TestWhatIsMeasured:
                 assert_same_bits(verdict, detector_of(name, noise, **options).detect(wild, acceleration))
 
     @each
-    def test_no_alarm_without_noise(self, name: str) -> None:
+    def test_no_alarm_without_noise(self, name):
         rate = np.random.default_rng(15).uniform(-5, 5, (500, 3))
         rate[:20] = 0
         verdict = detector_of(name).detect(rate @ usual_geometry(name).axes.T)
@@ -279,7 +264,7 @@ class TestWhatIsMeasured:
         assert (verdict.statistic < (math.log(501) if name == "sequential" else 1e-6)).all()
 
     @pytest.mark.parametrize("name", sorted(set(NAMES) - {"sequential"}))
-    def test_verdict_does_not_depend_on_the_body_rate(self, name: str) -> None:
+    def test_verdict_does_not_depend_on_the_body_rate(self, name):
         """Of `sequential` it does: scale errors, which are never known to be zero, show in motion alone."""
         rng = np.random.default_rng(16)
         z, _ = stream(rng, usual_geometry(name), 500)
@@ -294,7 +279,7 @@ class TestWhatIsMeasured:
         np.testing.assert_allclose(moved.error[clear], still.error[clear], atol=1e-9)
 
     @pytest.mark.parametrize("name", sorted(set(NAMES) - {"recursive"}))
-    def test_verdict_does_not_depend_on_the_order_of_channels(self, name: str) -> None:
+    def test_verdict_does_not_depend_on_the_order_of_channels(self, name):
         """`recursive` takes its equations in their order."""
         rng = np.random.default_rng(19)
         n = usual_geometry(name).n
@@ -315,7 +300,7 @@ class TestWhatIsMeasured:
                 np.testing.assert_allclose(other.error, one.error[:, order], atol=1e-12)
 
 
-def unequal(seed: int, n: int) -> tuple[Geometry, NoiseModel]:
+def unequal(seed, n):
     """Random axes, channels of unequal noise."""
     rng = np.random.default_rng(seed)
     return random_axes(rng, n), NoiseModel(rng.uniform(0.5e-3, 2e-3, n))
@@ -325,7 +310,7 @@ SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_
 SLOWLY = NoiseModel(SIGMA, scale_std=1e-3, timing_std=1e-4)
 CONE, DODECAHEDRON, PAPER = Geometry.two_triad_cone(), Geometry.dodecahedron(), Geometry(FIVE)
 FOUR, UNLIKE = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3]), NoiseModel(SIGMA * np.array([1.0, 2.0, 0.5, 1.0, 4.0, 1.0]))
-AS_MANY: list[tuple[str, Geometry, NoiseModel, float]] = [
+AS_MANY = [
     *((name, usual_geometry(name), CONSTANT, 1e-2) for name in RATE_OPTIONS),
     *((name, Geometry.cone(4), FOUR, 1e-2) for name in SEARCHES),
     *((name, geometry, CONSTANT, 1e-3) for name in SEARCHES for geometry in (CONE, DODECAHEDRON)),
@@ -340,7 +325,7 @@ AS_MANY: list[tuple[str, Geometry, NoiseModel, float]] = [
     *(("likelihood_ratio", geometry, MOVING, 1e-3) for geometry in (CONE, random_axes(np.random.default_rng(3), 7))),
 ]
 LOPSIDED = {n: random_axes(np.random.default_rng(3), n) for n in (5, 6)}
-HARDLY_MORE: list[tuple[str, Geometry, NoiseModel]] = [
+HARDLY_MORE = [
     *((name, LOPSIDED[usual_geometry(name).n], noise) for name in RATE_OPTIONS for noise in (CONSTANT, MOVING)),
     *((name, *unequal(12, 7)) for name in SEARCHES),
 ]
@@ -348,7 +333,7 @@ HARDLY_MORE: list[tuple[str, Geometry, NoiseModel]] = [
 
 class TestFalseAlarms:
     @pytest.mark.parametrize(("name", "geometry", "noise", "probability"), AS_MANY)
-    def test_as_many_as_asked_for(self, name: str, geometry: Geometry, noise: NoiseModel, probability: float) -> None:
+    def test_as_many_as_asked_for(self, name, geometry, noise, probability):
         """Above three parity dimensions the threshold itself is an estimate, good to about 1 %."""
         detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
         rows = 200_000 if probability > 1e-4 else 3_000_000
@@ -356,13 +341,13 @@ class TestFalseAlarms:
         assert within_standard_errors(count, rows, probability, 3.0 if noise.constant else 3.5)
 
     @pytest.mark.parametrize(("name", "geometry", "noise"), HARDLY_MORE)
-    def test_hardly_more_nor_far_fewer_on_any_axes(self, name: str, geometry: Geometry, noise: NoiseModel) -> None:
+    def test_hardly_more_nor_far_fewer_on_any_axes(self, name, geometry, noise):
         rows, probability = 100_000, 0.01
         detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
         assert 0.5 < alarms(detector, noise, rows, 1) / (rows * probability) < 1.1
 
     @pytest.mark.parametrize("name", [*RATE_OPTIONS, *RUN_LENGTHS])
-    def test_per_hour_is_a_probability_per_sample_or_a_run_length(self, name: str) -> None:
+    def test_per_hour_is_a_probability_per_sample_or_a_run_length(self, name):
         per_sample = {"run_length": 1e5} if name in RUN_LENGTHS else {"false_alarm_probability": 1e-5}
         per_hour = {"false_alarms_per_hour": 3.6, "sample_rate": 100.0}
         one, other = (
@@ -373,7 +358,7 @@ class TestFalseAlarms:
         assert name not in RUN_LENGTHS or detector_of(name).run_length == 3.6e8
 
 
-def last_verdicts(name: str, geometry: Geometry, **options: Any) -> Iterator[tuple[int, Verdict]]:
+def last_verdicts(name, geometry, **options):
     """Of a large fault of each channel in turn, the last sample's verdict."""
     detector = create_detector(name, geometry, CONSTANT, **options)
     for channel in range(geometry.n):
@@ -384,21 +369,21 @@ def last_verdicts(name: str, geometry: Geometry, **options: Any) -> Iterator[tup
 
 class TestChannelsThatCannotBeToldApart:
     @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_two_parallel_triads(self, name: str) -> None:
+    def test_two_parallel_triads(self, name):
         for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 2)):
             assert last.alarm
             assert not last.isolated
             assert set(np.flatnonzero(last.suspects)) == {channel, (channel + 3) % 6}
 
     @pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
-    def test_two_of_five_channels(self, criterion: str) -> None:
+    def test_two_of_five_channels(self, criterion):
         geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]])
         for _, last in list(last_verdicts("determinant", geometry, criterion=criterion))[:2]:
             assert not last.isolated
             assert np.flatnonzero(last.suspects).tolist() == [0, 1]
 
     @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_three_parallel_triads(self, name: str) -> None:
+    def test_three_parallel_triads(self, name):
         for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 3)):
             assert last.alarm
             assert last.suspects[channel]
@@ -406,14 +391,14 @@ class TestChannelsThatCannotBeToldApart:
             assert name not in SINGLE_FAULT or (last.isolated and last.suspects.sum() == 1)
 
     @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_four_channels_detect_and_do_not_isolate(self, name: str) -> None:
+    def test_four_channels_detect_and_do_not_isolate(self, name):
         for _, last in last_verdicts(name, Geometry.cone(4)):
             assert last.alarm
             assert last.suspects.all()
             assert not last.isolated
 
     @each_variant
-    def test_channel_no_fault_of_which_is_seen_is_never_suspect(self, name: str, options: dict[str, Any]) -> None:
+    def test_channel_no_fault_of_which_is_seen_is_never_suspect(self, name, options):
         root = np.sqrt(0.5)
         axes = [[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0.8, 0]]
         geometry = Geometry(axes if name in ANY_NUMBER else axes[:5])
@@ -430,12 +415,10 @@ class TestLopsidedAxes:
     `recursive` is not asked: noise alone may make what it divides by small.
     """
 
-    METHODS: ClassVar[list[tuple[str, dict[str, Any]]]] = [
-        (name, options) for name, options in VARIANTS if name in SINGLE_FAULT and name != "recursive"
-    ]
-
-    @pytest.mark.parametrize(("name", "options"), METHODS, ids=str)
-    def test_isolated_verdict_is_never_wrong(self, name: str, options: dict[str, Any]) -> None:
+    @pytest.mark.parametrize(
+        ("name", "options"), [one for one in VARIANTS if one[0] in SINGLE_FAULT and one[0] != "recursive"], ids=str
+    )
+    def test_isolated_verdict_is_never_wrong(self, name, options):
         isolated = 0
         for seed in range(30):
             rng = np.random.default_rng(seed)
@@ -455,7 +438,7 @@ class TestLopsidedAxes:
         assert isolated > 60
 
 
-REFUSED: list[tuple[str, dict[str, Any], str]] = [
+REFUSED = [
     *((name, options, words) for name in RATE_OPTIONS for options, words in (
         ({"false_alarm_probability": 0.0}, "is 0, expected between 0 and 1"),
         ({"false_alarm_probability": 1.0}, "is 1, expected between 0 and 1"),
@@ -490,23 +473,23 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
 
 class TestBadOptions:
     @each
-    def test_unknown_option(self, name: str) -> None:
+    def test_unknown_option(self, name):
         with pytest.raises(DetectorError, match=r"no option 'sensitivity', expected one of: \w+"):
             create_detector(name, usual_geometry(name), CONSTANT, sensitivity=3)
 
     @pytest.mark.parametrize(("name", "options", "words"), REFUSED)
-    def test_refused(self, name: str, options: dict[str, Any], words: str) -> None:
+    def test_refused(self, name, options, words):
         with pytest.raises(FdiError) as caught:
             create_detector(name, usual_geometry(name), CONSTANT, **options)
         assert words in str(caught.value)
         assert "\n" not in str(caught.value)
 
-    def test_unknown_detector(self) -> None:
+    def test_unknown_detector(self):
         with pytest.raises(DetectorError, match=r"unknown detector 'median', expected one of: .*max_residual"):
             create_detector("median", Geometry.two_triad_cone(), CONSTANT)
 
     @each
-    def test_numbers_of_channels_refused_are_those_that_fail(self, name: str) -> None:
+    def test_numbers_of_channels_refused_are_those_that_fail(self, name):
         for n in range(4, 13):
             if reason := detector_class(name).refuses(n):
                 with pytest.raises(DetectorError, match=f"^{re.escape(reason)}$"):

@@ -3,10 +3,7 @@
 
 """CUSUM: run lengths and delays by simulation, the recursion itself, onset, bounded memory."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,15 +19,13 @@ TABLE = [(0.25, 66.6, 510), (0.5, 35.5, 138), (1.0, 18.5, 37), (2.0, 9.4, 10)]
 """Shift, threshold for a run length of 3.6e8 samples of one two-sided sum, mean samples until it is found."""
 
 
-def cusum(geometry: Geometry, noise: NoiseModel = UNIT, **options: Any) -> Cusum:
+def cusum(geometry, noise=UNIT, **options):
     detector = create_detector("cusum", geometry, noise, **options)
     assert isinstance(detector, Cusum)
     return detector
 
 
-def runs_to_alarm(
-    detector: Cusum, noise: NoiseModel, runs: int, seed: int, shift: np.ndarray | float = 0.0, block: int = 500
-) -> np.ndarray:
+def runs_to_alarm(detector, noise, runs, seed, shift=0.0, block=500):
     """Samples until the alarm, from the start, in so many runs."""
     rng, lengths = np.random.default_rng(seed), []
     for _ in range(runs):
@@ -44,7 +39,7 @@ def runs_to_alarm(
     return np.array(lengths)
 
 
-def test_scores_are_the_sums() -> None:
+def test_scores_are_the_sums():
     geometry, z = Geometry.dodecahedron(), np.random.default_rng(1).normal(0.3, 1, (200, 6))
     detector = cusum(geometry, shift=0.5)
     w = (z @ geometry.S) / geometry.sensitivity
@@ -55,7 +50,7 @@ def test_scores_are_the_sums() -> None:
 
 
 @pytest.mark.parametrize(("shift", "h", "published"), TABLE)
-def test_threshold_and_delay_are_those_published(shift: float, h: float, published: float) -> None:
+def test_threshold_and_delay_are_those_published(shift, h, published):
     assert threshold_for(3.6e8, shift / 2, TWO_SIDES) == pytest.approx(h, abs=0.06)
     geometry = Geometry.cone(4)
     detector = cusum(geometry, shift=shift)
@@ -76,13 +71,13 @@ class TestThreshold:
             (Geometry.cone(9), UNIT, 2.0),
         ],
     )
-    def test_run_length(self, geometry: Geometry, noise: NoiseModel, shift: float) -> None:
+    def test_run_length(self, geometry, noise, shift):
         # 3.6e8 samples take minutes: here shorter ones, where the approximation is worse.
         detector = cusum(geometry, noise, shift=shift, run_length=1000)
         lengths = runs_to_alarm(detector, noise, 600, 5)
         assert lengths.mean() == pytest.approx(1000, rel=0.14)
 
-    def test_a_scale_factor_error_in_a_long_turn_is_no_drift(self) -> None:
+    def test_a_scale_factor_error_in_a_long_turn_is_no_drift(self):
         """It keeps its sign for as long as the turn lasts: as white noise it would alarm within seconds."""
         geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(11)
         noise = NoiseModel(0.003, scale_std=0.002, timing_std=0.0)
@@ -98,7 +93,7 @@ class TestThreshold:
         assert found.alarm[15_000:].any()
         assert found.suspects[-1].tolist() == [False, False, False, True, False, False]
 
-    def test_what_a_start_up_average_leaves_is_no_drift(self) -> None:
+    def test_what_a_start_up_average_leaves_is_no_drift(self):
         """12 runs of 300 s at rest at 100 Hz, after an average over 3 s."""
         geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
         noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
@@ -120,7 +115,7 @@ class TestThreshold:
 
 
 class TestDelay:
-    def test_late_fault_takes_no_longer(self) -> None:
+    def test_late_fault_takes_no_longer(self):
         # An hour at 100 Hz of a strong fault on one channel, a pause, then another: memory is bounded.
         rng, geometry = np.random.default_rng(8), Geometry.dodecahedron()
         z = rng.standard_normal((3000, 6))
@@ -139,7 +134,7 @@ class TestDelay:
 class TestNaming:
     @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
     @pytest.mark.parametrize("sign", [1, -1])
-    def test_drifting_channel_is_named(self, geometry: Geometry, sign: int) -> None:
+    def test_drifting_channel_is_named(self, geometry, sign):
         detector, rng = cusum(geometry, shift=0.5), np.random.default_rng(9)
         named = isolated = 0
         for _ in range(100):
@@ -154,7 +149,7 @@ class TestNaming:
         assert named == 100
         assert isolated >= 97
 
-    def test_onset(self) -> None:
+    def test_onset(self):
         detector, rng, off = cusum(Geometry.dodecahedron(), shift=1.0), np.random.default_rng(11), []
         for _ in range(150):
             begin = int(rng.integers(300, 700))
@@ -172,9 +167,7 @@ class TestNaming:
 
     @pytest.mark.parametrize(("scale", "timing"), [(0.002, 0.0003), (0.01, 0.0005)])
     @pytest.mark.parametrize("size", [0.1, 0.5, 2.0, 5.0, 30.0])
-    def test_no_sound_channel_is_isolated_under_rate_dependent_noise(
-        self, scale: float, timing: float, size: float
-    ) -> None:
+    def test_no_sound_channel_is_isolated_under_rate_dependent_noise(self, scale, timing, size):
         """A large fault passes for rate in the statistics of the others, and shrinks them."""
         geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(13)
         noise = NoiseModel(0.0025, scale, timing)

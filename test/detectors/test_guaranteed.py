@@ -3,11 +3,7 @@
 
 """Guaranteed intervals: the paper's example, linear programmes as oracle, and what certainty means."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +16,13 @@ from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 
 
-def guaranteed(geometry: Geometry, bound: Any = 1.0, **options: Any) -> Guaranteed:
+def guaranteed(geometry, bound=1.0, **options):
     detector = create_detector("guaranteed", geometry, NoiseModel(1.0, bound=bound), **options)
     assert isinstance(detector, Guaranteed)
     return detector
 
 
-def sample(rng: np.random.Generator, geometry: Geometry, bound: np.ndarray, faults: int) -> np.ndarray:
+def sample(rng, geometry, bound, faults):
     error = rng.uniform(-1, 1, geometry.n) * bound
     error[rng.choice(geometry.n, faults, replace=False)] += rng.normal(0, 20, faults)
     return geometry.axes @ rng.normal(0, 10, 3) + error
@@ -38,7 +34,7 @@ class TestWorkedExample:
     geometry = Geometry([[-c, -s, 0], [c, s / 2, -h], [-c, s / 2, h], [c, -s, 0], [-c, s / 2, -h], [c, s / 2, h]])
     z = geometry.axes @ [-172.82, 604.19, -1284.63] + [0.50, 20.10, -50.80, -0.01, -0.02, 0.30]
 
-    def test_intervals_and_verdict_are_those_printed(self) -> None:
+    def test_intervals_and_verdict_are_those_printed(self):
         printed = [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19]
         np.testing.assert_allclose(self.z, printed, atol=0.0051)
         detector = guaranteed(self.geometry, max_faults=2)
@@ -56,7 +52,7 @@ class TestWorkedExample:
 
 class TestAgainstLinearProgrammes:
     @pytest.mark.parametrize(("n", "trials"), [(5, 8), (6, 8), (7, 5), (9, 3)])
-    def test_intervals_and_culprits(self, n: int, trials: int) -> None:
+    def test_intervals_and_culprits(self, n, trials):
         rng = np.random.default_rng(n)
         for k in range(trials):
             # Nine channels: of three axes, with up to two faults.
@@ -70,7 +66,7 @@ class TestAgainstLinearProgrammes:
             largest = [len(channels) == most for channels in detector.sets]
             assert detector.culprits(z[None])[0][largest].tolist() == feasible
 
-    def test_mildest_explanation(self) -> None:
+    def test_mildest_explanation(self):
         rng, compared = np.random.default_rng(20), 0
         while compared < 12:
             geometry, bound = lopsided(rng, 6), rng.uniform(0.5, 2, 6)
@@ -84,7 +80,7 @@ class TestAgainstLinearProgrammes:
                 assert statistic < 1.001
 
 
-def by_programmes(H: np.ndarray, bound: np.ndarray, z: np.ndarray, faults: int) -> tuple[np.ndarray, list[bool]]:
+def by_programmes(H, bound, z, faults):
     """Extremes (2, n) of every channel's error over all sets left out, and which sets are feasible."""
     n, feasible = len(H), []
     hull = np.stack([np.full(n, np.inf), np.full(n, -np.inf)])
@@ -100,7 +96,7 @@ def by_programmes(H: np.ndarray, bound: np.ndarray, z: np.ndarray, faults: int) 
     return (hull if any(feasible) else np.full((2, n), np.nan)), feasible
 
 
-def least_largest(H: np.ndarray, bound: np.ndarray, z: np.ndarray, struck: tuple[int, ...]) -> float:
+def least_largest(H, bound, z, struck):
     """Least t for which the errors of the channels struck stay within t bounds and all others within one."""
     grows = np.isin(np.arange(len(H)), struck) * bound
     fixed = bound - grows
@@ -117,7 +113,7 @@ def least_largest(H: np.ndarray, bound: np.ndarray, z: np.ndarray, struck: tuple
     size=st.floats(0, 100),
     threshold=st.sampled_from([0.5, 1, 3, 10]),
 )
-def test_what_is_certain_is_true(seed: int, n: int, size: float, threshold: float) -> None:
+def test_what_is_certain_is_true(seed, n, size, threshold):
     rng = np.random.default_rng(seed)
     geometry, bound = lopsided(rng, n), rng.uniform(0.5, 2, n)
     detector = guaranteed(geometry, bound, threshold=threshold)
@@ -139,7 +135,7 @@ def test_what_is_certain_is_true(seed: int, n: int, size: float, threshold: floa
     assert (verdict.scores <= np.abs(error) / bound + 1e-9).all()
 
 
-def test_more_faults_than_allowed_are_a_contradiction() -> None:
+def test_more_faults_than_allowed_are_a_contradiction():
     geometry = Geometry.dodecahedron()
     z = geometry.axes @ [1.0, 2.0, 3.0] + np.array([60, -70, 80, 0, 0, 0])
     detector = guaranteed(geometry, max_faults=1)
@@ -153,7 +149,7 @@ def test_more_faults_than_allowed_are_a_contradiction() -> None:
     assert not verdict.error.any()
 
 
-def test_both_channels_of_an_axis_struck_leave_it_without_bounds() -> None:
+def test_both_channels_of_an_axis_struck_leave_it_without_bounds():
     # With both x channels struck nothing measures x: the pair may be off by any amount.
     detector = guaranteed(Geometry.from_triads([np.eye(3), np.eye(3)]), max_faults=2)
     z = np.array([[30.0, 0, 0, 0, 0, 0]])
@@ -169,7 +165,7 @@ def test_both_channels_of_an_axis_struck_leave_it_without_bounds() -> None:
 
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), n=st.integers(4, 9), threshold=st.sampled_from([1, 3, 10]))
-def test_verdict_follows_from_the_intervals(seed: int, n: int, threshold: float) -> None:
+def test_verdict_follows_from_the_intervals(seed, n, threshold):
     """Also where channels are absent, and each row for itself."""
     rng = np.random.default_rng(seed)
     geometry = lopsided(rng, n)
@@ -207,12 +203,12 @@ SIX = Geometry.two_triad_cone()
         (lambda: guaranteed(SIX).culprits(np.zeros(6)), "z has shape (6,), expected (N, 6)"),
     ],
 )
-def test_refused(build: Callable[[], Any], words: str) -> None:
+def test_refused(build, words):
     with pytest.raises(FdiError) as caught:
         build()
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_default_is_as_many_faults_as_the_channels_allow() -> None:
+def test_default_is_as_many_faults_as_the_channels_allow():
     assert [guaranteed(Geometry.cone(n)).max_faults for n in range(4, 10)] == [0, 1, 2, 2, 2, 2]

@@ -3,8 +3,6 @@
 
 """Projector, recursion and determinants against their definitions, linear programmes and the tables of their paper."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from detectors.detector_trials import FIVE, FIVE_RATE, TABLE_2, alarms, paper_trials, random_axes, table_noise
@@ -16,13 +14,13 @@ from fdi_ros.detectors.papers.identification import CRITERIA, Determinant, Proje
 UNIT = NoiseModel(1.0)
 
 
-def noisy(rng: np.random.Generator, geometry: Geometry, rows: int) -> np.ndarray:
+def noisy(rng, geometry, rows):
     return rng.uniform(-3, 3, (rows, 3)) @ geometry.axes.T + rng.standard_normal((rows, geometry.n))
 
 
 @pytest.mark.parametrize("construction", ["svd", "qr"])
 @pytest.mark.parametrize("n", [4, 5, 6, 7, 9])
-def test_scores_are_j_by_its_definition(n: int, construction: str) -> None:
+def test_scores_are_j_by_its_definition(n, construction):
     rng = np.random.default_rng(n)
     geometry = random_axes(rng, n)
     z = noisy(rng, geometry, 50)
@@ -41,7 +39,7 @@ def test_scores_are_j_by_its_definition(n: int, construction: str) -> None:
 
 
 @pytest.mark.parametrize("n", [5, 6, 7, 9])
-def test_names_the_likelihood_ratio_choice(n: int) -> None:
+def test_names_the_likelihood_ratio_choice(n):
     rng = np.random.default_rng(n)
     for _ in range(20):
         geometry = random_axes(rng, n)
@@ -57,7 +55,7 @@ def test_names_the_likelihood_ratio_choice(n: int) -> None:
 
 class TestLeastOneNorm:
     @pytest.mark.parametrize("n", [4, 5, 6, 7])
-    def test_equals_a_linear_programme(self, n: int) -> None:
+    def test_equals_a_linear_programme(self, n):
         rng = np.random.default_rng(n)
         for _ in range(12):
             geometry = random_axes(rng, n)
@@ -72,12 +70,12 @@ class TestLeastOneNorm:
                 # The optimum of continuous data is unique: not only its size, every entry is the programme's.
                 np.testing.assert_allclose(scores[row], np.abs(best.x[:n] - best.x[n:]), atol=1e-7)
 
-    def test_false_alarms_are_at_most_those_asked_for(self) -> None:
+    def test_false_alarms_are_at_most_those_asked_for(self):
         detector = Projector(Geometry.dodecahedron(), UNIT, norm="l1", false_alarm_probability=1e-3)
         assert 100 < alarms(detector, UNIT, 200_000, 20) <= 240
 
 
-def k_s(axes: np.ndarray, std: np.ndarray, z: np.ndarray, last: int) -> list[float]:
+def k_s(axes, std, z, last):
     """k_s of every equation after the third, by the paper's recursion, `last` taken last."""
     n = len(axes)
     order = [(last + 1 + k) % n for k in range(n)]
@@ -97,7 +95,7 @@ def k_s(axes: np.ndarray, std: np.ndarray, z: np.ndarray, last: int) -> list[flo
 
 
 @pytest.mark.parametrize("n", [4, 5, 6, 7, 9])
-def test_all_permutations_at_once_equal_the_recursion(n: int) -> None:
+def test_all_permutations_at_once_equal_the_recursion(n):
     rng = np.random.default_rng(n)
     geometry = random_axes(rng, n)
     std = rng.uniform(0.5, 2.0, n)
@@ -113,7 +111,7 @@ def test_all_permutations_at_once_equal_the_recursion(n: int) -> None:
 
 
 class TestPaperExample:
-    def test_table_1_largest_ratio_is_where_the_failed_channel_is_last(self) -> None:
+    def test_table_1_largest_ratio_is_where_the_failed_channel_is_last(self):
         detector = Recursive(Geometry(FIVE), NoiseModel(0.1 / np.sqrt(3)))
         scores = detector.detect(FIVE @ FIVE_RATE + table_noise() + np.eye(5)).scores
         assert scores.argmax(axis=1).tolist() == [0, 1, 2, 3, 4]
@@ -123,13 +121,13 @@ class TestPaperExample:
         assert (lead > 1.6).all()
 
 
-def struck(axes: np.ndarray, z: np.ndarray) -> np.ndarray:
+def struck(axes, z):
     """[axes z] of samples (N, 5) without each row in turn, (N, 5, 4, 4)."""
     both = np.concatenate([np.broadcast_to(axes, (len(z), 5, 3)), z[:, :, None]], axis=2)
     return np.stack([np.delete(both, j, axis=1) for j in range(5)], axis=1)
 
 
-def test_scores_are_the_determinants() -> None:
+def test_scores_are_the_determinants():
     rng = np.random.default_rng(1)
     for _ in range(20):
         geometry = random_axes(rng, 5)
@@ -138,7 +136,7 @@ def test_scores_are_the_determinants() -> None:
         np.testing.assert_allclose(scores, np.abs(np.linalg.det(struck(geometry.axes, z))), rtol=1e-9, atol=1e-12)
 
 
-def test_table_2() -> None:
+def test_table_2():
     scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ FIVE_RATE + table_noise() + np.eye(5)).scores
     np.testing.assert_allclose(scores, TABLE_2, atol=1e-4)
     assert np.abs(table_noise()).max() <= 0.1
@@ -149,9 +147,7 @@ def test_table_2() -> None:
     [(Recursive, {}, 0.999), *((Determinant, {"criterion": name}, 0.999) for name in CRITERIA), (Projector, {}, 0.98)],
     ids=str,
 )
-def test_the_example_of_the_paper_is_named_correctly_for_all_five_faults(
-    method: type[Recursive | Determinant | Projector], options: dict[str, str], share: float
-) -> None:
+def test_the_example_of_the_paper_is_named_correctly_for_all_five_faults(method, options, share):
     z, _ = paper_trials(np.random.default_rng(3), 10_000)
     detector = method(Geometry(FIVE), NoiseModel(0.1 / np.sqrt(3)), **options)
     for channel in range(5):
@@ -161,7 +157,7 @@ def test_the_example_of_the_paper_is_named_correctly_for_all_five_faults(
 
 
 class TestConditionNumber:
-    def test_equals_the_2_norm_condition_number(self) -> None:
+    def test_equals_the_2_norm_condition_number(self):
         rng = np.random.default_rng(4)
         for _ in range(40):
             geometry = random_axes(rng, 5)
@@ -173,7 +169,7 @@ class TestConditionNumber:
             assert ordinary.mean() > 0.5
             np.testing.assert_allclose(scores[ordinary], expected[ordinary], rtol=1e-8)
 
-    def test_singular_is_infinite_and_no_alarm(self) -> None:
+    def test_singular_is_infinite_and_no_alarm(self):
         verdict = Determinant(Geometry(FIVE), UNIT, criterion="condition_number").detect(np.zeros((3, 5)))
         assert np.isposinf(verdict.scores).all()
         assert not verdict.alarm.any()

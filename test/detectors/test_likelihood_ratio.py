@@ -3,8 +3,6 @@
 
 """Likelihood ratio: published probabilities, independent least squares, false alarms, what it may claim."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 
@@ -22,7 +20,7 @@ MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)
 CONFIDENCE = 0.999
 
 
-def fit(H: np.ndarray, z: np.ndarray, variance: np.ndarray, kept: list[int]) -> tuple[np.ndarray, float, np.ndarray]:
+def fit(H, z, variance, kept):
     """Weighted least squares of the channels kept: rate, chi-square left, covariance of the rate."""
     white = H[kept] / np.sqrt(variance[kept])[:, None]
     rate = np.linalg.lstsq(white, z[kept] / np.sqrt(variance[kept]), rcond=None)[0]
@@ -30,23 +28,19 @@ def fit(H: np.ndarray, z: np.ndarray, variance: np.ndarray, kept: list[int]) -> 
     return rate, float(left @ left), np.linalg.inv(white.T @ white)
 
 
-def variance_without(
-    geometry: Geometry, noise: NoiseModel, z: np.ndarray, a: np.ndarray, kept: list[int]
-) -> np.ndarray:
+def variance_without(geometry, noise, z, a, kept):
     rate = np.linalg.lstsq(geometry.axes[kept], z[kept], rcond=None)[0]
     return noise.for_channels(geometry.n).variance(geometry, rate[None], a[None])[0]
 
 
-def chi_square_without(
-    geometry: Geometry, noise: NoiseModel, z: np.ndarray, a: np.ndarray, out: tuple[int, ...]
-) -> float:
+def chi_square_without(geometry, noise, z, a, out):
     kept = [i for i in range(geometry.n) if i not in out]
     return fit(geometry.axes, z, variance_without(geometry, noise, z, a, kept), kept)[1]
 
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 100_000), n=st.integers(4, 9), moving=st.booleans())
-def test_statistics_equal_weighted_least_squares(seed: int, n: int, moving: bool) -> None:
+def test_statistics_equal_weighted_least_squares(seed, n, moving):
     rng = np.random.default_rng(seed)
     geometry = random_axes(rng, n)
     assume(geometry.sensitivity.min() > 0.1)
@@ -67,9 +61,7 @@ def test_statistics_equal_weighted_least_squares(seed: int, n: int, moving: bool
 class TestSingleFault:
     @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
     @pytest.mark.parametrize("confidence", [0.9, 0.999])
-    def test_true_channel_is_lost_no_more_often_than_the_confidence_says(
-        self, geometry: Geometry, confidence: float
-    ) -> None:
+    def test_true_channel_is_lost_no_more_often_than_the_confidence_says(self, geometry, confidence):
         options = {"false_alarm_probability": 1e-3, "confidence": confidence}
         detector, rows = create_detector("likelihood_ratio", geometry, UNIT, **options), 100_000
         for b in (3, 5, 7, 10):
@@ -83,9 +75,7 @@ class TestSingleFault:
 class TestTwoFaults:
     @settings(max_examples=40)
     @given(seed=st.integers(0, 100_000), n=st.integers(6, 8), moving=st.booleans(), size=st.floats(8, 40))
-    def test_suspects_are_the_channels_of_all_pairs_that_fit(
-        self, seed: int, n: int, moving: bool, size: float
-    ) -> None:
+    def test_suspects_are_the_channels_of_all_pairs_that_fit(self, seed, n, moving, size):
         rng = np.random.default_rng(seed)
         geometry = random_axes(rng, n)
         assume(np.abs(geometry.rho[~np.eye(n, dtype=bool)]).max() < 0.99 and geometry.sensitivity.min() > 0.1)
@@ -108,7 +98,7 @@ class TestTwoFaults:
         assert set(np.flatnonzero(verdict.suspects[0])) == expected
         assert verdict.isolated[0] == isolated
 
-    def test_isolated_pair_is_the_true_one(self) -> None:
+    def test_isolated_pair_is_the_true_one(self):
         rng, rows = np.random.default_rng(51), 20_000
         geometry = Geometry.cone(9)
         z = rng.standard_normal((rows, 9))
@@ -121,7 +111,7 @@ class TestTwoFaults:
         assert (verdict.isolated & ~right).sum() <= 2e-3 * rows
         np.testing.assert_allclose(verdict.error[right][:, pair].mean(axis=0), [25, -20], atol=0.1)
 
-    def test_five_channels_never_isolate_a_pair(self) -> None:
+    def test_five_channels_never_isolate_a_pair(self):
         geometry = Geometry.cone(5)
         z = np.random.default_rng(53).standard_normal((5000, 5))
         # Two neighbouring parity directions, 36 deg apart: the sum is 18 deg from the nearest single one.

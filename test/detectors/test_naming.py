@@ -3,8 +3,6 @@
 
 """Naming by odds: the hypotheses against an independent Bayes, the set chosen, and what cannot be told apart."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
@@ -39,7 +37,7 @@ PARALLEL = Geometry.from_triads([np.eye(3)] * 3)
 class Mean:
     """A mean to be explained, its covariance, and the motion it is of."""
 
-    def __init__(self, geometry: Geometry, y: np.ndarray, covariance: np.ndarray | float) -> None:
+    def __init__(self, geometry, y, covariance):
         self.geometry, self.n = geometry, geometry.n
         self.y, self.covariance = y, np.eye(self.n) * covariance if np.isscalar(covariance) else covariance
         self.members = np.zeros(MAX_UNITS, dtype=np.int64)
@@ -52,19 +50,19 @@ class Mean:
         eliminate_rate(own["parity"], self.n, self.axes, UNKNOWN_RATE)
 
     @property
-    def axes(self) -> np.ndarray:
+    def axes(self):
         return self.geometry.axes.copy()
 
-    def moving(self, rate: np.ndarray, acceleration: np.ndarray) -> Mean:
+    def moving(self, rate, acceleration):
         self.own["rate"], self.own["angular_acceleration"][: self.n] = rate, self.geometry.axes @ acceleration
         return self
 
-    def explained(self, confidence: float = 0.999) -> tuple[set[int], set[int]]:
+    def explained(self, confidence=0.999):
         """Channels that are faulty, and those of which one is."""
         explain(self.own, self.n, self.axes, self.members, len(self.geometry.units), confidence)
         return channels_of(int(self.own["common"])), channels_of(int(self.own["union"]))
 
-    def hypotheses(self) -> list[tuple[int, float, int]]:
+    def hypotheses(self):
         """Channels, logarithm of the odds and kind of each."""
         explain(self.own, self.n, self.axes, self.members, len(self.geometry.units), 0.999)
         self.own["count"] = 0
@@ -74,30 +72,30 @@ class Mean:
         return list(zip(*(self.own[name][:count].tolist() for name in ("members", "odds", "whole")), strict=True))
 
 
-def channels_of(mask: int) -> set[int]:
+def channels_of(mask):
     return {i for i in range(12) if mask >> i & 1}
 
 
-def evidence(mean: Mean, errors: np.ndarray) -> float:
+def evidence(mean, errors):
     """Logarithm of the likelihood of the parity vector with errors of that covariance (n, n)."""
     parity = mean.geometry.parity
     spread = parity @ (mean.covariance + errors) @ parity.T
     return float(multivariate_normal.logpdf(parity @ mean.y, cov=spread))
 
 
-def amplitudes(mean: Mean, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def amplitudes(mean, directions):
     """Generalised least squares with a rate and amplitudes (k,) of directions (n, k): estimates and covariance."""
     columns, weight = np.hstack([mean.geometry.axes, directions]), np.linalg.inv(mean.covariance)
     normal = columns.T @ weight @ columns
     return np.linalg.solve(normal, columns.T @ weight @ mean.y)[3:], np.linalg.inv(normal)[3:, 3:]
 
 
-def oracle(mean: Mean) -> list[tuple[int, float, int]]:
+def oracle(mean):
     """All hypotheses in order, each by the density of the parity vector with and without it."""
     n, unit_vectors = mean.n, np.eye(mean.n)
     healthy, found = evidence(mean, np.zeros((n, n))), []
 
-    def take(channels: tuple[int, ...], prior: float, directions: np.ndarray, std: float = 0.0) -> None:
+    def take(channels, prior, directions, std=0.0):
         variance, spread = std**2, SPREAD * directions.shape[1]
         if not std:
             error, scatter = amplitudes(mean, directions)
@@ -123,7 +121,7 @@ def oracle(mean: Mean) -> list[tuple[int, float, int]]:
     return found
 
 
-def random_mean(seed: int, n: int) -> Mean:
+def random_mean(seed, n):
     rng = np.random.default_rng(seed)
     geometry = random_axes(rng, n)
     while geometry.sensitivity.min() < 0.3:
@@ -139,7 +137,7 @@ def random_mean(seed: int, n: int) -> Mean:
 class TestOdds:
     @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
-    def test_are_those_of_normal_densities(self, seed: int, n: int) -> None:
+    def test_are_those_of_normal_densities(self, seed, n):
         mean = random_mean(seed, n)
         ours = {(m, w, k): o for k, (m, o, w) in enumerate(sorted(mean.hypotheses(), key=lambda one: (one[0], one[2])))}
         theirs = sorted(oracle(mean), key=lambda one: (one[0], one[2]))
@@ -158,7 +156,7 @@ class TestOdds:
 
 
 class TestChoice:
-    def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self) -> None:
+    def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self):
         """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
         rng = np.random.default_rng(3)
         for size in (0.2, 0.5, 0.8):
@@ -167,7 +165,7 @@ class TestChoice:
                 y[0], y[3] = y[0] + size, y[3] + other * size
                 assert Mean(PARALLEL, y, 0.01).explained()[0] <= {0, 3}
 
-    def test_a_unit_that_measures_motion_too_late_does_not_blame_its_gyros(self) -> None:
+    def test_a_unit_that_measures_motion_too_late_does_not_blame_its_gyros(self):
         acceleration = np.array([20.0, -10.0, 5.0])
         y = np.random.default_rng(4).normal(0, 1e-3, 9)
         y[3:6] -= 3e-3 * PARALLEL.axes[3:6] @ acceleration
@@ -177,7 +175,7 @@ class TestChoice:
 
     @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9, 12]))
-    def test_what_no_hypothesis_explains_blames_all(self, seed: int, n: int) -> None:
+    def test_what_no_hypothesis_explains_blames_all(self, seed, n):
         """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""
         mean = random_mean(seed, n)
         root = np.linalg.inv(np.linalg.cholesky(mean.covariance))

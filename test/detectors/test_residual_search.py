@@ -3,8 +3,6 @@
 
 """Residual searches against their paper: figures, tolerance, agreement, and what the Monte-Carlo protocol gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from detectors.detector_trials import random_axes
@@ -15,13 +13,13 @@ SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_
 each_search = pytest.mark.parametrize("name", SEARCHES)
 
 
-def without(z: np.ndarray, axes: np.ndarray, *channels: int) -> np.ndarray:
+def without(z, axes, *channels):
     """Least-squares rate without some channels."""
     kept = [k for k in range(len(axes)) if k not in channels]
     return np.linalg.lstsq(axes[kept], z[kept], rcond=None)[0]
 
 
-def by_definition(name: str, axes: np.ndarray, z: np.ndarray) -> np.ndarray:
+def by_definition(name, axes, z):
     """Scores of one sample, least squares solved anew for every set of channels, as the paper writes them."""
     n = len(axes)
     if name == "max_residual":
@@ -42,7 +40,7 @@ def by_definition(name: str, axes: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 @each_search
 @pytest.mark.parametrize("n", [5, 6, 7, 9])
-def test_scores_are_the_papers_figures(name: str, n: int) -> None:
+def test_scores_are_the_papers_figures(name, n):
     rng = np.random.default_rng(n)
     geometry = random_axes(rng, n)
     z = rng.uniform(-2, 2, (10, 3)) @ geometry.axes.T + rng.standard_normal((10, n))
@@ -52,7 +50,7 @@ def test_scores_are_the_papers_figures(name: str, n: int) -> None:
 
 
 @each_search
-def test_channel_that_nothing_predicts_is_left_out_of_the_mean(name: str) -> None:
+def test_channel_that_nothing_predicts_is_left_out_of_the_mean(name):
     geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
     z = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.4]])
     scores = create_detector(name, geometry, NoiseModel(1.0)).detect(z).scores[0]
@@ -68,7 +66,7 @@ def test_channel_that_nothing_predicts_is_left_out_of_the_mean(name: str) -> Non
 
 
 @each_search
-def test_paper_tolerance_is_equation_8(name: str) -> None:
+def test_paper_tolerance_is_equation_8(name):
     rng = np.random.default_rng(1)
     geometry = Geometry.two_triad_cone()
     zero, scale = rng.uniform(0.5, 2, 6), rng.uniform(0.01, 0.2, 6)

@@ -3,11 +3,8 @@
 
 """Sequential evidence: the sums and their run length, delays, what is no fault, and the bound of a single value."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +15,9 @@ from monitor.streams import RATE, SIGMA, START, declarations, parallel, swing
 from vehicles import vehicle
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.base import Verdict
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 
 UNIT = NoiseModel(1.0)
@@ -30,62 +26,62 @@ BOUND = {2.0: 18.8, 4.0: 5.2, 8.0: 1.6}
 """Least mean delay in samples at a run length of 3.6e8, by size in standard deviations (Moustakides 1986)."""
 
 
-def sequential(geometry: Geometry = CONE, noise: NoiseModel = UNIT, **options: Any) -> Sequential:
+def sequential(geometry=CONE, noise=UNIT, **options):
     detector = create_detector("sequential", geometry, noise, **options)
     assert isinstance(detector, Sequential)
     return detector
 
 
 @cache
-def built() -> Sequential:
+def built():
     return sequential()
 
 
-def fresh() -> Sequential:
+def fresh():
     """A detector without memory; building one anew takes longer than a short stream."""
     built().reset()
     return built()
 
 
-def white(seed: int, rows: int, n: int = 6) -> np.ndarray:
+def white(seed, rows, n=6):
     return np.random.default_rng(seed).standard_normal((rows, n))
 
 
-def fault(channel: int, size: float, geometry: Geometry = CONE) -> np.ndarray:
+def fault(channel, size, geometry=CONE):
     """Error of one channel (n,) that moves its normalised residual by so many standard deviations."""
     return size / geometry.sensitivity[channel] * np.eye(geometry.n)[channel]
 
 
-def named(verdict: Verdict) -> set[int]:
+def named(verdict):
     """Channels that were ever isolated."""
     return set(np.flatnonzero(verdict.suspects[verdict.isolated].any(axis=0)).tolist())
 
 
 @cache
-def noisy() -> np.ndarray:
+def noisy():
     fresh().detect(white(99, 4000))
     return built().states.copy()
 
 
 @cache
-def rested() -> np.ndarray:
+def rested():
     fresh().detect(0.2 * white(16, 20_000))
     return built().states.copy()
 
 
-def after(states: np.ndarray) -> Sequential:
+def after(states):
     """The detector with that memory."""
     built().states[:] = states
     return built()
 
 
-def measured() -> Sequential:
+def measured():
     """The same detector after 40 s of noise as expected, which it then knows."""
     return after(noisy())
 
 
 class TestSums:
-    def test_no_more_than_the_number_of_samples_in_the_mean(self) -> None:
+    def test_no_more_than_the_number_of_samples_in_the_mean(self):
         """What makes the run length exact: their mean less the number of samples never tends upward."""
         detector, sums = sequential(run_length=1e15), []
         for k in range(400):
@@ -98,7 +94,7 @@ class TestSums:
         ("geometry", "noise"),
         [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
     )
-    def test_run_length_is_at_least_the_one_asked_for(self, geometry: Geometry, noise: NoiseModel) -> None:
+    def test_run_length_is_at_least_the_one_asked_for(self, geometry, noise):
         detector, samples, alarms = sequential(geometry, noise, run_length=1000), 0, 0
         for seed in range(30):
             detector.reset()
@@ -112,7 +108,7 @@ class TestSums:
 
 class TestDelay:
     @pytest.mark.parametrize(("size", "most"), [(2.0, 2.0), (4.0, 1.7), (8.0, 2.0)])
-    def test_beside_the_optimal_bound(self, size: float, most: float) -> None:
+    def test_beside_the_optimal_bound(self, size, most):
         """After 40 s without a fault, over which the noise was measured."""
         delays = []
         for k in range(60):
@@ -121,7 +117,7 @@ class TestDelay:
             delays.append(int(alarm.argmax()) + 1)
         assert np.mean(delays) < most * BOUND[size]
 
-    def test_what_has_passed_is_forgotten(self) -> None:
+    def test_what_has_passed_is_forgotten(self):
         """Sums are bounded: a fault of any size and length leaves no more than noise takes away in minutes."""
         detector = measured()
         detector.detect(white(7, 5000) + fault(0, 1000.0))
@@ -130,7 +126,7 @@ class TestDelay:
         assert not after.alarm[-1]
 
     @pytest.mark.parametrize("geometry", [CONE, Geometry.cone(8), Geometry.from_triads([np.eye(3)] * 3)])
-    def test_one_fault_is_named_with_its_size(self, geometry: Geometry) -> None:
+    def test_one_fault_is_named_with_its_size(self, geometry):
         detector = sequential(geometry)
         for channel in range(geometry.n):
             detector.reset()
@@ -145,13 +141,13 @@ class TestDelay:
 class TestNoFault:
     @settings(max_examples=40)
     @given(size=st.floats(-1e7, 1e7), channel=st.integers(0, 5), at=st.integers(0, 699), common=st.booleans())
-    def test_one_wild_value_never_alarms(self, size: float, channel: int, at: int, common: bool) -> None:
+    def test_one_wild_value_never_alarms(self, size, channel, at, common):
         z = white(9, 700)
         # A spike that all channels have in the same measure is one of the rate at times.
         z[at, slice(None) if common else channel] += size
         assert not fresh().detect(z).alarm.any()
 
-    def test_a_bias_is_learned_and_what_comes_later_is_found(self) -> None:
+    def test_a_bias_is_learned_and_what_comes_later_is_found(self):
         detector, z = sequential(noise=NoiseModel(1.0, bias_std=0.2)), white(11, 30_000)
         z += fault(3, 2.4 * 0.2)
         assert not detector.detect(z[:20_000]).alarm.any()
@@ -159,7 +155,7 @@ class TestNoFault:
         assert found.alarm.any()
         assert found.suspects[found.alarm][:, 3].all()
 
-    def test_errors_that_motion_explains_never_alarm(self) -> None:
+    def test_errors_that_motion_explains_never_alarm(self):
         """A turn as long as it likes, with scale factors up to three standard deviations off, and late instants."""
         rng, noise = np.random.default_rng(12), NoiseModel(0.003, scale_std=0.002, timing_std=3e-4)
         t = np.arange(20_000) / 100
@@ -171,14 +167,14 @@ class TestNoFault:
             assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
 
     @pytest.mark.parametrize("seed", range(20))
-    def test_noise_of_another_size_is_no_fault(self, seed: int) -> None:
+    def test_noise_of_another_size_is_no_fault(self, seed):
         """Twice as large at once, five times within two seconds, and as expected after a long rest."""
         assert not measured().detect(2.0 * white(seed, 600)).alarm.any()
         rise = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
         assert not measured().detect(rise * white(seed, 600)).isolated.any()
         assert not after(rested()).detect(white(seed, 400)).alarm.any()
 
-    def test_nothing_is_found_in_streams_without_noise(self) -> None:
+    def test_nothing_is_found_in_streams_without_noise(self):
         """Not even in the rounding of single precision, after a long time of none."""
         rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
         z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
@@ -187,14 +183,14 @@ class TestNoFault:
         assert verdict.statistic.max() < 4.0
 
     @pytest.mark.parametrize("correlation", [0.5, 0.9])
-    def test_coloured_noise_is_no_fault(self, correlation: float) -> None:
+    def test_coloured_noise_is_no_fault(self, correlation):
         for seed in range(4):
             z = white(seed, 6000)
             for k in range(1, len(z)):
                 z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
             assert not fresh().detect(z).alarm.any()
 
-    def test_heavy_tails_and_spikes_now_and_then_are_no_fault(self) -> None:
+    def test_heavy_tails_and_spikes_now_and_then_are_no_fault(self):
         tails, spikes = np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2), white(10, 60_000)
         rng = np.random.default_rng(10)
         hit = rng.random(spikes.shape) < 0.002
@@ -204,7 +200,7 @@ class TestNoFault:
 
     @settings(max_examples=20)
     @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
-    def test_any_axes_without_alarm_for_20_s(self, seed: int, n: int) -> None:
+    def test_any_axes_without_alarm_for_20_s(self, seed, n):
         rng = np.random.default_rng(seed)
         try:
             geometry = random_axes(rng, n)
@@ -219,7 +215,7 @@ class TestNoFault:
 class TestDecision:
     """What becomes of the evidence in the monitor."""
 
-    def flown(self, fault: float, seed: int, **changes: object) -> tuple[Pipeline, Output]:
+    def flown(self, fault, seed, **changes):
         """Three parallel triads at rest, after ten seconds with a bias of so many noise_std on imu_2.y."""
         pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
         z = SIGMA * white(seed, 2500, 9)
@@ -228,14 +224,14 @@ class TestDecision:
         return pipeline, pipeline.process(Block(stamp, z))
 
     @pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
-    def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(self, rule: str, after: int) -> None:
+    def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(self, rule, after):
         changes = {"decision__rule": rule, "decision__confirm_alarms": 20, "decision__confirm_window": 20}
         pipeline, output = self.flown(50.0, 20, **changes)
         assert [name for name, state in declarations(pipeline, output) if state == "FAULTY"] == ["imu_2.y"]
         declared = np.isin(output.state, (ChannelState.AMBIGUOUS, ChannelState.FAULTY)).any(axis=1)
         assert int(declared.argmax()) == int(output.alarm.argmax()) + after < 1040
 
-    def test_an_undecided_set_leaves_the_culprit_as_evidence_grows(self) -> None:
+    def test_an_undecided_set_leaves_the_culprit_as_evidence_grows(self):
         sizes = []
         for seed in range(8):
             pipeline, output = self.flown(4.0, seed)
@@ -249,7 +245,7 @@ class TestDecision:
 
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
 @pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
-def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) -> None:
+def test_single_spikes_teach_nothing_and_name_nobody(kind, value):
     """Sixty values far off: before the first motion no delay is known, and after it none is wrong."""
     one, rng = vehicle(2, kind, 3), np.random.default_rng(52)
     axes, nominal = one.axes.ravel().tolist(), Config.from_parameters({**one.config.parameters(), "imus.mounts": []})
@@ -268,7 +264,7 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) ->
         assert abs(delay - true) < 4 * std + 1e-4
 
 
-def two_units(seconds: np.ndarray, late: np.ndarray | float, seed: int) -> tuple[Pipeline, Block]:
+def two_units(seconds, late, seed):
     """Two parallel units in quick motion, of which the second stamps its values late."""
     z = np.hstack([swing(seconds), swing(seconds - late)])
     z += SIGMA * np.random.default_rng(seed).standard_normal(z.shape)
@@ -278,7 +274,7 @@ def two_units(seconds: np.ndarray, late: np.ndarray | float, seed: int) -> tuple
 
 @pytest.mark.parametrize("hole", [0.02, 0.05, 0.1])
 @pytest.mark.parametrize("late", [0.0, 0.015])
-def test_holes_in_the_stream_teach_no_wrong_delay(hole: float, late: float) -> None:
+def test_holes_in_the_stream_teach_no_wrong_delay(hole, late):
     """Samples for 0.1 s, then none for a while, in quick motion: the instants are known, and so is the delay."""
     seconds = np.arange(0.0, 20.0, 1.0 / RATE)
     pipeline, stream = two_units(seconds[seconds % (0.1 + hole) < 0.1], late, 3)
@@ -289,7 +285,7 @@ def test_holes_in_the_stream_teach_no_wrong_delay(hole: float, late: float) -> N
     assert status.delay_std[1] < 0.002
 
 
-def flown_with_a_hole(units: int, hole: float, fault: float, seed: int) -> Output:
+def flown_with_a_hole(units, hole, fault, seed):
     """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
     rng, seconds = np.random.default_rng([units, seed]), np.arange(0.0, 24.0 + hole, 1.0 / RATE)
     rate = swing(seconds) * np.clip((seconds[:, None] - 4.0) / 2.0, 0.0, 1.0)
@@ -305,7 +301,7 @@ def flown_with_a_hole(units: int, hole: float, fault: float, seed: int) -> Outpu
 
 @pytest.mark.parametrize("hole", [2.0, 6.0, 20.0])
 @pytest.mark.parametrize("units", [2, 3])
-def test_a_fault_that_begins_in_a_hole_is_found_and_none_without(units: int, hole: float) -> None:
+def test_a_fault_that_begins_in_a_hole_is_found_and_none_without(units, hole):
     """10 mrad/s: of three units the channel by name, of two the two channels that disagree, in 4 s."""
     for seed in range(8):
         state = flown_with_a_hole(units, hole, 0.0, seed).state
@@ -317,7 +313,7 @@ def test_a_fault_that_begins_in_a_hole_is_found_and_none_without(units: int, hol
 
 
 @pytest.mark.parametrize("offset", [-0.04, -0.02, 0.02, 0.04])
-def test_after_a_reset_a_clock_that_was_set_is_followed(offset: float) -> None:
+def test_after_a_reset_a_clock_that_was_set_is_followed(offset):
     seconds = np.arange(0.0, 60.0, 1.0 / RATE)
     pipeline, stream = two_units(seconds, offset * (seconds > 20.0), 4)
     before = pipeline.process(stream[:3000])

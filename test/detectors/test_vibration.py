@@ -6,8 +6,6 @@
 The flights are those of ``benchmark/vibration.py``, which measures many more of them.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -26,7 +24,7 @@ sys.path.pop(0)
 FLIGHTS = 3
 
 
-def flown(units: int, name: str) -> dict[str, np.ndarray]:
+def flown(units, name):
     condition, rate = CONDITIONS[name]
     pipeline = Pipeline.from_config(config_of(units, rate, Asked()))
     flights = [
@@ -53,7 +51,7 @@ def flown(units: int, name: str) -> dict[str, np.ndarray]:
         "landing shock 5 rad/s",
     ],
 )
-def test_the_covariance_is_true(units: int, name: str) -> None:
+def test_the_covariance_is_true(units, name):
     found = flown(units, name)
     assert 0.05 < found["nees"].mean() < 2.0, found
     assert found["nees"].max() < 5.0, found
@@ -62,14 +60,14 @@ def test_the_covariance_is_true(units: int, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["one unit x3", "one channel x10"])
-def test_weights_follow_the_noise(name: str) -> None:
+def test_weights_follow_the_noise(name):
     """Beside the best weighted mean of gyros whose errors are all known; the others are estimated on the way."""
     assert flown(2, name)["over_best"].mean() < 1.35
     assert flown(3, name)["over_best"].mean() < 1.35
 
 
 @pytest.mark.parametrize("units", [3, 4])
-def test_biases_that_all_move_are_followed(units: int) -> None:
+def test_biases_that_all_move_are_followed(units):
     """As motors start, or while all gyros warm up: stated, and no set that stands for the flight."""
     for name in ("rectified 5 mrad/s", "warming 20 mrad/s"):
         found = flown(units, name)

@@ -3,7 +3,6 @@
 
 """Simulated flights: the motion is possible for a vehicle, and the gyros are off by what was asked for."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,12 +18,12 @@ PERFECT = GyroErrors(**dict.fromkeys(ERRORS, 0), max_rate=np.inf)
 CONE = Geometry.two_triad_cone()
 
 
-def acceleration(motion: Motion, t: np.ndarray) -> np.ndarray:
+def acceleration(motion, t):
     return (motion.rate_at(t + 1e-4) - motion.rate_at(t - 1e-4)) / 2e-4
 
 
 @given(seed=st.integers(0, 2**32 - 1), max_rate=st.floats(0.1, 10), max_acceleration=st.floats(1, 100))
-def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: float) -> None:
+def test_motion_keeps_its_bounds(seed, max_rate, max_acceleration):
     motion = vehicle_motion(
         30.0, np.random.default_rng(seed), rest=5.0, max_rate=max_rate, max_acceleration=max_acceleration
     )
@@ -43,7 +42,7 @@ def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: f
         ({"bias_walk": 0.003}, lambda t: 0.003 * np.sqrt(t)),
     ],
 )
-def test_errors_at_rest_have_the_deviation_asked_for(errors: dict[str, float], expected: Callable) -> None:
+def test_errors_at_rest_have_the_deviation_asked_for(errors, expected):
     still = Motion(np.array([0.0, 1.0]), np.zeros((2, 3)))
     stamps = regular_stamps(16.0, 10.0)
     rng = np.random.default_rng(11)
@@ -54,7 +53,7 @@ def test_errors_at_rest_have_the_deviation_asked_for(errors: dict[str, float], e
     np.testing.assert_allclose(measured, expected((stamps[1:]) * 1e-9), rtol=0.07)
 
 
-def test_scale_and_misalignment_turn_and_stretch_the_axes() -> None:
+def test_scale_and_misalignment_turn_and_stretch_the_axes():
     rng = np.random.default_rng(5)
     axes = np.stack([replace(PERFECT, scale_std=0.01, misalignment_std=0.02).draw(CONE, rng).axes for _ in range(2000)])
     along = np.sum(axes * CONE.axes, axis=2)
@@ -63,7 +62,7 @@ def test_scale_and_misalignment_turn_and_stretch_the_axes() -> None:
     assert np.sqrt(np.mean(across**2) / 2) == pytest.approx(0.02, rel=0.05)
 
 
-def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
+def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip():
     ramp = Motion(np.array([0.0, 10.0]), np.array([[0.0, 0, 0], [3.0, -2.0, 1.0]]))
     stamps = regular_stamps(10.0, 100.0)
     gyros = replace(PERFECT, delay_std=1e-3).draw(CONE, np.random.default_rng(6))
@@ -73,7 +72,7 @@ def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
     np.testing.assert_allclose(off, acceleration(ramp, t) @ CONE.axes.T * gyros.delay, atol=1e-6)
 
 
-def test_the_converter_rounds_and_saturates() -> None:
+def test_the_converter_rounds_and_saturates():
     fast = Motion(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [50.0, -50.0, 20.0]]))
     errors = replace(PERFECT, resolution=0.5, max_rate=30.0)
     z = errors.draw(CONE, np.random.default_rng(0)).measure(fast, regular_stamps(1, 100), np.random.default_rng(0)).z
@@ -81,7 +80,7 @@ def test_the_converter_rounds_and_saturates() -> None:
     assert np.abs(z).max() == 30.0
 
 
-def test_the_bundled_bag_is_what_its_script_makes(flight, root, monkeypatch) -> None:
+def test_the_bundled_bag_is_what_its_script_makes(flight, root, monkeypatch):
     """Channels and both Imu topics of the bag against the simulation run again."""
     monkeypatch.syspath_prepend(str(root / "bags"))
     import make_bags

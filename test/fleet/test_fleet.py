@@ -3,8 +3,6 @@
 
 """Many recordings: found, judged, kept through stops and full disks, read back by other programs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -15,9 +13,8 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,24 +39,23 @@ class Stopped(BaseException):
     """Stands for SIGKILL: nothing is cleaned up after it."""
 
 
-def run(out: Path, *given: object, codes: Sequence[int] = (0, 3, 4)) -> Path:
+def run(out, *given, codes=(0, 3, 4)):
     """Judge what is given; return the folder of the tables."""
     assert main(["fleet", *map(str, given), "--output", str(out), "--workers", "1"]) in codes
     return out
 
 
-def rows(out: Path, name: str = "flights") -> list[dict[str, Any]]:
+def rows(out, name="flights"):
     with (out / f"{name}.parquet").open("rb") as file:
-        found: list[dict[str, Any]] = parquet.read_table(file).to_pylist()
-    return found
+        return parquet.read_table(file).to_pylist()
 
 
-def both(out: Path) -> list[bytes]:
+def both(out):
     return [(out / f"{name}.parquet").read_bytes() for name in ("flights", "episodes")]
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fleet(tmp_path_factory):
     """Two vehicles: five flights, one with a fault and one cut off, and one file that is no recording."""
     root = tmp_path_factory.mktemp("fleet")
     for vehicle in ("heron", "kite"):
@@ -78,7 +74,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def faulty(messages: list[tuple[str, int, bytes]], z: np.ndarray) -> list[tuple[str, int, bytes]]:
+def faulty(messages, z):
     """The messages with other rates."""
     from bag.recordings import imu_messages
 
@@ -86,7 +82,7 @@ def faulty(messages: list[tuple[str, int, bytes]], z: np.ndarray) -> list[tuple[
 
 
 @pytest.fixture(scope="module")
-def judged(fleet: Path) -> Path:
+def judged(fleet):
     """The folder of a run over all of them that was not stopped."""
     return run(fleet / "out", fleet / "heron", fleet / "kite", "--config", fleet / "config.yaml")
 
@@ -94,7 +90,7 @@ def judged(fleet: Path) -> Path:
 # Which recordings -----------------------------------------------------------------------------------------------------
 
 
-def test_recordings_are_found_each_once_by_whatever_name(fleet: Path, tmp_path: Path) -> None:
+def test_recordings_are_found_each_once_by_whatever_name(fleet, tmp_path):
     """In folders, given twice, as a file of a bag, by a link; and what is no recording at all."""
     found, unread = find_recordings([str(fleet), str(fleet / "heron" / "a.mcap")])
     assert [path.name for path in found] == ["a.mcap", "b", "c.mcap", "d.mcap", "e.mcap"]
@@ -112,9 +108,7 @@ def test_recordings_are_found_each_once_by_whatever_name(fleet: Path, tmp_path: 
         find_recordings([str(tmp_path / "empty")])
 
 
-def test_recordings_behind_links_and_beside_other_metadata_are_found(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_behind_links_and_beside_other_metadata_are_found(fleet, tmp_path, monkeypatch):
     """Links in circles, a foreign metadata.yaml, a log in the folder of a bag, a folder that may not be read."""
     inside = tmp_path / "of_another_program"
     (inside / "below").mkdir(parents=True)
@@ -130,7 +124,7 @@ def test_recordings_behind_links_and_beside_other_metadata_are_found(
     (inside / "secret").mkdir()
     listed = os.scandir
 
-    def scan(folder: str) -> Any:
+    def scan(folder):
         if str(folder).endswith("secret"):
             raise PermissionError(13, "Permission denied", folder)
         return listed(folder)
@@ -146,7 +140,7 @@ def test_recordings_behind_links_and_beside_other_metadata_are_found(
 # What is said of them -------------------------------------------------------------------------------------------------
 
 
-def test_other_programs_read_the_tables(judged: Path) -> None:
+def test_other_programs_read_the_tables(judged):
     pandas, duckdb = pytest.importorskip("pandas"), pytest.importorskip("duckdb")
     flights = pandas.read_parquet(judged / "flights.parquet")
     assert flights.error.map(bool).tolist() == [False, False, False, False, True]
@@ -168,7 +162,7 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
     assert {"path", "error", "watched", "declared", "sets"} < set(flights.columns)
 
 
-def test_first_stands_what_needs_a_person(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     """A fault, what could not be read, what was hardly checked; not how recordings end when the power goes."""
     run(fleet / "again", fleet, "--config", fleet / "config.yaml", "--json", tmp_path / "all.json")
     said = capsys.readouterr().out.splitlines()
@@ -194,13 +188,13 @@ def test_first_stands_what_needs_a_person(fleet: Path, tmp_path: Path, capsys: p
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
 
 
-def test_settings_that_do_not_fit_need_a_person(fleet: Path, tmp_path: Path) -> None:
+def test_settings_that_do_not_fit_need_a_person(fleet, tmp_path):
     other = write_config(tmp_path / "other.yaml", {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]})
     (row,) = rows(run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", other, codes=(2,)))
     assert "sample_rate is 300 Hz in the config, the recording has 100 Hz" in row["error"]
 
 
-def test_one_sensor_on_two_topics_needs_a_look(tmp_path: Path) -> None:
+def test_one_sensor_on_two_topics_needs_a_look(tmp_path):
     z = flight(900)[1]
     stamp, topics = START + STEP * np.arange(900), (*TOPICS, "/third")
     three = write_mcap(tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, z[:, :3]]), topics))
@@ -213,9 +207,7 @@ def test_one_sensor_on_two_topics_needs_a_look(tmp_path: Path) -> None:
     assert f"{TOPICS[1]}: it gives the values of {TOPICS[0]}: one sensor on two topics" in row.why[0]
 
 
-def test_without_a_config_that_of_inspect_is_taken_and_said(
-    fleet: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_config_that_of_inspect_is_taken_and_said(fleet, root, tmp_path, capsys):
     """Calibrated on itself, or with the reason why not."""
     (row,) = rows(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
     assert (row["error"], row["measured"]) == ("", False)
@@ -229,7 +221,7 @@ def test_without_a_config_that_of_inspect_is_taken_and_said(
     assert refused["calibration"].startswith("refused: ")
 
 
-def test_the_questions_of_the_docs_are_answered(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_questions_of_the_docs_are_answered(root, tmp_path, monkeypatch):
     """Six flights, four weeks apart: of imu_1.y the bias grows by 0.01 rad/s each, one is noisy, one has a fault."""
     duckdb = pytest.importorskip("duckdb")
     (tmp_path / "logs").mkdir()
@@ -256,7 +248,7 @@ def test_the_questions_of_the_docs_are_answered(root: Path, tmp_path: Path, monk
     assert [(Path(path).name, channel) for path, channel, _ in noisy] == [("4.bin", "imu_0.z")]
 
 
-def test_names_that_are_no_unicode_cost_nothing(fleet: Path, tmp_path: Path) -> None:
+def test_names_that_are_no_unicode_cost_nothing(fleet, tmp_path):
     (tmp_path / "kite").mkdir()
     for number in (b"\xff", b"\xfe"):
         (tmp_path / "kite" / (b"broken" + number + b".mcap").decode("utf-8", "surrogateescape")).write_bytes(b"")
@@ -268,14 +260,14 @@ def test_names_that_are_no_unicode_cost_nothing(fleet: Path, tmp_path: Path) -> 
 # Runs that stop, and go on --------------------------------------------------------------------------------------------
 
 
-def test_what_is_there_is_not_judged_again(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_there_is_not_judged_again(fleet, tmp_path, monkeypatch):
     """But for what has changed; and rows of recordings that are not given again stay."""
     shutil.copytree(fleet / "heron", tmp_path / "heron")
     given = (tmp_path / "heron", "--config", fleet / "config.yaml", "--quiet")
     run(tmp_path / "o", *given)
     before = both(tmp_path / "o")
 
-    def none(*_: Any) -> Any:
+    def none(*_):
         raise AssertionError("judged again")
 
     with monkeypatch.context() as patched:
@@ -293,13 +285,13 @@ def test_what_is_there_is_not_judged_again(fleet: Path, tmp_path: Path, monkeypa
     assert len(rows(tmp_path / "o")) == 2
 
 
-def before(name: str) -> Stop:
+def before(name):
     """Stop before a table is written the second time."""
 
-    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+    def patch(monkeypatch):
         times, real = [], tables.whole_file
 
-        def stop(path: Path) -> Any:
+        def stop(path):
             times.append(path.name)
             if times.count(f"{name}.parquet") > 1:
                 raise Stopped
@@ -311,7 +303,7 @@ def before(name: str) -> Stop:
 
 
 @pytest.mark.parametrize("name", ["episodes", "flights"])
-def test_a_run_that_is_killed_anywhere_goes_on(fleet: Path, judged: Path, tmp_path: Path, name: str) -> None:
+def test_a_run_that_is_killed_anywhere_goes_on(fleet, judged, tmp_path, name):
     words = (fleet / "heron", fleet / "kite", "--config", fleet / "config.yaml", "--quiet")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(tables, "WRITE_AFTER", 0.0)
@@ -322,7 +314,7 @@ def test_a_run_that_is_killed_anywhere_goes_on(fleet: Path, judged: Path, tmp_pa
     assert len(rows(tmp_path / "o")) == 1
     run(tmp_path / "o", *words)
 
-    def told(out: Path, table: str) -> list[dict[str, Any]]:
+    def told(out, table):
         return [{**row, "config": ""} for row in rows(out, table)]
 
     assert [told(tmp_path / "o", table) for table in ("flights", "episodes")] == [
@@ -330,9 +322,7 @@ def test_a_run_that_is_killed_anywhere_goes_on(fleet: Path, judged: Path, tmp_pa
     ]
 
 
-def test_a_folder_of_something_else_is_left_alone(
-    fleet: Path, judged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_something_else_is_left_alone(fleet, judged, tmp_path, capsys):
     """Of other settings, unless that is asked for; of another run at the same time; of another program."""
     out = Path(shutil.copytree(judged, tmp_path / "o"))
     run(out, fleet / "heron", codes=[2])
@@ -360,9 +350,7 @@ def test_a_folder_of_something_else_is_left_alone(
     assert capsys.readouterr().err.splitlines()[-1].endswith("fleet.html/o: Not a directory")
 
 
-def test_a_full_disk_is_one_line_and_loses_nothing(
-    fleet: Path, judged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_is_one_line_and_loses_nothing(fleet, judged, tmp_path, capsys):
     out = Path(shutil.copytree(judged, tmp_path / "o"))
     limit, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     # As much as a parameter file takes, and less than a table.
@@ -376,14 +364,14 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     assert both(out) == both(judged)
 
 
-def test_where_nothing_could_be_judged_that_is_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_nothing_could_be_judged_that_is_the_end(tmp_path, capsys):
     (tmp_path / "a.mcap").write_bytes(b"")
     run(tmp_path / "o", tmp_path, codes=[2])
     assert f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'}" in capsys.readouterr().err
     assert (tmp_path / "o" / "flights.parquet").exists()
 
 
-def test_a_signal_is_answered_in_words(fleet: Path, tmp_path: Path) -> None:
+def test_a_signal_is_answered_in_words(fleet, tmp_path):
     words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
     command = [sys.executable, "-m", "fdi_ros.cli", "fleet", str(fleet / "heron"), *words]
     # As plain Python it takes so long that it cannot be done before the signal comes.

@@ -3,10 +3,10 @@
 
 """Summaries of replays for the tests."""
 
-from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, Scores, StreamResult, Summary
+from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
 
 
-def summary_of(scores: Scores, bag: str = "bag") -> Summary:
+def summary_of(scores, bag="bag"):
     """The summary of a replay of which nothing but the scores matters."""
     levels = ProtectionLevel((None,) * 3, (None,) * 3)
     monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)

@@ -3,8 +3,6 @@
 
 """What an autopilot says of itself stands beside what the monitor declares, whatever log it is in."""
 
-from __future__ import annotations
-
 import json
 import struct
 

@@ -3,8 +3,6 @@
 
 """What happened in a recording: of states and residuals to episodes, and of these to words."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Which declaration is whose doing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """The output bag, read back by mcap, by rosbags and by rclpy: what the pipeline said, bit for bit."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections import defaultdict
 from dataclasses import astuple

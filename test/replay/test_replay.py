@@ -3,8 +3,6 @@
 
 """A recording through the monitor: what the summary says is what was injected and what the pipeline declared."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import astuple

@@ -3,8 +3,6 @@
 
 """The pages: opened in a real browser, and what is in them."""
 
-from __future__ import annotations
-
 import base64
 import importlib.util
 import json

@@ -3,8 +3,6 @@
 
 """What a replay says of a recording as a user brings it: a fault that nobody injected, two units, several armings."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Refused, Run
 from faults.examples import SCENARIO
 
 from fdi_ros.bag.samples import read_block
@@ -22,7 +21,7 @@ from fdi_ros.faults.fault import Injector, load_scenario
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind, Scored, score
-from fdi_ros.replay.sweep import Plan, Subject, SweepResult, judged_with, onsets_of, parse_swept, sweep, try_faults
+from fdi_ros.replay.sweep import Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
 from fdi_ros.replay.sweep_report import lines_of, smallest, sound_lines, sweep_page, sweep_text
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -38,7 +37,7 @@ EVERY = tuple(
 
 
 @cache
-def flown() -> Block:
+def flown():
     """The bundled flight, one channel missing twice: the detector then judges by fewer channels."""
     block = read_block(BAG, Config.from_file(FILE))
     z = block.z.copy()
@@ -46,13 +45,13 @@ def flown() -> Block:
     return Block(block.stamp, z)
 
 
-def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[SweepResult, Plan]:
+def swept(block, text="kind=bias size=0.02,0.2", **plan):
     asked = Plan(parse_swept(text), **{"times": 2, "within": 2.0, **plan})
     return sweep([Subject("own", Config.from_file(FILE), block)], asked)[0], asked
 
 
 @pytest.mark.parametrize("detector", ["sequential", "cusum"])
-def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector: str) -> None:
+def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector):
     config = Config.from_file(FILE, {"detector.name": detector})
     pipeline, block = Pipeline(config), flown()
     onsets = list(onsets_of(pipeline, block, (11.9, 29.6), 1.5))
@@ -86,7 +85,7 @@ def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector: s
         ({}, {}, "silent", np.inf, np.inf),
     ],
 )
-def test_outcome_of_a_fault(alone: dict, among: dict, words: str, named: float, found: float) -> None:
+def test_outcome_of_a_fault(alone, among, words, named, found):
     since = np.arange(50) * 0.1
     masks = [np.zeros((50, 3), dtype=bool) for _ in range(2)]
     for mask, told in zip(masks, (alone, among), strict=True):
@@ -95,7 +94,7 @@ def test_outcome_of_a_fault(alone: dict, among: dict, words: str, named: float, 
     assert score(*masks, 0, since, 2.0) == Scored(OutcomeKind(words), pytest.approx(named), pytest.approx(found))
 
 
-def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process() -> None:
+def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process():
     tried, plan = swept(flown(), "kind=bias size=0.3,0.02,0.001")
     lines = lines_of(tried, plan)
     assert [line.swept.size for line in lines] == [0.001, 0.02, 0.3]
@@ -114,7 +113,7 @@ def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_proc
     assert try_faults(*pickle.loads(pickle.dumps((config, onset, 0, plan)))) == list(tried.trials[:3])
 
 
-def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
+def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
     block = flown()
     z = block.z.copy()
     z[4000:, 2] += 0.5
@@ -131,7 +130,7 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
         assert told.index("nothing injected: g3 FAULTY") < told.index("bias 0.02 rad/s")
 
 
-def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
+def test_figures_of_a_vehicle_at_rest_are_called_that():
     # The flight rests for its first 8 s.
     at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
     # Of a dozen faults the share is not 95 %, whatever came of them.
@@ -142,7 +141,7 @@ def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
     assert "AT REST" not in sweep_page([moving], plan, "bag", {})
 
 
-def test_a_monitor_that_judges_nothing_is_no_result() -> None:
+def test_a_monitor_that_judges_nothing_is_no_result():
     config = Config.from_file(FILE, {"bias.startup_bias_duration": 500.0})
     with pytest.raises(
         FaultError, match="it judges nothing of this recording: it ends after 6001 samples, before the biases"
@@ -160,7 +159,7 @@ def test_a_monitor_that_judges_nothing_is_no_result() -> None:
     assert "judges nothing" in sweep_text([slow, own], plan, "bag")
 
 
-def test_excluded_channels_are_not_tried(fdi: Run, tmp_path: Path) -> None:
+def test_excluded_channels_are_not_tried(fdi, tmp_path):
     words = ["sweep", BAG, "--config", FILE, "--times", 2, "--within", 2, "--fault", "kind=bias size=0.3"]
     other = tmp_path / "other.yaml"
     other.write_text(FILE.read_text().replace("body_frame:", "excluded_channels: [g2]\n    body_frame:"))
@@ -207,5 +206,5 @@ def test_excluded_channels_are_not_tried(fdi: Run, tmp_path: Path) -> None:
         (["--start", "9", "--end", "3"], "expected 0 <= start < end"),
     ],
 )
-def test_what_is_asked_wrongly_is_one_line(refused: Refused, words: list[str], said: str) -> None:
+def test_what_is_asked_wrongly_is_one_line(refused, words, said):
     assert said in refused("sweep", BAG, "--config", FILE, *words)
