@@ -163,6 +163,7 @@ ULOG_FORMATS = {
     "uint8_t gyro_calibration_count;uint8_t[4] _padding0;",
     "sensor_gyro_fifo": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;"
     "int16_t[32] x;int16_t[32] y;int16_t[32] z;uint8_t samples;uint8_t[3] _padding0;",
+    "vehicle_imu_status": "uint64_t timestamp;uint32_t gyro_device_id;float[3] mean_gyro;",
     "sensor_gps": "uint64_t timestamp;uint64_t timestamp_sample;uint64_t time_utc_usec;uint8_t fix_type;"
     "uint8_t[7] _padding0;",
 }
@@ -213,6 +214,9 @@ def _ulog_samples(unit, number, kind):
     if kind == "sensor_gyro_fifo":
         return _fifo(unit, number)
     out = _empty(kind, len(unit.stamp), number)
+    if kind == "vehicle_imu_status":
+        out["timestamp"], out["mean_gyro"] = unit.stamp, unit.rate
+        return out
     out["timestamp"], out["timestamp_sample"] = unit.stamp + 300, unit.stamp
     if kind == "vehicle_imu":
         step = int(np.clip(np.median(np.diff(unit.stamp)), 1, 10**6))

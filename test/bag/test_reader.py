@@ -23,7 +23,6 @@ from bag.recordings import (
     TOPICS,
     array,
     flight,
-    imu,
     split,
     write_bag,
     write_mcap,
@@ -37,28 +36,28 @@ from rosbags.rosbag2 import StoragePlugin
 
 from fdi_ros.bag.mcap_file import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Samples, check_sample_rate
+from fdi_ros.bag.samples import Samples, check_sample_rate, joined
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
 
 CONFIG = Config.from_parameters(PARAMETERS)
 SAMPLES = 300
+STAMP = START + STEP * np.arange(SAMPLES)
 
 
-def read(path, config=CONFIG, channels=6, **span):
+def read(path, config=CONFIG, **span):
     """All samples of a recording, and the reader of them."""
     with Recording(path) as recording:
-        samples = Samples(recording, config, channels, **span)
-        blocks = list(samples.blocks())
-    stamp = np.concatenate([block.stamp for block in blocks])
-    return stamp, np.vstack([block.z for block in blocks]), samples
+        samples = Samples(recording, config, 6, **span)
+        block = joined(list(samples.blocks()))
+    return block.stamp, block.z, samples
 
 
 @pytest.mark.parametrize("make", MAKES)
 def test_every_make_of_recording_gives_the_same_samples(make, tmp_path):
     messages, z = flight(SAMPLES)
     stamp, values, samples = read(MAKES[make](tmp_path / "bag", messages))
-    np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
+    np.testing.assert_array_equal(stamp, STAMP)
     np.testing.assert_array_equal(values, z)
     assert samples.progress == pytest.approx(1, abs=0.1)
     assert samples.recording.damage.report() == (
@@ -68,60 +67,39 @@ def test_every_make_of_recording_gives_the_same_samples(make, tmp_path):
     )
 
 
-def test_messages_out_of_order_come_in_the_order_of_recording(tmp_path):
+@pytest.mark.parametrize("make", ["zstd chunks", "rosbag2 sqlite3"])
+def test_messages_out_of_order_and_of_other_topics_do_not_matter(make, tmp_path):
     messages, z = flight(SAMPLES)
-    random = np.random.default_rng(1)
-    order = np.argsort(np.arange(len(messages)) + random.uniform(0, 200, len(messages)))
-    shuffled = [messages[i] for i in order]
-    for path in (
-        write_mcap(tmp_path / "bag.mcap", shuffled),
-        write_bag(tmp_path / "b", shuffled, StoragePlugin.SQLITE3),
-    ):
-        stamp, values, _ = read(path)
-        np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
-        np.testing.assert_array_equal(values, z)
-
-
-def test_other_topics_in_the_recording_do_not_matter(tmp_path):
-    messages, z = flight(SAMPLES)
-    noise = [("/other", log_time, array([1.0])) for _, log_time, _ in messages[::7]]
+    noise = [("/other", log_time, messages[0][2]) for _, log_time, _ in messages[::7]]
     mixed = sorted(messages + noise, key=lambda message: message[1])
-    path = write_mcap(tmp_path / "bag.mcap", mixed, types={"/other": ARRAY})
-    np.testing.assert_array_equal(read(path)[1], z)
+    late = np.random.default_rng(1).uniform(0, 200, len(mixed))
+    path = MAKES[make](tmp_path / "bag", [mixed[i] for i in np.argsort(np.arange(len(mixed)) + late)])
+    stamp, values, _ = read(path)
+    np.testing.assert_array_equal(stamp, STAMP)
+    np.testing.assert_array_equal(values, z)
     with Recording(path) as recording:
-        assert [(topic.name, topic.count) for topic in recording.topics] == [
-            (TOPICS[0], SAMPLES),
-            (TOPICS[1], SAMPLES),
-            ("/other", len(noise)),
-        ]
+        counts = {topic.name: topic.count for topic in recording.topics}
+    assert counts == {**dict.fromkeys(TOPICS, SAMPLES), "/other": len(noise)}
 
 
 def test_a_part_is_read_by_seconds_from_the_first_message(tmp_path):
     messages, z = flight(SAMPLES)
-    path = write_mcap(tmp_path / "bag.mcap", messages)
-    stamp, values, samples = read(path, start=1.0, end=2.0)
+    stamp, values, samples = read(write_mcap(tmp_path / "bag.mcap", messages), start=1.0, end=2.0)
     assert samples.origin == START
-    np.testing.assert_array_equal(stamp, START + STEP * np.arange(100, 200))
+    np.testing.assert_array_equal(stamp, STAMP[100:200])
     np.testing.assert_array_equal(values, z[100:200])
 
 
 def test_a_topic_that_stops_leaves_the_other_one(tmp_path):
     messages, z = flight(SAMPLES)
     stops = [m for m in messages if m[0] == TOPICS[0] or m[1] < START + 100 * STEP]
-    with Recording(write_mcap(tmp_path / "bag.mcap", stops)) as recording:
-        blocks = list(Samples(recording, CONFIG, 6).blocks())
-    values = np.vstack([block.z for block in blocks])
-    np.testing.assert_array_equal(values[:, :3], z[:, :3])
-    np.testing.assert_array_equal(values[:100, 3:], z[:100, 3:])
-    assert np.isnan(values[100:, 3:]).all()
-    received = np.vstack([np.ones(b.z.shape, bool) if b.received is None else b.received for b in blocks])
-    assert not received[100:, 3:].any()
-    assert received[:, :3].all()
+    _, values, _ = read(write_mcap(tmp_path / "bag.mcap", stops))
+    z[100:, 3:] = np.nan
+    np.testing.assert_array_equal(values, z)
 
 
 def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
-    random = np.random.default_rng(0)
-    z = random.normal(size=(50, 6))
+    z = np.random.default_rng(0).normal(size=(50, 6))
     times = START + np.array([0, 0, 0, *range(3, 50)]) * STEP
     messages = [("/gyro_channels", int(t), array(list(row), ["a"])) for t, row in zip(times, z, strict=True)]
     messages.insert(20, ("/gyro_channels", messages[20][1], array([1.0] * 5)))
@@ -132,15 +110,15 @@ def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     assert samples.malformed == {"gyro_channels": 1}
 
 
-def test_a_recording_cut_off_by_a_crash_is_read_up_to_the_cut(tmp_path):
+@pytest.mark.parametrize("make", ["zstd chunks", "lz4 chunks", "plain chunks"])
+def test_a_recording_cut_off_by_a_crash_is_read_up_to_the_cut(make, tmp_path):
     messages, z = flight(SAMPLES)
-    for compression in (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE):
-        whole = write_mcap(tmp_path / "bag.mcap", messages, compression).read_bytes()
-        (tmp_path / "bag.mcap").write_bytes(whole[: len(whole) // 2])
-        stamp, values, samples = read(tmp_path / "bag.mcap")
-        assert 0.3 * SAMPLES < len(stamp) < 0.7 * SAMPLES
-        np.testing.assert_array_equal(values[:-1], z[: len(stamp) - 1])
-        assert any("breaks off in the record at byte" in line for line in samples.recording.damage.report())
+    path = MAKES[make](tmp_path / "bag", messages)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    stamp, values, samples = read(path)
+    assert 0.3 * SAMPLES < len(stamp) < 0.7 * SAMPLES
+    np.testing.assert_array_equal(values[:-1], z[: len(stamp) - 1])
+    assert any("breaks off in the record at byte" in line for line in samples.recording.damage.report())
 
 
 def contents(folder):
@@ -148,50 +126,54 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(tmp_path):
+@pytest.fixture
+def crashed(tmp_path):
+    """A database being written, what it holds, and what copies it as a recorder that loses its power leaves it."""
     messages, z = flight(SAMPLES)
-    written = write_bag(tmp_path / "written", messages, StoragePlugin.SQLITE3) / "written.db3"
-    crashed = tmp_path / "crashed"
-    crashed.mkdir()
+    folder, written = tmp_path / "crashed", write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3) / "bag.db3"
+    folder.mkdir()
+
+    def crash(end):
+        for part in ("", end):
+            shutil.copy(f"{written}{part}", folder)
+        return folder, contents(folder)
+
     with contextlib.closing(sqlite3.connect(written)) as base:
-        base.execute("PRAGMA journal_mode = WAL")
-        rows = list(base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (len(messages) // 2,)))
-        base.execute("DELETE FROM messages WHERE id > ?", (len(messages) // 2,))
-        base.commit()
-        base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        base.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
-        base.commit()
-        # As a recorder leaves it that loses its power: the second half is in the log alone.
-        for end in ("", "-wal"):
-            shutil.copy(f"{written}{end}", crashed / f"bag.db3{end}")
-    before, temporary = contents(crashed), set(os.listdir(tempfile.gettempdir()))
-    _, values, samples = read(crashed)
-    np.testing.assert_array_equal(values, z)
-    assert contents(crashed) == before
-    (crashed / "bag.db3-wal").unlink()
-    _, values, samples = read(crashed / "bag.db3")
+        yield base, z, crash
+
+
+def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(crashed):
+    base, z, crash = crashed
+    base.execute("PRAGMA journal_mode = WAL")
+    rows = list(base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (SAMPLES,)))
+    base.execute("DELETE FROM messages WHERE id > ?", (SAMPLES,))
+    base.commit()
+    base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    base.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    base.commit()
+    # The second half is in the log alone.
+    folder, before = crash("-wal")
+    temporary = set(os.listdir(tempfile.gettempdir()))
+    np.testing.assert_array_equal(read(folder)[1], z)
+    assert contents(folder) == before
+    (folder / "bag.db3-wal").unlink()
+    _, values, samples = read(folder / "bag.db3")
     np.testing.assert_array_equal(values, z[: SAMPLES // 2])
-    assert os.listdir(crashed) == ["bag.db3"]
+    assert os.listdir(folder) == ["bag.db3"]
     assert not {name for name in set(os.listdir(tempfile.gettempdir())) - temporary if name.startswith("fdi_bag_")}
     assert samples.recording.damage.report() == ()
 
 
-def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_left_there(tmp_path):
-    messages, _ = flight(SAMPLES)
-    written = write_bag(tmp_path / "written", messages, StoragePlugin.SQLITE3) / "written.db3"
-    crashed = tmp_path / "crashed"
-    crashed.mkdir()
-    with contextlib.closing(sqlite3.connect(written)) as base:
-        base.execute("PRAGMA cache_size = 1")
-        base.execute("PRAGMA journal_mode = DELETE")
-        base.execute("UPDATE messages SET timestamp = timestamp + 1")
-        for end in ("", "-journal"):
-            shutil.copy(f"{written}{end}", crashed / f"bag.db3{end}")
-    before = contents(crashed)
+def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_left_there(crashed):
+    base, _, crash = crashed
+    base.execute("PRAGMA cache_size = 1")
+    base.execute("PRAGMA journal_mode = DELETE")
+    base.execute("UPDATE messages SET timestamp = timestamp + 1")
+    folder, before = crash("-journal")
     assert before["bag.db3-journal"]
-    _, values, samples = read(crashed / "bag.db3")
+    _, values, samples = read(folder / "bag.db3")
     assert len(values) > SAMPLES // 2
-    assert contents(crashed) == before
+    assert contents(folder) == before
     assert "its last transaction was not finished" in samples.recording.damage.report()[0]
 
 
@@ -199,12 +181,11 @@ def test_a_damaged_chunk_is_left_out_and_said(tmp_path):
     messages, z = flight(SAMPLES)
     path = write_mcap(tmp_path / "bag.mcap", messages, CompressionType.NONE)
     data = bytearray(path.read_bytes())
-    rate = imu(0, z[150, :3], "imu_1")[-8 * 24 :][:24]
-    data[data.index(rate)] ^= 1
-    path.write_bytes(bytes(data))
+    data[data.index(z[150, :3].tobytes())] ^= 1
+    path.write_bytes(data)
     stamp, _, samples = read(path)
     assert 0.8 * SAMPLES < len(stamp) < SAMPLES
-    assert START + 150 * STEP not in stamp
+    assert STAMP[150] not in stamp
     (line,) = samples.recording.damage.report()
     assert "fails its checksum and was left out" in line
 
@@ -267,22 +248,16 @@ def test_a_topic_of_another_type_is_refused(tmp_path):
 
 def test_a_database_that_another_program_damaged_is_read_as_far_as_it_goes(tmp_path):
     messages, z = flight(3000)
-    path = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
-    file = path / "bag.db3"
-    with sqlite3.connect(file) as base:
-        page = base.execute("PRAGMA page_size").fetchone()[0]
-    base.close()
-    data = bytearray(file.read_bytes())
+    file = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3) / "bag.db3"
+    data, page = bytearray(file.read_bytes()), 4096
     middle = len(data) // 2 // page * page
     data[middle : middle + 20 * page] = b"\xff" * (20 * page)
-    file.write_bytes(bytes(data))
-    stamp, values, samples = read(path)
+    file.write_bytes(data)
+    stamp, values, samples = read(file.parent)
     assert 0 < len(stamp) < 3000
     assert samples.recording.damage.report()
-    known = np.isin(stamp, START + STEP * np.arange(3000))
-    rows = (stamp[known] - START) // STEP
-    complete = np.isfinite(values[known]).all(axis=1)
-    np.testing.assert_array_equal(values[known][complete], z[rows[complete]])
+    known = np.isin(stamp, START + STEP * np.arange(3000)) & np.isfinite(values).all(axis=1)
+    np.testing.assert_array_equal(values[known], z[(stamp[known] - START) // STEP])
 
 
 # Records in a run of bytes: those that a plain reading of the format finds, however the bytes are damaged ------------
@@ -344,22 +319,27 @@ def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
 # Bags of ROS 1 -------------------------------------------------------------------------------------------------------
 
 
-def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi):
+def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi, refused):
+    """All of what can be read and nothing else; it is replaced only if asked for, and only what fdi has made."""
     messages, z = flight(SAMPLES)
     others = [("/text", log_time, b"\1\0\0\0x") for _, log_time, _ in messages[::9]]
-    path = write_ros1(
-        tmp_path / "bag.bag", sorted(messages + others, key=lambda m: m[1]), types={"/text": "std_msgs/msg/String"}
-    )
-    assert fdi("convert", path, "--output", tmp_path / "out").code == 0
-    for recording in (path, tmp_path / "out"):
+    mixed = sorted(messages + others, key=lambda m: m[1])
+    path = write_ros1(tmp_path / "bag.bag", mixed, types={"/text": "std_msgs/msg/String"})
+    words, out = ["convert", path, "--output", tmp_path / "out"], tmp_path / "out"
+    assert fdi(*words).out.startswith(f"{TOPICS[0]}: 300 messages\n")
+    for recording in (path, out):
         stamp, values, samples = read(recording)
         np.testing.assert_array_equal(values, z)
-        np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
+        np.testing.assert_array_equal(stamp, STAMP)
         assert samples.recording.damage.report() == ()
-    with Recording(path) as recording:
-        assert [(topic.name, topic.count) for topic in recording.topics][-1] == ("/text", len(others))
-        sent = [batch.message(k) for batch in recording.batches([TOPICS[0]]) for k in range(len(batch))]
-    assert sent == [data for topic, _, data in messages if topic == TOPICS[0]]
+        with Recording(recording) as opened:
+            assert ("/text" in [topic.name for topic in opened.topics]) == (recording == path)
+            sent = [batch.message(k) for batch in opened.batches([TOPICS[0]]) for k in range(len(batch))]
+        assert sent == [data for topic, _, data in messages if topic == TOPICS[0]]
+    assert "--force" in refused(*words)
+    assert fdi(*words, "--force", "--quiet").code == 0
+    bag = write_bag(tmp_path / "bag", messages)
+    assert "holds more than a recording made by fdi" in refused("convert", out, "--output", bag, "--force")
 
 
 def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
