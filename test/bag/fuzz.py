@@ -8,7 +8,6 @@ in one clear line, prints nothing that a terminal obeys, and leaves whole output
 """
 
 import argparse
-import contextlib
 import faulthandler
 import io
 import itertools
@@ -27,6 +26,7 @@ import time
 import traceback
 import warnings
 import zlib
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
@@ -136,19 +136,16 @@ def messages(draw):
     topics += [(draw.choice(NAMES), draw.choice((IMU, ARRAY, "std_msgs/msg/String", "")))] * (draw.random() < 0.4)
     topics += [("/gyros", ARRAY)] * (draw.random() < 0.3)
     topics += [(f"/t{k}", IMU) for k in range(draw.choice((*[0] * 20, 5000)))]
-    count = draw.choice((0, 1, 2, 5, 40, 40, 200))
     step = draw.choice((STEP, STEP, STEP, 0, 1, -STEP, 10**12))
     value = draw.choice((None, None, None, *VALUES))
     stamp_step = step if draw.random() < 0.8 else draw.choice((0, STEP, -STEP, 10**13))
     first = draw.choice((START, START, START, 0, 5, 2**62, 2**63 - 3 * 10**9))
     found = []
-    for k in range(count):
+    for k in range(draw.choice((0, 1, 2, 5, 40, 40, 200))):
         for topic, (_, kind) in enumerate(topics[:4]):
             rates = [draw.gauss(0, 0.01) if value is None else value for _ in range(6)]
-            stamp = (
-                max(0, min(draw.choice((first, START)) if draw.odd() else first, 2**31 * 10**9 - 1)) + k * stamp_step
-            )
-            stamp = min(max(stamp, 0), 2**31 * 10**9 - 1)
+            begin = draw.choice((first, START)) if draw.odd() else first
+            stamp = min(max(min(begin, 2**31 * 10**9 - 1) + k * stamp_step, 0), 2**31 * 10**9 - 1)
             data = array(rates[: draw.choice((6, 6, 6, 4, 0))]) if kind == ARRAY else imu(stamp, rates[:3])
             found.append((topic, (first + k * step) % 2**64, draw.damaged(data)))
     if draw.random() < 0.1:
@@ -207,29 +204,29 @@ def database(draw, path):
     """A rosbag2 database with odd tables and values."""
     topics, sent = messages(draw)
     base = sqlite3.connect(path)
-    table = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
-    base.execute(table)
+    base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
     for number, (name, kind) in enumerate(topics[:50]):
         odd = draw.choice((None, 3, b"\xff\xfe", 1e308, name)) if draw.odd() else name
         base.execute("INSERT INTO topics VALUES(?, ?, ?, ?)", (number, odd, kind, "cdr"))
     if draw.odd():
         base.execute("UPDATE topics SET name = CAST(x'fffe2f00' AS TEXT)")
-    form = draw.choice((*["plain"] * 6, "view", "computed", "zeroblob", "untyped", "virtual"))
+    plain = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
     tables = {
-        "plain": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)",
         "untyped": "CREATE TABLE messages(id, topic_id, timestamp, data)",
         "computed": "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000)))",
         "view": "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
         " SELECT x AS id, 0 AS topic_id, x AS timestamp, zeroblob(1000) AS data FROM c",
         "virtual": "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
     }
-    base.execute(tables.get(form, tables["plain"]))
+    form = draw.choice((*["plain"] * 6, "zeroblob", *tables))
+    base.execute(tables.get(form, plain))
     if form in ("plain", "untyped", "zeroblob"):
-        rows = [(t, at if at < 2**63 else at - 2**64, data) for t, at, data in sent]
-        rows = [(t, draw.choice(("x", 1.5, None, -5)) if draw.odd() else at, data) for t, at, data in rows]
         packed = draw.random() < 0.2
-        rows = [(t, at, zstandard.compress(data) if packed else data) for t, at, data in rows]
-        rows = [(t, at, draw.choice((3, "text", None, b"")) if draw.odd() else data) for t, at, data in rows]
+        rows = []
+        for topic, at, data in sent:
+            data = zstandard.compress(data) if packed else data
+            at = draw.choice(("x", 1.5, None, -5)) if draw.odd() else at - 2**64 * (at >= 2**63)
+            rows.append((topic, at, draw.choice((3, "text", None, b"")) if draw.odd() else data))
         rows += [(0, START, zstandard.compress(bytes(1 << 24)))] * draw.choice((0, 0, 0, 30))
         base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
         if form == "zeroblob":
@@ -249,42 +246,36 @@ def recording(draw, folder):
     bag = folder / "bag"
     bag.mkdir()
     files = [storage(draw, bag / f"bag_{k}") for k in range(draw.choice((1, 1, 2)))]
-    names = [file.name for file in files] * draw.choice((1, 1, 1, 2000))
-    names += draw.choice(
-        ([], [], ["../config.yaml"], ["/dev/zero"], ["\x00"], ["../bag/bag_0.mcap"], ["x" * 5000], ["."])
+    odd = ("../config.yaml", "/dev/zero", "\x00", "../bag/bag_0.mcap", "x" * 5000, ".")
+    names = [file.name for file in files] * draw.choice((1, 1, 1, 2000)) + draw.choice(
+        ([], [], *([one] for one in odd))
     )
-    about = {
-        "version": 9,
-        "relative_file_paths": names,
-        "compression_mode": draw.choice(("", "MESSAGE", "FILE")),
-        "topics_with_message_count": [],
-    }
-    text = json.dumps({"rosbag2_bagfile_information": about}, indent=1)
-    (bag / "metadata.yaml").write_bytes(odd_yaml(draw, text).encode("utf-8", "surrogatepass"))
-    if draw.random() < 0.1:
-        (bag / "metadata.yaml").unlink()
+    about = {"version": 9, "relative_file_paths": names, "topics_with_message_count": []}
+    about["compression_mode"] = draw.choice(("", "MESSAGE", "FILE"))
+    if draw.random() < 0.9:
+        write(bag / "metadata.yaml", odd_yaml(draw, json.dumps({"rosbag2_bagfile_information": about}, indent=1)))
     return bag
 
 
 def flight_log(draw, stem):
     """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
     made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
-    kind = draw.choice(
-        ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo", "SCALED_IMU")
-        + ("csv",) * 4
+    dataflash, ulog = (
+        ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1"),
+        ("sensor_gyro", "vehicle_imu", "sensor_gyro_fifo"),
     )
+    kind = draw.choice((*dataflash, *ulog, "tlog", *["csv"] * 4))
     for unit in made:
         if draw.odd() or draw.odd():
             unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
             unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
     if kind == "csv":
         path = table(draw, stem.with_name(f"{stem.name}.csv"), made)
-    elif kind == "SCALED_IMU":
+    elif kind == "tlog":
         path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), made)
-    elif kind.isupper() or kind == "TimeMS":
-        path = logs.write_dataflash(stem.with_name(f"{stem.name}.bin"), made, kind, draw.random() < 0.7)
     else:
-        path = logs.write_ulog(stem.with_name(f"{stem.name}.ulg"), made, kind, draw.random() < 0.7)
+        suffix, write_log = ("bin", logs.write_dataflash) if kind in dataflash else ("ulg", logs.write_ulog)
+        path = write_log(stem.with_name(f"{stem.name}.{suffix}"), made, kind, draw.random() < 0.7)
     data = bytearray(path.read_bytes())
     for _ in range(draw.choice((0, 1, 3, 30)) if draw.oddness else 0):
         at = draw.randrange(min(len(data), draw.choice((700, 1500, len(data)))))
@@ -310,29 +301,27 @@ def table(draw, path, made):
 
 
 def storage(draw, stem):
-    if draw.random() < 0.3:
-        path = stem.with_name(f"{stem.name}.db3")
+    kind = draw.choice((*[".db3"] * 3, *[".bag"] * (stem.name == "bag"), *[".mcap"] * 6))
+    path = stem.with_name(f"{stem.name}{kind}")
+    if kind == ".db3":
         database(draw, path)
-    elif stem.name == "bag" and draw.random() < 0.2:
+    elif kind == ".bag":
         topics, sent = messages(draw)
         named = [(topics[k][0], at % 2**61, data) for k, at, data in sent if topics[k][0]]
         packing = draw.choice((None, Ros1Writer.CompressionFormat.BZ2, Ros1Writer.CompressionFormat.LZ4))
-        path = write_ros1(stem.with_name(f"{stem.name}.bag"), named, packing, dict(topics[:2]))
-        data = bytearray(path.read_bytes())
+        data = bytearray(write_ros1(path, named, packing, dict(topics[:2])).read_bytes())
         for _ in range(draw.choice((0, 1, 3, 30)) if draw.oddness else 0):
             data[draw.randrange(len(data))] = draw.choice((0, 1, 255, draw.randrange(256)))
         path.write_bytes(draw.damaged(bytes(data)))
     else:
-        path = stem.with_name(f"{stem.name}.mcap")
         path.write_bytes(mcap(draw))
     if draw.random() < 0.1:
-        packed = path.with_name(f"{path.name}.zstd")
         packer = zstandard.ZstdCompressor().compressobj()
         data = packer.compress(path.read_bytes())
         data += b"".join(packer.compress(bytes(1 << 20)) for _ in range(draw.choice((0, 0, 0, 0, 0, 512))))
-        packed.write_bytes(draw.damaged(data + packer.flush()))
         path.unlink()
-        path = packed
+        path = path.with_name(f"{path.name}.zstd")
+        path.write_bytes(draw.damaged(data + packer.flush()))
     return path
 
 
@@ -358,8 +347,8 @@ def parameters(draw):
     settings = dict(PARAMETERS)
     if draw is not SOUND and draw.random() < 0.2:
         settings = {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "two_triad_cone"}
-    names = list(Config().parameters()) if draw.odd() or draw.odd() else []
-    settings |= {name: draw.choice((1.0, -1, "x", [0.1], 10**9)) for name in draw.sample(names, min(1, len(names)))}
+    if draw.odd() or draw.odd():
+        settings[draw.choice(list(Config().parameters()))] = draw.choice((1.0, -1, "x", [0.1], 10**9))
     lines = [f"    {name}: {json.dumps(value)}" for name, value in settings.items()]
     return odd_yaml(draw, "\n".join(["/**:", "  ros__parameters:", *lines]))
 
@@ -369,17 +358,15 @@ def words_of(draw, folder):
     verb = draw.choice(
         (*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, *["convert"] * 2, "geometry")
     )
-    source = recording(draw, folder) if verb not in ("study", "geometry") else Path()
-    of_config = parameters(draw) if verb == "geometry" or draw.random() < 0.2 else parameters(SOUND)
-    if source.suffix in (".bin", ".csv", ".tlog", ".ulg"):
-        of_config = of_config.replace(TOPICS[0], "/imu_0").replace(TOPICS[1], "/imu_1")
-    (folder / "config.yaml").write_bytes(of_config.encode("utf-8", "surrogatepass"))
     if verb == "study":
         studies = sorted((ROOT / "config" / "studies").iterdir())
-        (folder / "study.yaml").write_bytes(
-            odd_yaml(draw, draw.choice(studies).read_text()).encode("utf-8", "surrogatepass")
-        )
+        write(folder / "study.yaml", odd_yaml(draw, draw.choice(studies).read_text()))
         return [verb, str(folder / "study.yaml")]
+    source = recording(draw, folder) if verb != "geometry" else Path()
+    of_config = parameters(draw if verb == "geometry" or draw.random() < 0.2 else SOUND)
+    if source.suffix in (".bin", ".csv", ".tlog", ".ulg"):
+        of_config = of_config.replace(TOPICS[0], "/imu_0").replace(TOPICS[1], "/imu_1")
+    write(folder / "config.yaml", of_config)
     if verb == "geometry":
         return [verb, str(folder / "config.yaml")]
     words = [verb, str(source)]
@@ -388,17 +375,17 @@ def words_of(draw, folder):
     if verb == "inspect":
         return words + ["--write", str(folder / "out" / "made.yaml")] * (draw.random() < 0.7)
     words += ["--config", str(folder / "config.yaml")]
-    if draw.random() < 0.2:
-        words += [f"--start={draw.choice(('0.1', '1e30', '-1', 'nan', '1e-300'))}"]
-    if draw.random() < 0.1:
-        words += [f"--end={draw.choice(('0.3', '1e30', 'nan', 'inf', '1e-9'))}"]
+    for option, values, share in (
+        ("--start", ("0.1", "1e30", "-1", "nan", "1e-300"), 0.2),
+        ("--end", ("0.3", "1e30", "nan", "inf", "1e-9"), 0.1),
+    ):
+        words += [f"{option}={draw.choice(values)}"] * (draw.random() < share)
     if verb == "calibrate":
         return [*words, "--output", str(folder / "out" / "made.yaml")]
     return words + replay_words(draw, folder)
 
 
 def replay_words(draw, folder):
-    """Options of a replay."""
     words = []
     for option, name in (("--json", "s.json"), ("--csv", "s.csv"), ("--output", "bag")):
         words += [option, str(folder / "out" / name)] * (draw.random() < 0.3)
@@ -407,9 +394,13 @@ def replay_words(draw, folder):
         kind = draw.choice(("bias", "drift", "stuck"))
         words += ["--fault", f"channel=imu_1.y kind={kind} size={size} start={start}"]
     if draw.random() < 0.1:
-        (folder / "scenario.yaml").write_bytes(odd_yaml(draw, SCENARIO).encode("utf-8", "surrogatepass"))
+        write(folder / "scenario.yaml", odd_yaml(draw, SCENARIO))
         words += ["--scenario", str(folder / "scenario.yaml")]
     return words
+
+
+def write(path, text):
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
 
 
 # Cases ---------------------------------------------------------------------------------------------------------------
@@ -424,21 +415,22 @@ def run_case(number, seed="fdi"):
         given = inputs(folder)
         out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
         begun, before = time.process_time(), peak()
-        with warnings.catch_warnings(record=True) as warned, contextlib.redirect_stdout(out):
+        with warnings.catch_warnings(record=True) as warned, redirect_stdout(out), redirect_stderr(err):
             warnings.simplefilter("always")
-            with contextlib.redirect_stderr(err):
-                try:
-                    code = verb(words)
-                    wrong = ""
-                except BaseException:
-                    code, wrong = -1, traceback.format_exc()
+            try:
+                code, wrong = verb(words), ""
+            except BaseException:
+                code, wrong = -1, traceback.format_exc()
         seconds, growth = time.process_time() - begun, peak() - before
         said, errors = (stream.buffer.getvalue().decode() for stream in (out, err))
-        wrong = wrong or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
-        wrong = wrong or look(folder, words, code, said, errors)
-        wrong = wrong or ("" if inputs(folder) == given else f"changed what it read: {given}, now {inputs(folder)}")
-        wrong = wrong or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
-        wrong = wrong or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
+        wrong = (
+            wrong
+            or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
+            or look(folder, words, code, said, errors)
+            or ("" if inputs(folder) == given else f"changed what it read: {given}, now {inputs(folder)}")
+            or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
+            or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
+        )
         return Case(number, words, wrong, seconds)
     finally:
         shutil.rmtree(folder)
@@ -509,18 +501,16 @@ def main():
         # By the time of the processor, which other programs may take; faulthandler's own timer goes by the wall.
         signal.setitimer(signal.ITIMER_PROF, 3 * MOST_SECONDS)
         case = run_case(number)
-        slowest, done = max(slowest, case.seconds), done + 1
+        slowest, done, wrong = max(slowest, case.seconds), done + 1, wrong + bool(case.wrong)
         if case.wrong:
-            wrong += 1
             print(f"case {number}: {' '.join(case.words)}\n{case.wrong}\n", flush=True)
+        took = time.monotonic() - begun
         if done % 1000 == 0:
-            print(f"{done} cases, {wrong} wrong, {time.monotonic() - begun:.0f} s", flush=True)
-        if time.monotonic() - begun > 60 * given.minutes:
+            print(f"{done} cases, {wrong} wrong, {took:.0f} s", flush=True)
+        if took > 60 * given.minutes:
             break
     signal.setitimer(signal.ITIMER_PROF, 0.0)
-    memory = peak() >> 20
-    took = time.monotonic() - begun
-    print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {memory} MB, {took:.0f} s")
+    print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {peak() >> 20} MB, {took:.0f} s")
     return int(wrong > 0)
 
 

@@ -81,29 +81,27 @@ def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(tmp_path
     assert (found["/imu_1"][1] == RATES[:, 3:]).all()
 
 
+IMUS = "imus: [[p1, q1, r1], [p2, q2, r2]]\n"
+
+
 def test_columns_yaml_says_what_names_do_not(tmp_path):
     names = ["k", "t", "p1", "q1", "r1", "p2", "q2", "r2"]
-    table = np.column_stack([TIME * 1e3, np.degrees(RATES)])
-    path = write(tmp_path, names, np.arange(len(TIME)), table)
+    path = write(tmp_path, names, np.arange(len(TIME)), np.column_stack([TIME * 1e3, np.degrees(RATES)]))
     assert "has no columns of gyros among k, t, p1, q1, r1, p2, q2, r2; columns.yaml says which: docs" in refusal(path)
     about = tmp_path / "columns.yaml"
-    imus = "imus: [[p1, q1, r1], [p2, q2, r2]]\n"
-    about.write_text(f"time: t\ntime_unit: ms\nrate_unit: deg/s\n{imus}")
+    about.write_text(f"time: t\ntime_unit: ms\nrate_unit: deg/s\n{IMUS}")
     found, _ = messages(path)
     np.testing.assert_allclose(found["/imu_1"][1], RATES[:, 3:], rtol=1e-12)
     assert (found["/imu_0"][0] == np.round(TIME * 1e6) * 1000).all()
     for text, words in (
         ("imus: [[p1, q1]]", "imus is a list of three columns for each IMU"),
         ("imus: [[p1, q1, z9], [p2, q2, r2]]", "has no column 'z9', it has k, t, p1"),
-        (f"{imus}rate_unit: rpm", "column 'p1' has the unit 'rpm', expected one of rad/s"),
-        (f"{imus}units: 3", "expected time, time_unit, rate_unit and imus"),
-        (f"{imus}time: [1]", "has no column [1]"),
+        (f"{IMUS}rate_unit: rpm", "column 'p1' has the unit 'rpm', expected one of rad/s"),
+        (f"{IMUS}units: 3", "expected time, time_unit, rate_unit and imus"),
+        (f"{IMUS}time: [1]", "has no column [1]"),
         ("- 1", "expected time, time_unit"),
         ("x: [", "is not YAML"),
-        (
-            "{time: t, time_unit: ms, imus: [[p1, q1, r1]]}",
-            "this table has one IMU (columns of 1 IMU at 100 Hz): nothing to compare it with",
-        ),
+        ("{time: t, time_unit: ms, imus: [[p1, q1, r1]]}", "this table has one IMU (columns of 1 IMU at 100 Hz): no"),
     ):
         about.write_text(text)
         assert words in refusal(path)
@@ -112,15 +110,14 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
     assert "is no regular file" in refusal(path)
 
 
-def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path):
-    """Two IMUs of their own rates in one table; a damaged number is a damaged number, not a lost message."""
+@pytest.mark.parametrize("portion", [3000, 1 << 20])
+def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypatch, portion):
+    """Two IMUs of their own rates in one table; a damaged number is one, not a lost message; a second table is left."""
+    monkeypatch.setattr("fdi_ros.bag.csv_file._PORTION", portion)
     path = write(tmp_path, named("imu_{k}.{axis}"))
     lines = path.read_text().splitlines()
-    for k in range(1, len(lines)):
-        cells = lines[k].split(",")
-        if k % 2:
-            cells[4:] = ["", "", ""]
-        lines[k] = ",".join(cells)
+    again = lines[1:]
+    lines[1::2] = [",".join([*line.split(",")[:4], "", "", ""]) for line in lines[1::2]]
     lines[100] = lines[100].replace(lines[100].split(",")[1], "0.1x2", 1)
     path.write_text("\n".join([*lines[:50], "", "# pause", "no numbers", *lines[50:]]) + "\n1.0,2.")
     found, damage = messages(path)
@@ -131,16 +128,10 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path):
         "the last line is not finished and was left out",
         "1 lines without a time were left out",
     ]
-
-
-def test_what_is_read_does_not_depend_on_the_portions_and_a_second_table_is_left_out(tmp_path, monkeypatch):
-    path = write(tmp_path, named("imu_{k}.{axis}"))
-    whole, _ = messages(path)
-    monkeypatch.setattr("fdi_ros.bag.csv_file._PORTION", 3000)
-    again = path.read_text().partition("\n")[2]
-    path.write_text(path.read_text() + again)
-    found, damage = messages(path)
-    assert [one[2] for one in found.values()] == [one[2] for one in whole.values()]
+    monkeypatch.undo()
+    path.write_text("\n".join([*lines, *again]) + "\n")
+    beside, damage = messages(path)
+    assert [one[2] for one in beside.values()] == [one[2] for one in found.values()]
     assert "the time steps back at byte" in damage[1]
 
 
@@ -153,8 +144,12 @@ def test_what_is_read_does_not_depend_on_the_portions_and_a_second_table_is_left
         ("t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50, "has columns of 2 IMUs at times that do not advance"),
         ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),
         ("t," * CSV_LINE_BYTES, "has no line with the names"),
+        (
+            "t,gx,gy,gz,gx1,gy1,gz1\n" + "".join(f"{10 * k},0,0,0,0,0,0\n" for k in range(50)),
+            "does the name of the time have its unit (time_ms), or columns.yaml a time_unit?",
+        ),
     ],
-    ids=["empty", "no names", "unit", "time", "line", "names"],
+    ids=["empty", "no names", "unit", "time", "line", "names", "time in the wrong unit"],
 )
 def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, words):
     path = tmp_path / "a.csv"
@@ -164,26 +159,14 @@ def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, wor
     assert "\n" not in said
 
 
-def test_a_time_in_the_wrong_unit_is_asked_about(tmp_path):
-    said = refusal(write(tmp_path, ["t", *named("imu_{k}.{axis}")[1:]], time=TIME * 1e3))
-    assert "has columns of 2 IMUs at 0.1 Hz" in said
-    assert "does the name of the time have its unit (time_ms), or columns.yaml a time_unit?" in said
-
-
-def test_every_verb_reads_a_table(tmp_path, fdi):
+def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):
     made = units(2, seconds=20.0)
     time = (made[0].stamp - made[0].stamp[0]) * 1e-6
     path = write(tmp_path, named("imu_{k}.{axis}"), time, np.hstack([unit.rate for unit in made]).astype(float))
+    (tmp_path / "other.csv").write_text("name,size\na,3\n")
     config = tmp_path / "made.yaml"
     assert "/imu_1" in fdi("inspect", path, "--output", config).out
     assert fdi("replay", path, "--config", config, "--check", "declared=0").code == 0
-    assert fdi("convert", path, "--output", tmp_path / "bag").code == 0
-    assert fdi("replay", tmp_path / "bag", "--config", config, "--check", "declared=0").code == 0
-    assert (
-        fdi("sweep", path, "--config", config, "--fault", "kind=bias size=0.3", "--json", tmp_path / "sweep.json").code
-        == 0
-    )
-    (tmp_path / "other.csv").write_text("name,size\na,3\n")
     said = fdi("fleet", tmp_path, "--output", tmp_path / "fleet")
     assert said.code == 0, said.err
     assert "other.csv" not in said.out
