@@ -11,14 +11,11 @@ have all of them; 25 blocks are a window.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.config import Config
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.model.samples import Array, Block, Int, Mask
 
@@ -48,8 +45,6 @@ class Data:
     """(N,) ns."""
     z: Array
     """(N, n) rad/s, NaN where not usable."""
-    window: Int
-    """(N,) number of the window that each sample is in, from 0, increasing."""
     unusable: dict[str, Int]
     """(n,) samples of each channel that are not usable, by the reason: missing, not_finite, out_of_range, repeated."""
 
@@ -70,11 +65,12 @@ class Data:
 
     def slow_rates(self) -> Array:
         """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
-        complete = np.isfinite(self.z).all(axis=1)
-        starts = np.flatnonzero(np.diff(self.window, prepend=-1))
-        counts = np.diff(starts, append=len(self.window))
+        window = (self.stamp - self.stamp[0]) // round(WINDOW * 1e9)
+        starts = np.flatnonzero(np.diff(window, prepend=-1))
+        counts = np.diff(starts, append=len(window))
         # A window at the end, or beside a gap, may hold few samples.
-        good = np.logical_and.reduceat(complete, starts) & (counts >= 0.5 * np.median(counts))
+        complete = np.logical_and.reduceat(np.isfinite(self.z).all(axis=1), starts)
+        good = complete & (counts >= 0.5 * np.median(counts))
         means = np.add.reduceat(np.where(np.isfinite(self.z), self.z, 0.0), starts, axis=0)[good] / counts[good, None]
         return np.asarray(means - np.median(means, axis=0)) if len(means) else means
 
@@ -89,27 +85,13 @@ def prepare(block: Block, max_rate: Array) -> Data:
     z = np.where(received & inside, block.z, np.nan)
     old = repeated(z, step)
     z[old] = np.nan
-    window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
-    reasons = {
+    lost = {
         "missing": ~received,
         "not_finite": received & ~finite,
         "out_of_range": received & finite & ~inside,
         "repeated": old,
     }
-    return Data(
-        block.stamp, z, consecutive(window), {why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()}
-    )
-
-
-def consecutive(number: Int) -> Int:
-    """Return the numbers (N,) of spans without those that are empty, from 0 on."""
-    return np.cumsum(np.diff(number, prepend=number[0]) > 0)
-
-
-def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
-    """Prepare some channels of a recording, by their numbers in the configuration."""
-    rates = np.broadcast_to(np.array(config.health.max_rate), block.z.shape[1])
-    return prepare(Block(block.stamp, block.z[:, channels], block.delivered[:, channels]), rates[channels])
+    return Data(block.stamp, z, {why: np.asarray(which.sum(axis=0)) for why, which in lost.items()})
 
 
 def spikes(z: Array, axes: Array) -> Mask:
@@ -189,8 +171,6 @@ class Repeats:
             self._last[k], self._run[k] = column[-1], lengths[-1]
 
 
-BLOCKS_IN_WINDOW = REST_BLOCKS
-"""The test of rest is of as many."""
 POINTS = 6
 """Of the interpolation."""
 HOLE = 1.5
@@ -201,8 +181,6 @@ PORTION = 100_000
 """Samples worked on at once, about."""
 NOT_SHIFTED = 1e-6
 """s; smaller delays are none."""
-SUBS = 5
-"""Blocks in the longer means that show whether noise is coloured."""
 
 
 @dataclass(frozen=True)
@@ -213,8 +191,6 @@ class Blocks:
     """(B,) middle of each block, s from the first sample."""
     mean: Array
     """(B, n) rad/s; NaN where a channel lacks a sample."""
-    window: Int
-    """(B,) number of the window of each block."""
     start: Int
     """(W,) first block of each window."""
     samples: Array
@@ -230,6 +206,16 @@ class Blocks:
         return len(self.start)
 
     @property
+    def size(self) -> Int:
+        """(W,) blocks of each window."""
+        return np.diff(self.start, append=len(self.mean))
+
+    @property
+    def window(self) -> Int:
+        """(B,) number of the window of each block."""
+        return np.repeat(np.arange(self.windows), self.size)
+
+    @property
     def length(self) -> float:
         """Usual time from block to block, s."""
         return float(np.median(np.diff(self.seconds)))
@@ -237,88 +223,56 @@ class Blocks:
     @property
     def time(self) -> Array:
         """(W,) middle of each window, s."""
-        return np.asarray(np.add.reduceat(self.seconds, self.start) / np.diff([*self.start, len(self.seconds)]))
+        return np.asarray(np.add.reduceat(self.seconds, self.start) / self.size)
 
 
 def make_blocks(data: Data, delay: Array) -> Blocks:
     """Cut a recording into blocks, delays (n,) s taken off."""
     span = max(round(BLOCK_TIME / data.step), 1) * data.step
-    source = Resampled(data, delay)
     # A sample on the edge must not fall to either side as its stamp jitters.
-    number = np.floor(source.seconds / span + 0.25 * data.step / span).astype(np.int64)
+    number = np.floor(data.seconds / span + 0.25 * data.step / span).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1))
-    ends = np.append(first[1:], len(number))
-    window = consecutive(number[first] // BLOCKS_IN_WINDOW)
-    start = np.flatnonzero(np.diff(window, prepend=-1))
-    begin = np.append(first[start], len(number))
-    n = data.z.shape[1]
-    mean, samples = np.empty((len(first), n)), np.full((len(start), n, n), np.nan)
-    used = np.zeros(len(start), dtype=np.int64)
-    for a, b in portions(begin):
-        z = source.part(int(begin[a]), int(begin[b]))
-        blocks = slice(int(start[a]), int(start[b]) if b < len(start) else len(first))
-        mean[blocks] = np.add.reduceat(z, first[blocks] - begin[a], axis=0)
-        for w in range(a, b):
-            part = z[begin[w] - begin[a] : begin[w + 1] - begin[a]]
-            there = np.isfinite(part)
-            columns = np.flatnonzero(there.mean(axis=0) >= PRESENT)
-            part = part[there[:, columns].all(axis=1)][:, columns]
-            used[w] = len(part)
-            if len(part) > 3 and len(columns):
-                part = part - part.mean(axis=0)
-                samples[w][np.ix_(columns, columns)] = part.T @ part / (len(part) - 1)
-    count = ends - first
-    seconds = np.add.reduceat(source.seconds, first) / count
-    return Blocks(seconds, mean / count[:, None], window, start, samples, source.white, used)
+    start = np.flatnonzero(np.diff(number[first] // REST_BLOCKS, prepend=-1))
+    z, white = resampled(data, delay)
+    samples, used = np.full((len(start), *z.shape[1:] * 2), np.nan), np.zeros(len(start), dtype=np.int64)
+    for w, part in enumerate(np.split(z, first[start[1:]])):
+        there = np.isfinite(part)
+        columns = np.flatnonzero(there.mean(axis=0) >= PRESENT)
+        part = part[there[:, columns].all(axis=1)][:, columns]
+        used[w] = len(part)
+        if len(part) > 3 and len(columns):
+            part = part - part.mean(axis=0)
+            samples[w][np.ix_(columns, columns)] = part.T @ part / (len(part) - 1)
+    count = np.diff(first, append=len(z))
+    mean, seconds = np.add.reduceat(z, first, axis=0) / count[:, None], np.add.reduceat(data.seconds, first) / count
+    return Blocks(seconds, mean, start, samples, white, used)
 
 
-def portions(begin: Int) -> Iterator[tuple[int, int]]:
-    """Spans of windows of about `PORTION` samples together; begin (W + 1,): their first samples, and the end."""
-    cuts = np.unique(np.searchsorted(begin, np.arange(0, begin[-1] + PORTION, PORTION)).clip(0, len(begin) - 1))
-    return itertools.pairwise(cuts.tolist())
+def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
+    """Interpolate a recording at the instants of its samples, delays (n,), s, taken off.
 
-
-class Resampled:
-    """Values of a recording at the instants of its samples, delays (n,), s, taken off."""
-
-    def __init__(self, data: Data, delay: Array) -> None:
-        self.seconds = data.seconds
-        self._z, self._delay = data.z, delay
-        self._squares, self._count = np.zeros((2, data.z.shape[1]))
-        every, there = np.arange(len(data.z)), np.isfinite(data.z)
-        whole = [bool(column.all()) for column in there.T]
-        self._groups: list[tuple[Int, Int, float]] = []
-        """Channels alike in delay and in samples that they have; these samples, and the usual time between them, s."""
-        left = [i for i in range(len(delay)) if not whole[i] or abs(delay[i]) >= NOT_SHIFTED]
-        while left:
-            i = left[0]
-            alike = [j for j in left if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()]
-            rows = every if whole[i] else np.flatnonzero(there[:, i])
-            usual = float(np.median(np.diff(self.seconds[rows]))) if len(rows) > 1 else 0.0
-            self._groups.append((np.array(alike), rows, usual))
-            left = [j for j in left if j not in alike]
-
-    def part(self, begin: int, end: int) -> Array:
-        """Values (N, n) of some samples, rad/s, NaN: not known."""
-        z = self._z[begin:end].copy()
-        for channels, rows, usual in self._groups:
-            delay = float(self._delay[channels[0]])
-            first, weight = lagrange_weights(self.seconds[rows], self.seconds[begin:end] + delay, usual)
+    Returns values (N, n) rad/s, NaN: not known; and what is left (n,) of the variance of white noise.
+    """
+    seconds, there, z, white = data.seconds, np.isfinite(data.z), data.z.copy(), np.ones(len(delay))
+    left = [i for i in range(len(delay)) if not there[:, i].all() or abs(delay[i]) >= NOT_SHIFTED]
+    while left:
+        i = left[0]
+        # Channels alike in delay and in samples that they have.
+        alike = [j for j in left if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()]
+        left = [j for j in left if j not in alike]
+        rows = np.flatnonzero(there[:, i])
+        knots, squares, count = seconds[rows], 0.0, 0
+        usual = float(np.median(np.diff(knots))) if len(rows) > 1 else 0.0
+        z[:, alike] = np.nan
+        for begin in range(0, len(z), PORTION):
+            first, weight = lagrange_weights(knots, seconds[begin : begin + PORTION] + delay[i], usual)
             known = np.flatnonzero(first >= 0)
-            z[:, channels] = np.nan
-            if len(known):
-                around = rows[first[known, None] + np.arange(POINTS)]
-                z[np.ix_(known, channels)] = np.einsum(
-                    "mp,mpc->mc", weight[known], self._z[around[..., None], channels]
-                )
-            self._squares[channels] += (weight[known] ** 2).sum()
-            self._count[channels] += len(known)
-        return z
-
-    @property
-    def white(self) -> Array:
-        """What is left (n,) of the variance of white noise, in the parts so far."""
-        return np.where(self._count > 0, self._squares / np.maximum(self._count, 1), 1.0)
+            around = rows[first[known, None] + np.arange(POINTS)]
+            values = np.einsum("mp,mpc->mc", weight[known], data.z[around[..., None], alike])
+            z[np.ix_(begin + known, np.array(alike))] = values
+            squares, count = squares + (weight[known] ** 2).sum(), count + len(known)
+        white[alike] = squares / count if count else 1.0
+    return z, white
 
 
 def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:

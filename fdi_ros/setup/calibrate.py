@@ -10,10 +10,11 @@ and formulas are in docs/calibration.md.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import LEAST_NOISE
@@ -23,10 +24,10 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.run import Kept, Sink, Walk
+from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement
-from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
+from fdi_ros.setup.blocks import NOT_SHIFTED, Data, flag_runs, prepare, resampled, spikes
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.result import Calibration, Span, StampDelay
 from fdi_ros.sources import source_of
@@ -81,72 +82,62 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
         If the recording is too short, or its channels contradict each other, naming which.
     """
     full = build_geometry(config)
-    active = np.array([i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels])
-    nominal, source = full.subset(np.isin(np.arange(full.n), active)), source_of(config)
+    used = np.array([name not in config.excluded_channels for name in full.channel_names])
+    active, nominal = np.flatnonzero(used), full.subset(used)
     chosen = reference_channels(config, nominal, reference)
-    data = prepare_channels(block, config, active.tolist())
+    rates = np.broadcast_to(np.array(config.health.max_rate), full.n)
+    data = prepare(Block(block.stamp, block.z[:, used], block.delivered[:, used]), rates[used])
     _check_amount(data, nominal.channel_names)
     spiky = spikes(data.z, nominal.axes)
     data.z[spiky] = np.nan
     lost = np.flatnonzero(np.isin(active, unknown)).tolist()
-    if source.units:
+    if source_of(config).units:
         check_agreement(data, nominal, lost)
-    sensors = _sensors(config, nominal, data, chosen)
-    if lost:
-        sensors.axes[lost] = _axes_against_others(data, sensors.axes, lost)
-        sensors.scale_std[lost] = UNKNOWN_MOUNT
+    sensors = _sensors(config, nominal, data, chosen, lost)
     try:
         found = estimate(data, sensors)
-        settings = _settings(config, active, data.step, found)
-        tried = Config.from_parameters({**config.parameters(), **settings})
+        tried = config.replaced(_settings(config, active, data.step, found))
         faults, spectrum = _watch(_aligned(block, data, found.delay, active), tried, active)
         if faults:
-            _check_share(faults, data, nominal.channel_names)
-            found = estimate(_left_out(data, faults), sensors)
-            settings = _settings(config, active, data.step, found)
+            found = estimate(_without(faults, data, nominal.channel_names), sensors)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
-    delays = []
-    for k in range(1, sensors.units):
-        unit = np.flatnonzero(sensors.unit == k).tolist()
-        delays.append(StampDelay(tuple(unit), float(found.delay[unit[0]]), float(found.delay_std[unit[0]])))
+    units = [tuple(np.flatnonzero(sensors.unit == k).tolist()) for k in range(1, sensors.units)]
     return Calibration(
         names=nominal.channel_names,
         nominal=nominal.axes,
         estimate=found,
         timing=float(_timing(config, active, found).max()),
-        delays=tuple(delays),
+        delays=tuple(StampDelay(unit, float(found.delay[unit[0]]), float(found.delay_std[unit[0]])) for unit in units),
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
-        settings=settings,
+        settings=_settings(config, active, data.step, found),
         spectrum=spectrum,
     )
 
 
-def _aligned(block: Block, data: Data, delay: Array, active: Int) -> Iterator[Block]:
-    """Give the usable values, part by part, as the monitor will have them once the delays (n,), s, are taken off."""
-    source, shifted = Resampled(data, delay), np.abs(delay) >= NOT_SHIFTED
-    for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
-        part, usable, moved = block[first:end], data.z[first:end], source.part(first, end)
-        z, received = part.z.copy(), part.delivered.copy()
-        z[:, active] = np.where(np.isfinite(usable) & ~shifted, usable, moved)
-        # Where there is none for the instant, the value of another one is not it.
-        received[:, active] = np.isfinite(z[:, active])
-        yield Block(part.stamp, z, received)
+def _aligned(block: Block, data: Data, delay: Array, active: Int) -> Block:
+    """Return the usable values as the monitor will have them once the delays (n,), s, are taken off."""
+    z, received = block.z.copy(), block.delivered.copy()
+    still = np.isfinite(data.z) & (np.abs(delay) < NOT_SHIFTED)
+    z[:, active] = np.where(still, data.z, resampled(data, delay)[0])
+    # Where there is none for the instant, the value of another one is not it.
+    received[:, active] = np.isfinite(z[:, active])
+    return Block(block.stamp, z, received)
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:
     """Refuse a recording that is too short, too slow, or lacks too much of a channel."""
-    samples, duration = len(data.stamp), data.duration if len(data.stamp) else 0.0
-    for few, words, needed in (
-        (samples < 2 or duration < LEAST_DURATION, f"is {duration:.1f} s long", f"at least {LEAST_DURATION:g} s"),
-        (samples < LEAST_SAMPLES, f"has {samples} samples", f"at least {LEAST_SAMPLES}"),
-        (samples > 1 and data.step > LONGEST_STEP, "has a sample every {step:g} s", f"one every {LONGEST_STEP:g} s"),
-    ):
-        if few:
-            step = data.step if samples > 1 else 0.0
-            raise CalibrationError(f"the recording {words.format(step=step)}, a calibration needs {needed}")
+    samples, words = len(data.stamp), ""
+    if samples < 2 or data.duration < LEAST_DURATION:
+        words = f"is {data.duration if samples else 0.0:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
+    elif samples < LEAST_SAMPLES:
+        words = f"has {samples} samples, a calibration needs at least {LEAST_SAMPLES}"
+    elif data.step > LONGEST_STEP:
+        words = f"has a sample every {data.step:g} s, a calibration needs one every {LONGEST_STEP:g} s"
+    if words:
+        raise CalibrationError(f"the recording {words}")
     for i, name in enumerate(names):
         seconds = data.seconds[np.isfinite(data.z[:, i])]
         # Of those that it would give at its own rate: a unit may be slower than the others.
@@ -185,13 +176,23 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
     return chosen
 
 
-def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -> Priors:
+def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], lost: list[int]) -> Priors:
+    """Take axes as configured; of an array, and of lost channels, those that the motion shows."""
     source, axes, scale = source_of(config), nominal.axes.copy(), np.full(nominal.n, SCALE_STD)
-    if not source.units:
-        found = _axes_from_motion(data, axes, chosen)
-        if np.abs(found - axes).max() > UNKNOWN_AXES:
+    means = data.slow_rates()
+    if not source.units and len(means) >= LEAST_WINDOWS:
+        x = means[:, chosen]
+        found = np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen]
+        turns = np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) >= LEAST_ROTATION
+        if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
             axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
-    scale[chosen] = REFERENCE_STD
+    if lost:
+        # About what does not turn they stay as they were.
+        others = [i for i in range(nominal.n) if i not in lost]
+        rate = means[:, others] @ np.linalg.pinv(axes[others]).T
+        weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
+        axes[lost] = np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T
+    scale[chosen], scale[lost] = REFERENCE_STD, UNKNOWN_MOUNT
     # Channels that belong to no unit are of the first.
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
@@ -199,83 +200,54 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int]) -
     return Priors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
 
 
-def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
-    """Axes (n, 3) of all channels from those of three, by plain least squares; as they were where nothing turns."""
-    means = data.slow_rates()
-    x = means[:, chosen]
-    if len(x) < LEAST_WINDOWS or np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) < LEAST_ROTATION:
-        return axes
-    return np.asarray(np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen])
+class _Watched(Kept):
+    """Keeps the states of channels, and takes the spectrum of what all differ by from the fused rate."""
 
-
-def _axes_against_others(data: Data, axes: Array, lost: list[int]) -> Array:
-    """Axes of channels of unknown mount by the rate that the others show; about what does not turn as they were."""
-    means, others = data.slow_rates(), [i for i in range(len(axes)) if i not in lost]
-    rate = means[:, others] @ np.linalg.pinv(axes[others]).T
-    weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
-    return np.asarray(np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T)
-
-
-class _Residuals(Sink):
-    """Takes the spectrum of what channels differ by from the fused rate."""
-
-    def __init__(self, names: Sequence[str], rate: float) -> None:
+    def __init__(self, names: Sequence[str], rate: float, active: Int) -> None:
+        super().__init__(lambda output: (output.stamp, output.state[:, active]))
         self.spectrum = Spectrum(names, rate)
 
     def begin_stretch(self) -> None:
         self.spectrum.begin_stretch()
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        super().add(block, output, pipeline)
         self.spectrum.add(output.residual)
 
 
-def _watch(parts: Iterable[Block], config: Config, active: Int) -> tuple[tuple[Span, ...], Spectrum]:
+def _watch(block: Block, config: Config, active: Int) -> tuple[tuple[Span, ...], Spectrum]:
     """Find when the monitor itself, with the settings found, has something declared, and the spectrum of residuals."""
     # So that what was declared ends when it has gone.
-    pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
-    kept = Kept(lambda output: (output.stamp, output.state[:, active]))
-    residuals = _Residuals(pipeline.channel_names, config.sample_rate)
-    walk = Walk(pipeline, [kept, residuals])
-    for part in parts:
-        walk.take(part)
-    stamp, state = kept.columns
-    seconds = (stamp - stamp[0]) * 1e-9
-    spans = [
-        Span((place,), float(seconds[first]), float(seconds[end - 1]))
-        for place, states in enumerate(state.T)
-        for first, end in flag_runs(states == ChannelState.FAULTY)
-    ]
+    pipeline = Pipeline.from_config(config.replaced({"decision.latch": False}))
+    watched = _Watched(pipeline.channel_names, config.sample_rate, active)
+    Walk(pipeline, [watched]).take(block)
+    stamp, state = watched.columns
     among = np.asarray(state == ChannelState.AMBIGUOUS)
-    for first, end in flag_runs(np.asarray(among.any(axis=1))):
-        sets = tuple(int(place) for place in np.flatnonzero(among[first:end].any(axis=0)))
-        spans.append(Span(sets, float(seconds[first]), float(seconds[end - 1])))
-    return tuple(sorted(spans, key=lambda span: span.start)), residuals.spectrum
+    runs = [([k], run) for k, states in enumerate(state.T) for run in flag_runs(states == ChannelState.FAULTY)]
+    for run in flag_runs(np.asarray(among.any(axis=1))):
+        runs.append((np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run))
+    seconds = (stamp - stamp[0]) * 1e-9
+    spans = [Span(tuple(channels), float(seconds[first]), float(seconds[end - 1])) for channels, (first, end) in runs]
+    return tuple(sorted(spans, key=lambda span: span.start)), watched.spectrum
 
 
-def _left_out(data: Data, faults: tuple[Span, ...]) -> Data:
-    """Leave faults out that are of so few channels that the others are known to be right."""
-    z = data.z.copy()
-    for span in faults:
-        if len(span.channels) <= MOST_LEFT_OUT * data.z.shape[1]:
-            rows = (data.seconds >= span.start - LEAD) & (data.seconds <= span.end)
-            z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
-    return replace(data, z=z)
-
-
-def _check_share(faults: tuple[Span, ...], data: Data, names: tuple[str, ...]) -> None:
-    """Refuse a channel that is faulty for so long that it may be the others that are wrong."""
-    share = np.zeros(len(names))
-    for span in faults:
-        if len(span.channels) <= MOST_LEFT_OUT * len(names):
-            share[list(span.channels)] += (span.end - span.start) / data.duration
+def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data:
+    """Leave faults out that are of so few channels that the others are known to be right; refuse one that lasts."""
+    clear = [span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)]
+    z, share = data.z.copy(), np.zeros(len(names))
+    for span in clear:
+        share[list(span.channels)] += (span.end - span.start) / data.duration
+        rows = (data.seconds >= span.start - LEAD) & (data.seconds <= span.end)
+        z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
     if share.max() > MOST_FAULTY:
         group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
-        first = next(span for span in faults if int(share.argmax()) in span.channels)
+        first = next(span for span in clear if int(share.argmax()) in span.channels)
         raise DisagreementError(
             f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of the recording (from"
             f" {first.start:.1f} s): faulty; mend it, cut it out with --start and --end, or name it in"
             " excluded_channels"
         )
+    return replace(data, z=z)
 
 
 # Settings -------------------------------------------------------------------------------------------------------------
@@ -283,49 +255,45 @@ def _check_share(faults: tuple[Span, ...], data: Data, names: tuple[str, ...]) -
 
 def _settings(config: Config, active: Int, step: float, found: StateEstimate) -> dict[str, object]:
     """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
-    all_axes = build_geometry(config).axes.copy()
-    n = len(all_axes)
-    all_axes[active] = found.axes
-    all_bias = np.array(config.bias.fixed) if config.bias.fixed else np.zeros(n)
-    all_bias[active] = found.bias
-    before = build_noise(config, n)
-    std, scale, timing = before.noise_std.copy(), before.scale_std.copy(), before.timing_std.copy()
-    std[active], scale[active] = np.maximum(_noise(found), LEAST_NOISE), found.disagreement()[0]
-    timing[active] = _timing(config, active, found)
-    changed: dict[str, object] = {
+    geometry = build_geometry(config)
+    before, source = build_noise(config, geometry.n), source_of(config)
+
+    def changed(values: ArrayLike, new: ArrayLike) -> Array:
+        whole = np.broadcast_to(np.asarray(values, dtype=float), np.shape(geometry.axes)[: np.ndim(new) or 1]).copy()
+        whole[active] = new
+        return whole
+
+    moving, std = found.moment[~found.rest], found.floor.std
+    if len(moving):
+        std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
+    settings: dict[str, object] = {
         "geometry.preset": "axes",
-        "geometry.axes": _rounded(all_axes.ravel(), 6),
-        "noise.noise_std": [float(f"{value:.4g}") for value in std],
-        "noise.scale_std": _short(scale),
-        "noise.timing_std": _short(timing),
-        "bias.fixed": _rounded(all_bias, 7),
+        "geometry.axes": _rounded(changed(geometry.axes, found.axes).ravel(), 6),
+        "noise.noise_std": [float(f"{value:.4g}") for value in changed(before.noise_std, np.maximum(std, LEAST_NOISE))],
+        "noise.scale_std": _short(changed(before.scale_std, found.disagreement()[0])),
+        "noise.timing_std": _short(changed(before.timing_std, _timing(config, active, found))),
+        "bias.fixed": _rounded(changed(config.bias.fixed or 0.0, found.bias), 7),
         "bias.startup_bias_duration": 0.0,
         # No single recording shows how biases differ from one start to the next.
         "bias.turn_on_std": config.bias.turn_on_std,
     }
     if found.bias_walk.value > 0:
-        walk = np.broadcast_to(np.array(config.noise.bias_walk), n).copy()
-        walk[active] = found.bias_walk.value
-        changed["noise.bias_walk"] = _short(walk)
-    source = source_of(config)
+        settings["noise.bias_walk"] = _short(changed(config.noise.bias_walk, found.bias_walk.value))
     if source.stamped:
         total = np.array(source.delays)
         shown = np.abs(found.delay) > np.maximum(LEAST_SKEW, SHOWN * found.delay_std)
         # Of all channels of a unit the first is taken.
         units, first = np.unique([source.chip_of(int(channel)) for channel in active], return_index=True)
         total[units] += np.where(shown, found.delay, 0.0)[first]
-        changed["imus.delays"] = _rounded(total - total[0], 6)
+        settings["imus.delays"] = _rounded(total - total[0], 6)
         if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
-            changed["imus.timeout"] = float(f"{needed:.2g}")
-        if (narrow := _skew(config, step, found.delay)) < config.imus.max_skew:
-            changed["imus.max_skew"] = narrow
-    return changed
-
-
-def _noise(found: StateEstimate) -> Array:
-    """Noise (n,) of one sample as written, rad/s: the channels' own."""
-    moving = found.moment[~found.rest]
-    return np.maximum(found.floor.std, np.median(moving, axis=0) / LOUDER) if len(moving) else found.floor.std
+            settings["imus.timeout"] = float(f"{needed:.2g}")
+        # Within max_skew stamps count as one instant: then no delay is taken off.
+        offset = np.abs(found.delay - np.round(found.delay / step) * step)
+        hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= config.imus.max_skew)]
+        if len(hidden):
+            settings["imus.max_skew"] = float(f"{hidden.min() / 2:.2g}")
+    return settings
 
 
 def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
@@ -333,13 +301,6 @@ def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
     before = build_noise(config, build_geometry(config).n).timing_std[active]
     error = float(np.sqrt(np.mean(found.delay_std**2))) if source_of(config).stamped else 0.0
     return np.where(error < np.maximum(before, LEAST_SKEW), error, before)
-
-
-def _skew(config: Config, step: float, delay: Array) -> float:
-    """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
-    offset = np.abs(delay - np.round(delay / step) * step)
-    hidden = offset[(offset > 2 * LEAST_SKEW) & (offset <= config.imus.max_skew)]
-    return float(f"{hidden.min() / 2:.2g}") if len(hidden) else config.imus.max_skew
 
 
 def _rounded(values: Array, digits: int) -> list[float]:

@@ -34,7 +34,7 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
-from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
+from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
 from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.setup.smoother import NormalEquations, RandomWalk, Smoothed, find_random_walk, smooth
 
@@ -65,8 +65,8 @@ USUAL_WALK = 2e-5
 """rad/s/sqrt(s); of biases that show none."""
 WIDER = 1.5
 """Axes that are farther off than expected by so much are known less beforehand."""
-LEAST_BLOCKS = 5
-"""Of a window that tells its noise; also windows that tell whether it is coloured."""
+LEAST_BLOCKS = SUBS = 5
+"""Of a window that tells its noise, and windows that tell whether it is coloured; blocks of the means that show it."""
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")
@@ -128,7 +128,7 @@ class StateEstimate:
     @property
     def rest_seconds(self) -> float:
         """Time at rest, s."""
-        return float(self.rest.sum()) * BLOCKS_IN_WINDOW * self.blocks.length
+        return float(self.rest.sum()) * REST_BLOCKS * self.blocks.length
 
     def disagreement(self) -> tuple[float, float]:
         """Scale error that is left between channels, root mean square of all components, and its uncertainty.
@@ -155,7 +155,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     colour = np.ones((2, n))
     blocks, prior_scale = make_blocks(data, taken[sensors.unit]), sensors.scale_std
     for number in range(PASSES):
-        one = _Pass(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
+        one = _Pass(blocks, sensors, axes, taken, biases, number > 1, colour, prior_scale)
         if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
             walk = find_random_walk(one.evidence)
         usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
@@ -186,7 +186,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
     # What interpolation has taken of white noise is given back to what is left once the motion is out.
     kept = np.sqrt(blocks.white)
-    moment = np.sqrt(of_the_moment(blocks.samples, one.present & one.has_samples, axes)) / kept
+    moment = np.sqrt(of_the_moment(blocks.samples, one.sampled, axes)) / kept
     return StateEstimate(
         axes,
         covariance[: 3 * n, : 3 * n],
@@ -208,60 +208,50 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
 class _Pass:
     """One linearisation: rest, rate and noise of every window with the states so far, and what they say of the states.
 
-    Parameters
-    ----------
-    blocks, sensors
-        The recording, and what is known of the sensors beforehand.
-    axes, delay
-        (n, 3), and (units,) s taken off the blocks.
-    biases
-        (K, n) of joined windows, rad/s.
-    colour
-        (2, n) variance of longer means over that of white noise, at rest and in motion.
-    known
-        Whether the biases are from a pass before.
-    scale
-        (n,) standard deviation of each component of the axes beforehand.
+    Of blocks with delays (units,) s taken off, axes (n, 3), and biases (K, n) rad/s of joined windows; whether these
+    are from a pass before; colour (2, n), the variance of longer means over that of white noise, at rest and in motion;
+    and scale (n,), the standard deviation of each component of the axes beforehand.
     """
 
     def __init__(
-        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, colour: Array, known: bool,
+        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, known: bool, colour: Array,
         scale: Array,
     ) -> None:  # fmt: skip
-        self.blocks, self.axes = blocks, axes
-        self.size = np.diff([*blocks.start, len(blocks.mean)])
+        self.blocks, self.axes, self.window = blocks, axes, blocks.window
         finite = np.isfinite(blocks.mean)
-        present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * self.size[:, None]
+        present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * blocks.size[:, None]
         # Blocks (B,) with all channels that are present in their window.
-        self.used: Mask = np.asarray((finite | ~present[blocks.window]).all(axis=1))
-        y = np.where(finite & present[blocks.window], blocks.mean, 0.0)
+        self.used: Mask = np.asarray((finite | ~present[self.window]).all(axis=1))
+        y = np.where(finite & present[self.window], blocks.mean, 0.0)
         count = np.add.reduceat(self.used, blocks.start)
         mean = np.add.reduceat(y * self.used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]
-        apart = (y - mean[blocks.window]) * self.used[:, None]
+        apart = (y - mean[self.window]) * self.used[:, None]
         covariance = self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
         enough = count >= LEAST_BLOCKS
         # (W, n); and those of whose single samples the windows tell.
         self.present = present & enough[:, None]
-        self.has_samples = np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
+        self.sampled = self.present & np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
         moment = of_the_moment(covariance, self.present, axes)
-        self.floor = find_floor(blocks.samples, blocks.count, self.present & self.has_samples, axes)
+        self.floor = find_floor(blocks.samples, blocks.count, self.sampled, axes)
         steady = np.where(self.present, moment, ABSENT)
         # Biases of every window, of those of joined ones.
         bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[: blocks.windows]
         gain = gains(steady, axes)
-        self.rate: Array = np.einsum("bai,bi->ba", gain[blocks.window], y - bias[blocks.window])
-        self.rest = np.zeros(blocks.windows, dtype=bool)
-        if blocks.windows > 1:
-            self.rest = self._find_rest(gain, steady, known)
+        self.rate: Array = np.einsum("bai,bi->ba", gain[self.window], y - bias[self.window])
+        self.rest = self._find_rest(gain, steady, known)
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
         self.variance: Array = np.where(self.present, moment * factor, ABSENT)
-        acceleration, inside = self._differentiate()
-        self.used = self.used & (inside | self.rest[blocks.window]) & enough[blocks.window]
+        # Angular acceleration, rad/s^2, where it is known.
+        acceleration, inside = np.zeros_like(self.rate), np.zeros(len(self.rate), dtype=bool)
+        span = blocks.seconds[2:] - blocks.seconds[:-2]
+        inside[1:-1] = (span < 2.5 * blocks.length) & self.used[2:] & self.used[:-2]
+        acceleration[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
+        self.used = self.used & (inside | self.rest[self.window]) & enough[self.window]
         each = -(-blocks.windows // MOST_STEPS)
         self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
         self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
-        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration, scale)
+        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration * inside[:, None], scale)
 
     @property
     def times(self) -> Array:
@@ -280,26 +270,14 @@ class _Pass:
             found[:, i, j] = np.add.reduceat(first[:, i] * second[:, j], self.blocks.start)
         return found
 
-    def _differentiate(self) -> tuple[Array, Mask]:
-        """Angular acceleration (B, 3), rad/s^2, and where it is known (B,)."""
-        acceleration, inside, t = (
-            np.zeros_like(self.rate),
-            np.zeros(len(self.rate), dtype=bool),
-            self.blocks.seconds,
-        )
-        span = t[2:] - t[:-2]
-        inside[1:-1] = (span < 2.5 * self.blocks.length) & self.used[2:] & self.used[:-2]
-        acceleration[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
-        return acceleration * inside[:, None], inside
-
     def _find_rest(self, gain: Array, variance: Array, known: bool) -> Mask:
         """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
         blocks, rate, found = self.blocks, self.rate, np.zeros(self.blocks.windows, dtype=bool)
         noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
-        level = levels(blocks.samples, self.present & self.has_samples, self.axes)
+        level = levels(blocks.samples, self.sampled, self.axes)
         quiet = level < QUIET * np.average(level[self.floor.windows])
         unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
-        for w in np.flatnonzero(quiet & (self.size == REST_BLOCKS)):
+        for w in np.flatnonzero(quiet & (blocks.size == REST_BLOCKS)) if blocks.windows > 1 else ():
             rows = slice(blocks.start[w], blocks.start[w] + REST_BLOCKS)
             there = self.used[rows]
             if there.mean() >= PRESENT:
@@ -308,15 +286,12 @@ class _Pass:
                 found[w] = rests(part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
         if not found.any():
             return found
-        mean = np.add.reduceat(rate, blocks.start, axis=0) / BLOCKS_IN_WINDOW
-        limit = ALIKE * np.sqrt(noise / BLOCKS_IN_WINDOW + REST_STD**2)
+        mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
+        limit = ALIKE * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
         found &= (np.abs(mean - np.median(mean[found], axis=0)) < np.maximum(limit, 0.0)).all(axis=1)
         # Beside motion its beginning is hidden by the noise.
-        before, after = np.roll(found, 1), np.roll(found, -1)
-        before[0] = after[-1] = True
-        found &= before & after
-        seconds = float(found.sum()) * BLOCKS_IN_WINDOW * blocks.length
-        return found if seconds >= LEAST_REST else np.zeros_like(found)
+        found &= np.append(True, found[:-1]) & np.append(found[1:], True)
+        return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LEAST_REST)
 
     def _find_evidence(
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array, scale: Array
@@ -324,7 +299,7 @@ class _Pass:
         """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
         blocks, axes, variance, rest, n = self.blocks, self.axes, self.variance, self.rest, len(self.axes)
         coefficients, prior = coefficients_of(sensors, axes, scale)
-        moving = (~rest[blocks.window])[:, None]
+        moving = (~rest[self.window])[:, None]
         base = np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving]) * self.used[:, None]
         # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
@@ -356,7 +331,7 @@ class _Pass:
             whole = np.block([[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]])
             rights = np.hstack([right, since[:, 0] * right[:, :n]])
             apart = np.diff(self.middle, append=self.middle[-1])
-            return NormalEquations.in_units(n, whole, rights, apart, prior, start)
+            return NormalEquations(n, whole, rights, apart, prior, start)
 
         kept = self._beyond_vibration(moments, count)
         return summed(moments, cross), summed(kept @ moments, kept @ cross)
@@ -389,13 +364,13 @@ class _Pass:
     def colours(self, axes: Array) -> Array:
         """Variance (2, n) of longer means over that of white noise, 1 at least, at rest and in motion."""
         blocks, n, found = self.blocks, len(axes), np.ones((2, len(axes)))
-        full = self.present.all(axis=1) & (self.size == BLOCKS_IN_WINDOW)
+        full = self.present.all(axis=1) & (blocks.size == REST_BLOCKS)
         full &= np.logical_and.reduceat(self.used, blocks.start)
         for regime, windows in enumerate((full & self.rest, full & ~self.rest)):
             chosen = np.flatnonzero(windows)
             if len(chosen) < LEAST_BLOCKS:
                 continue
-            rows = blocks.start[chosen][:, None] + np.arange(BLOCKS_IN_WINDOW)
+            rows = blocks.start[chosen][:, None] + np.arange(REST_BLOCKS)
             t = np.einsum("wij,wbj->wbi", information(self.variance[chosen], axes), blocks.mean[rows])
             means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
             short, long = (part.var(axis=1, ddof=1).sum(axis=0) for part in (t, means))

@@ -31,7 +31,7 @@ from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
-from fdi_ros.setup.blocks import prepare_channels
+from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
 from fdi_ros.setup.findings import candidates, clocks_apart, copy_words, needs, refuse_degrees
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
@@ -356,7 +356,7 @@ def _mounted(block: Block, start: LearnedSettings) -> LearnedSettings:
     """Find how units are mounted against each other."""
     if not source_of(start.config).units:
         return start
-    mounts = find_mounts(prepare_channels(block, start.config, list(range(block.z.shape[1]))))
+    mounts = find_mounts(prepare(block, np.array(start.config.health.max_rate)))
     rotations = [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]
     known = {**start.parameters, "imus.mounts": np.ravel(rotations).tolist()}
     return replace(_if_built(known, start), mounts=mounts)

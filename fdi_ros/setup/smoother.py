@@ -28,30 +28,26 @@ POSSIBLE = 2.0
 """What one may lose against the best and be possible."""
 
 
-@dataclass(frozen=True)
 class NormalEquations:
-    """What the groups say of the states, the n biases first, in units of their standard deviations before.
+    """What the groups say of the states, the biases first; kept in units of their standard deviations before.
 
     In units of their own, information on them would be apart by more than what rounding leaves of a number.
+
+    Parameters
+    ----------
+    n
+        Number of biases.
+    normal, right
+        N (K, s, s) and r (K, s).
+    apart
+        (K,) time to the next group, s; the last is not read.
+    prior, start
+        (s,) standard deviations, of all biases the same, and means before.
     """
 
-    n: int
-    """Number of biases."""
-    normal: Array
-    """(K, s, s) N."""
-    right: Array
-    """(K, s) r."""
-    apart: Array
-    """(K,) time to the next group, s; the last is not read."""
-    prior: Array
-    """(s,) standard deviations before, of all biases the same: rad/s, s, ..."""
-    start: Array
-    """(s,) means before."""
-
-    @classmethod
-    def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> NormalEquations:
-        """Take the same of states in units of their own."""
-        return cls(n, normal * np.outer(prior, prior), right * prior, apart, prior, start / prior)
+    def __init__(self, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> None:
+        self.n, self.apart, self.prior = n, apart, prior
+        self.normal, self.right, self.start = normal * np.outer(prior, prior), right * prior, start / prior
 
 
 @dataclass(frozen=True)
@@ -79,20 +75,12 @@ class RandomWalk(NamedTuple):
     """The largest that the recording does not rule out."""
 
 
-class _Eliminated(NamedTuple):
-    """What is left for the constants once the biases are eliminated."""
+def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:
+    """Eliminate the biases, of such a walk.
 
-    solved: Array
-    """(K n, n + m + 1): B^-1 of the mean of the biases; of C; and of h, the biases if all constants were zero."""
-    information: Array
-    """(m, m) on the constants."""
-    side: Array
-    """(m,) right-hand side."""
-    likelihood: float
-    """Logarithm of the marginal likelihood of the walk."""
-
-
-def _eliminate(of: NormalEquations, walk: float) -> _Eliminated:
+    Returns B^-1 (K n, n + m + 1) of the mean of the biases, of C and of h, which gives the biases if all constants were
+    zero; information (m, m) on the constants and its right-hand side (m,); and the log of the marginal likelihood.
+    """
     n, count = of.n, len(of.normal)
     stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
     blocks = of.normal[:, :n, :n].copy()
@@ -115,14 +103,14 @@ def _eliminate(of: NormalEquations, walk: float) -> _Eliminated:
     side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
     fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
     volume = 2.0 * np.log(factor[0]).sum() - n * np.log(stiffness).sum() + np.linalg.slogdet(information)[1]
-    return _Eliminated(solved, information, side, 0.5 * (fits - float(volume)))
+    return solved, information, side, 0.5 * (fits - float(volume))
 
 
 def find_random_walk(of: NormalEquations) -> RandomWalk:
     """Find the walk of the biases by its marginal likelihood."""
     if len(of.normal) < 3:
         return RandomWalk(0.0, float(WALKS[-1]))
-    none, *logs = (_eliminate(of, walk).likelihood for walk in (0.0, *WALKS))
+    none, *logs = (_eliminate(of, walk)[-1] for walk in (0.0, *WALKS))
     best = int(np.argmax(logs))
     # Between the walks tried, by a parabola.
     shift = 0.0
@@ -141,20 +129,20 @@ def smooth(of: NormalEquations, walk: float, known: tuple[Array, Array] | None =
     Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
     they count as uncertain as they are (Schmidt 1966).
     """
-    n, found = of.n, _eliminate(of, walk)
+    n, (solved, information, side, _) = of.n, _eliminate(of, walk)
     if known is None:
-        covariance = np.linalg.inv(found.information)
-        constant = covariance @ found.side
+        covariance = np.linalg.inv(information)
+        constant = covariance @ side
     else:
         k = len(known[0])
         first, p = known[0] / of.prior[n : n + k], known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
-        free = np.linalg.inv(found.information[k:, k:])
-        by = -free @ found.information[k:, :k]
-        constant = np.concatenate([first, free @ found.side[k:] + by @ first])
+        free = np.linalg.inv(information[k:, k:])
+        by = -free @ information[k:, :k]
+        constant = np.concatenate([first, free @ side[k:] + by @ first])
         covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
-    curve = (found.solved[:, -1] - found.solved[:, n:-1] @ constant).reshape(-1, n)
+    curve = (solved[:, -1] - solved[:, n:-1] @ constant).reshape(-1, n)
     # The mean of the biases by itself, and by the constants.
-    mean = found.solved.reshape(len(curve), n, -1).mean(axis=0)
+    mean = solved.reshape(len(curve), n, -1).mean(axis=0)
     alone, each = mean[:, :n], mean[:, n:-1]
     unit = of.prior[n:]
     return Smoothed(

@@ -41,7 +41,7 @@ def test_it_solves_the_whole_system(seed: int, windows: int, n: int, m: int, wal
         for a, b, sign in ((here, here, 1), (then, then, 1), (here, then, -1), (then, here, -1)):
             whole[a, b] += sign * weight
     covariance = np.linalg.inv(whole)
-    x, found = covariance @ right, smooth(NormalEquations.in_units(n, normal, rights, apart, prior, start), walk)
+    x, found = covariance @ right, smooth(NormalEquations(n, normal, rights, apart, prior, start), walk)
     mean = np.hstack([np.kron(np.ones((1, windows)), np.eye(n)) / windows, np.zeros((n, m))])
     np.testing.assert_allclose(found.curve.ravel(), x[: windows * n], atol=1e-9)
     np.testing.assert_allclose(found.constant, x[windows * n :], atol=1e-9)
@@ -56,7 +56,7 @@ def test_the_walk_is_found_where_there_is_one() -> None:
         normal = np.tile(np.diag([noise**-2.0] * 3 + [1e-9]), (windows, 1, 1))
         right = np.hstack([(bias + noise * rng.standard_normal((windows, 3))) / noise**2, np.zeros((windows, 1))])
         prior = np.array([0.02] * 3 + [1.0])
-        found = find_random_walk(NormalEquations.in_units(3, normal, right, np.ones(windows), prior, np.zeros(4)))
+        found = find_random_walk(NormalEquations(3, normal, right, np.ones(windows), prior, np.zeros(4)))
         if true:
             assert 0.6 < found.value / true < 1.6
         else:
