@@ -37,17 +37,15 @@ figures to within 2.2 points at the ratio sigma_0 = 0.2 sigma_k 2 deg/s, which t
 3 all stay within 4.4. The tolerance (8) is no false-alarm guarantee: see *sound*.
 
 At equal false alarms `likelihood_ratio` declares the right channel 2 to 5 points more often than the searches
-(*stands out*), because it weighs every channel by its error at the rate of the sample; that is what is
-possible (*best possible, approximate*, exact to about a point here). With constant noise and symmetric axes
-all of these name the same channel.""",
+(*stands out*), because it weighs every channel by its error at the rate of the sample. With constant noise and
+symmetric axes all of these name the same channel.""",
     "power": """Thresholds are found on 10^6 healthy samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:
-two methods that differ by less than half a point are alike. *best possible, approximate*: Bayes' decision that
-knows the size of the fault, integrated over parity space to 0.05 points; a method's figure may come out up to
-half a point above. `guaranteed` is brought to the common false-alarm rate by its threshold, far below the ten
-bounds of its own; its set of suspects is then all channels. Delay: the bound is for a method that knows channel,
-sign and size (Moustakides 1986). `sequential` begins each trial with no noise measured, for which it allows most
-at first, and some of its streams end before the alarm (a dash); in flights it is quicker, see there.""",
-    "roc": "Detection at other false-alarm rates; *best possible, approximate* as above.",
+two methods that differ by less than half a point are alike. Bayes' decision that knows the size of the fault
+is at most half a point better than the best of them. `guaranteed` is brought to the common false-alarm rate by
+its threshold, far below the ten bounds of its own; its set of suspects is then all channels. Delay: *best
+possible* is that of a method that knows channel, sign and size (Moustakides 1986). `sequential` begins each
+trial with no noise measured, for which it allows most at first, and some of its streams end before the alarm (a dash); in flights it is quicker, see there.""",
+    "roc": "Detection at other false-alarm rates.",
     "double": """Single-fault methods name one channel and call it isolated; where two are off that
 is wrong by construction. The set of `likelihood_ratio` holds both from 20 standard deviations on; below, one
 fault often explains the sample as well, and one is believed rather than two.""",

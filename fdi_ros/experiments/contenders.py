@@ -1,26 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Detectors side by side: at one false-alarm rate, on the same samples; and the best that any could do.
-
-The best is Bayes decisions on one sample, and optimal stopping over many.
-
-One sample. Whatever a method does with a sample, without knowledge of the rate it can use the parity vector alone.
-With f_0 the density of the parity vector of healthy channels and f_i that with channel i faulty, prior P_i, the
-decision that names the right channel most often at a given false-alarm rate names ``argmax P_i f_i`` and declares
-it where ``max_i P_i f_i / f_0`` exceeds a level (Neyman and Pearson's lemma, one region per channel). Both
-probabilities are integrals over parity space.
-
-Many samples. No method with mean run length G to a false alarm has a worst-case mean delay below that of the CUSUM
-tuned to the very change (Lorden 1971, first order; Moustakides 1986, exactly).
-"""
+"""Detectors side by side: at one false-alarm rate, on the same samples; and the least delay that any could have."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -29,13 +16,12 @@ from numpy.typing import NDArray
 
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
-from fdi_ros.errors import FdiError, StudyError
+from fdi_ros.errors import FdiError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, half_sphere, solve_log
-from fdi_ros.replay.outcomes import settled
+from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, solve_log
 
 
 class ChiSquare:
@@ -227,11 +213,10 @@ def threshold_factor(largest: Sequence[float], alarm_probability: float, trials:
 
 
 class Cell(NamedTuple):
-    """Trials on one geometry with faults of one size; 0: none. Or the best possible decision on these."""
+    """Trials on one geometry with faults of one size; 0: none."""
 
     geometry: int
     size: float
-    limit: bool = False
 
 
 class OnGeometries(TrialProtocol[Cell]):
@@ -255,8 +240,6 @@ class OnGeometries(TrialProtocol[Cell]):
 
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
-        if cell.limit:
-            return 1, 1
         return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
     @abstractmethod
@@ -268,126 +251,14 @@ class OnGeometries(TrialProtocol[Cell]):
         return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self.contenders, strict=True)}
 
 
-# The best that any method could do ------------------------------------------------------------------------------------
-
-
-MAX_DIMENSIONS = 3
-"""Dimensions of parity space up to which a limit is worth its time: those of six channels."""
-RADII, AROUND = 240, 96
-"""Radii, and directions once around, of the grid."""
-
-
-@dataclass(frozen=True)
-class Rule:
-    """Points of parity space in standard deviations, and weights: integrals over it become sums."""
-
-    points: Array
-    """(Q, m)"""
-    log_weight: Array
-    """(Q,)"""
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Best possible figures over all false-alarm rates."""
-
-    false_alarm: Array
-    """(Q,) probability of an alarm on healthy channels, increasing."""
-    declared: Array
-    """(Q,) probability that a fault is declared, on whatever channel."""
-    right: Array
-    """(Q,) probability that it is declared and the right channel named."""
-
-    def shares(self, false_alarms: Sequence[float]) -> dict[str, list[float]]:
-        """Best possible shares declared, and declared with the right channel named, at some false-alarm rates."""
-        declared, right = zip(*map(self.at, false_alarms), strict=True)
-        return {"declared": [settled(share) for share in declared], "right": [settled(share) for share in right]}
-
-    def at(self, false_alarm: float) -> tuple[float, float]:
-        """Probabilities (declared, right) at a false-alarm rate."""
-        x = math.log(false_alarm)
-        known = np.log(np.maximum(self.false_alarm, 1e-300))
-        return float(np.interp(x, known, self.declared)), float(np.interp(x, known, self.right))
-
-
-def limit_points(shares: Mapping[str, Sequence[float]], false_alarms: Sequence[float]) -> list[dict[str, float]]:
-    """Best possible shares, one by one with their false-alarm rates: as the result of a study has them."""
-    each = zip(false_alarms, shares["declared"], shares["right"], strict=True)
-    return [{"false_alarm": alarm, "declared": declared, "right": right} for alarm, declared, right in each]
-
-
-def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule:
-    """Rule over half of parity space, out to `reach` standard deviations; everything is even, so half is enough.
-
-    Radius and direction each by themselves, up to three dimensions.
-    """
-    if not 1 <= m <= MAX_DIMENSIONS:
-        raise StudyError(f"quadrature in parity space has 1 to {MAX_DIMENSIONS} dimensions, got {m}")
-    nodes, weights = np.polynomial.legendre.leggauss(radii)
-    radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
-    direction, share = half_sphere(m, circle=around, around=around, heights=around // 3)
-    solid = share * (1.0, np.pi, 2 * np.pi)[m - 1]
-    points = (radius[:, None, None] * direction).reshape(-1, m)
-    return Rule(points, np.log(2 * np.outer(radial, solid)).ravel())
-
-
-def log_normal(points: Array, covariance: Array) -> Array:
-    """Logarithm of the density of a normal parity vector, (Q,), covariance (m, m)."""
-    factor = np.linalg.cholesky(covariance)
-    # One product: solving for a million right-hand sides takes several times as long, and the factor is small.
-    white = np.linalg.inv(factor) @ points.T
-    return -0.5 * (white**2).sum(axis=0) - float(np.log(np.diag(factor)).sum()) - 0.5 * len(factor) * _LOG_2PI
-
-
-def log_faulty(points: Array, direction: Array, sizes: Array, covariance: Array) -> Array:
-    """Logarithm of the density (Q,) with a fault along one direction, each of its sizes and either sign alike.
-
-    At points (Q, m): direction (m,) is what a unit error adds, sizes (K,) are of the error, covariance (m, m) of all
-    other errors.
-    """
-    precise = np.linalg.inv(covariance)
-    along, own = points @ (precise @ direction), float(direction @ precise @ direction)
-    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + math.log(0.5 / len(sizes))
-    # ln(e^x + e^-x) = |x| + ln(1 + e^(-2 |x|)): neither overflows.
-    terms = shape + np.log1p(np.exp(-2 * np.abs(np.outer(sizes, along))))
-    top = terms.max(axis=0)
-    return log_normal(points, covariance) + top + np.log(np.exp(terms - top).sum(axis=0))
-
-
-def best_decisions(rule: Rule, healthy: Array, faulty: Array) -> Limit:
-    """Best figures from the log densities of healthy channels (Q,) and of each one faulty, prior included (n, Q)."""
-    best = faulty.max(axis=0)
-    order = np.argsort(healthy - best, kind="stable")
-    weight = rule.log_weight[order]
-    return Limit(
-        np.cumsum(np.exp(healthy[order] + weight)),
-        np.cumsum(np.exp(faulty[:, order] + weight).sum(axis=0)),
-        np.cumsum(np.exp(best[order] + weight)),
-    )
-
-
-def fault_of_size(geometry: Geometry, size: float) -> Limit:
-    """Limit for unit white noise and one fault of a size, in standard deviations; any channel, either sign alike."""
-    directions = geometry.parity.T
-    m = directions.shape[1]
-    rule = grid(m, size + 7.0)
-    each = [log_faulty(rule.points, u, np.array([size]), np.eye(m)) - math.log(geometry.n) for u in directions]
-    return best_decisions(rule, log_normal(rule.points, np.eye(m)), np.array(each))
-
-
-def lorden_delay(shift: float, run_length: float) -> float:
-    """First-order bound on the worst-case mean delay, samples: ln(G) over the information ``shift^2 / 2`` of a sample.
-
-    ``shift`` > 0: change of the mean of a standard normal, the fault in standard deviations times sqrt(S_ii). G: mean
-    run length, samples to a false alarm.
-    """
-    return math.log(run_length) / (0.5 * shift**2)
+# The least delay ----------------------------------------------------------------------------------------------------
 
 
 def moustakides_delay(shift: float, run_length: float) -> float:
-    """Least possible worst-case mean delay, samples: that of the CUSUM tuned to the change, at its run length.
+    """Least possible worst-case mean delay, samples, at a mean number of samples (``run_length``) to a false alarm.
 
-    Parameters as in `lorden_delay`.
+    No method has less than the CUSUM tuned to the very change (Moustakides 1986), for a ``shift`` > 0 of the mean of a
+    standard normal: the fault in standard deviations times sqrt(S_ii).
     """
     limit = solve_log(lambda limit: cusum_run_length(limit, shift / 2, 0.0), run_length, math.log(run_length) / shift)
     return cusum_run_length(limit, shift / 2, shift)
@@ -414,6 +285,3 @@ def cusum_run_length(limit: float, reference: float, mean: float) -> float:
 
 def _above(x: float) -> float:
     return 0.5 * math.erfc(x / math.sqrt(2))
-
-
-_LOG_2PI = math.log(2 * math.pi)

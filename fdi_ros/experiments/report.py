@@ -14,9 +14,7 @@ from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.replay.outcomes import Estimate
 from fdi_ros.report.layout import PALETTE, Rows, Section, number, page, table
 
-LIMIT = "best possible, approximate"
-"""For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the
-errors of its trials and of its threshold, and may come out above."""
+LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
 SIZE = "fault, standard deviations"
 
@@ -103,11 +101,6 @@ def _alike_together(title: str, hint: str, head: Sequence[str], rows: Sequence[S
     return Section(title, hint, (head, [(", ".join(names), *words) for words, names in alike.items()]))
 
 
-def _with_limit(figures: Mapping[str, Any], limit: Any) -> dict[str, Any]:
-    """Return figures by detector, with those of the best possible last where they are known."""
-    return {**figures, **({} if limit is None else {LIMIT: limit})}
-
-
 def _percent(figure: Estimate | float | None) -> str:
     """Share in percent; a dash where there is none."""
     value = figure.value if isinstance(figure, Estimate) else figure
@@ -133,12 +126,12 @@ def _firsts(cell: Figures) -> dict[str, Figures]:
 def _plot(
     title: str,
     curves: Mapping[str, Curve],
-    limit: tuple[Sequence[float], Sequence[float]],
     x: str,
     y: str,
     log: str = "",
+    limit: tuple[Sequence[float], Sequence[float]] = ((), ()),
 ) -> Section:
-    """Curves with their confidence bands, beside the best possible: x, y."""
+    """Curves with their confidence bands, beside the best possible where it is known: x, y."""
     data: list[dict[str, Any]] = []
     for k, (name, (at, figures)) in enumerate(curves.items()):
         line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
@@ -165,12 +158,8 @@ def _snapshot(group: Group) -> list[Section]:
     if len(group.settings["false_alarms"]) > 1:
         return [_rates(group, cell) for cell in group.faults]
     healthy, *faults = group.cells
-    limits = [cell["limit"][0] if cell["limit"] else None for cell in faults]
-    # The best possible is at the false-alarm rate asked for.
-    asked = limits[0] and {"declared": limits[0]["false_alarm"]}
-    columns: list[ByDetector] = [("healthy", _with_limit(_firsts(healthy), asked), _of("declared"))]
-    for cell, limit in zip(faults, limits, strict=True):
-        columns.append((f"{cell['size']:g}", _with_limit(_firsts(cell), limit), _both))
+    columns: list[ByDetector] = [("healthy", _firsts(healthy), _of("declared"))]
+    columns += [(f"{cell['size']:g}", _firsts(cell), _both) for cell in faults]
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
     found = [_table(f"One fault, {group.mounting}", hint, columns)]
     ranking = [name for name, at in _firsts(faults[0]).items() if "identified" in at]
@@ -187,8 +176,7 @@ def _snapshot(group: Group) -> list[Section]:
 def _rates(group: Group, cell: Figures) -> Section:
     columns: list[ByDetector] = []
     for k, alarm in enumerate(group.settings["false_alarms"]):
-        figures = {name: points[k] for name, points in cell["methods"].items()}
-        columns.append((f"{alarm:g}", _with_limit(figures, cell["limit"] and cell["limit"][k]), _of("declared")))
+        columns.append((f"{alarm:g}", {name: at[k] for name, at in cell["methods"].items()}, _of("declared")))
     return _table(_rates_title(group, cell), "Percent declared, by false-alarm rate.", columns)
 
 
@@ -220,15 +208,13 @@ def _snapshot_curves(group: Group) -> list[Section]:
     faults = group.faults
     sizes = [cell["size"] for cell in faults]
     curves = {name: (sizes, [_firsts(cell)[name]["right"] for cell in faults]) for name in _firsts(faults[0])}
-    limit = (sizes, [cell["limit"][0]["right"] for cell in faults if cell["limit"]])
-    return [_plot(f"Right declarations, {group.mounting}", curves, limit, SIZE, "declared, right channel named")]
+    return [_plot(f"Right declarations, {group.mounting}", curves, SIZE, "declared, right channel named")]
 
 
 def _rate_curves(group: Group, cell: Figures) -> Section:
     alarms = group.settings["false_alarms"]
     curves = {name: (alarms, [at["declared"] for at in points]) for name, points in cell["methods"].items()}
-    limit = (alarms, [at["declared"] for at in cell["limit"] or ()])
-    return _plot(_rates_title(group, cell), curves, limit, "false alarms per sample", "declared", log="xaxis")
+    return _plot(_rates_title(group, cell), curves, "false alarms per sample", "declared", log="xaxis")
 
 
 # Streams
@@ -243,8 +229,8 @@ def _delay(group: Group) -> list[Section]:
     hint = f"Mean samples to the alarm at a mean run length of {asked:g} samples, by size in standard deviations."
     columns: list[ByDetector] = []
     for cell in group.cells:
-        limit = {"mean_delay": cell["limit"]["moustakides"]}
-        columns.append((f"{cell['size']:g}", _with_limit(cell["methods"], limit), mean))
+        limit = {LIMIT: {"mean_delay": cell["limit"]["moustakides"]}}
+        columns.append((f"{cell['size']:g}", cell["methods"] | limit, mean))
     return [_table(f"Delay, {group.mounting}", hint, columns)]
 
 
@@ -255,7 +241,7 @@ def _delay_curves(group: Group) -> list[Section]:
         if known:
             curves[name] = ([size for size, _ in known], [figure for _, figure in known])
     limit = ([cell["size"] for cell in group.cells], [cell["limit"]["moustakides"] for cell in group.cells])
-    return [_plot(f"Delay, {group.mounting}", curves, limit, SIZE, "mean delay, samples", log="yaxis")]
+    return [_plot(f"Delay, {group.mounting}", curves, SIZE, "mean delay, samples", "yaxis", limit)]
 
 
 # Flights
@@ -294,10 +280,6 @@ def _outcomes(cell: Figures, settings: Mapping[str, Any]) -> Section:
     words = list(rows[0][2])
     for k, alarm in enumerate(settings["false_alarms"]):
         rows += [(name, f"{alarm:g}", points[k]) for name, points in cell["methods"].items()]
-        if cell["limit"]:
-            best = cell["limit"][k]
-            shares = {"right_declared": best["right"], "wrong_declared": best["declared"] - best["right"]}
-            rows.append((LIMIT, f"{alarm:g}", shares))
     title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
     ratio = settings["sigma_ratio"]
     hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."

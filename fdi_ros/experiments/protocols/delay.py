@@ -19,7 +19,6 @@ from fdi_ros.experiments.contenders import (
     OnGeometries,
     build_contenders,
     factors_of,
-    lorden_delay,
     moustakides_delay,
     white_noise,
 )
@@ -101,10 +100,7 @@ class Delay(OnGeometries):
             "size": cell.size,
             "trials": counts["trials"],
             "methods": {name: _figures(own, running[name].has_memory) for name, own in counts["methods"].items()},
-            "limit": {
-                "moustakides": settled(moustakides_delay(shift, run_length)),
-                "lorden": settled(lorden_delay(shift, run_length)),
-            },
+            "limit": {"moustakides": settled(moustakides_delay(shift, run_length))},
         }
 
     def _noise(self, cell: Cell, count: int, length: int, rng: np.random.Generator) -> Array:

@@ -12,7 +12,6 @@ import numpy as np
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
-    MAX_DIMENSIONS,
     Cell,
     Contender,
     Contenders,
@@ -20,9 +19,7 @@ from fdi_ros.experiments.contenders import (
     OnGeometries,
     build_contenders,
     factors_of,
-    fault_of_size,
     largest_ratios,
-    limit_points,
     white_noise,
 )
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
@@ -47,8 +44,8 @@ class Truth(NamedTuple):
 class Snapshot(OnGeometries):
     """Detection, right isolation and suspects by size of fault, at one false-alarm rate for all methods.
 
-    The first stage finds, on healthy channels, the threshold at which each method gives the false-alarm rate; and the
-    limit. The second runs healthy channels and faults through the detectors at those thresholds.
+    The first stage finds, on healthy channels, the threshold at which each method gives the false-alarm rate. The
+    second runs healthy channels and faults through the detectors at those thresholds.
     """
 
     kind = "snapshot"
@@ -72,34 +69,23 @@ class Snapshot(OnGeometries):
         self._ready: dict[int, dict[str, list[tuple[Contender, float]]]] = {}
 
     def preparation_cells(self) -> list[Cell]:
-        """List the healthy samples of each geometry, and the limits."""
-        healthy = [Cell(g, 0.0) for g in self._indices if not self._derived]
-        limits = [g for g in self._indices if self.geometries[g].n - 3 <= MAX_DIMENSIONS]
-        if self.settings["faults"] != 1:
-            limits = []
-        return healthy + [Cell(g, size, limit=True) for g in limits for size in self.settings["sizes"]]
+        """List the geometries, without faults."""
+        return [Cell(g, 0.0) for g in self._indices if not self._derived]
 
     def trial_cells(self) -> list[Cell]:
         """List each geometry, without faults and with those of each size."""
         return [Cell(g, size) for g in self._indices for size in [0.0, *self.settings["sizes"]]]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
-        """Find the largest ratios of healthy samples, or a limit."""
-        alarms = self.settings["false_alarms"]
-        if cell.limit:
-            return fault_of_size(self.geometries[cell.geometry], cell.size).shares(alarms)
+        """Find the largest ratios of healthy samples."""
         truth, running = self._draw(cell, count, rng), self.contenders[cell.geometry].running
-        return {"trials": count, "largest": largest_ratios(running, truth.z, alarms)}
+        return {"trials": count, "largest": largest_ratios(running, truth.z, self.settings["false_alarms"])}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
-        """Find the multiples of the loose thresholds by geometry, method and false-alarm rate, and the limits."""
-        cells = list(zip(self.preparation_cells(), found, strict=True))
-        limits = {_limit_key(cell): blocks[0] for cell, blocks in cells if cell.limit}
+        """Find the multiples of the loose thresholds by geometry, method and false-alarm rate."""
         if self._derived:
-            factors = [{name: [1.0] for name in loose.running} for loose in self.contenders]
-        else:
-            factors = [factors_of(blocks, self.settings["false_alarms"]) for cell, blocks in cells if not cell.limit]
-        return {"factors": factors, "limits": limits}
+            return {"factors": [{name: [1.0] for name in loose.running} for loose in self.contenders]}
+        return {"factors": [factors_of(blocks, self.settings["false_alarms"]) for blocks in found]}
 
     def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw samples and evaluate every method on them."""
@@ -115,7 +101,7 @@ class Snapshot(OnGeometries):
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of samples declared, rightly named, isolated and covered, at each false-alarm rate."""
-        alarms, limit = self.settings["false_alarms"], preparation["limits"].get(_limit_key(cell))
+        alarms = self.settings["false_alarms"]
         return {
             "geometry": self.settings["geometries"][cell.geometry],
             "size": cell.size,
@@ -123,7 +109,6 @@ class Snapshot(OnGeometries):
             "methods": {
                 name: [_figures(*at) for at in zip(alarms, own, strict=True)] for name, own in counts["methods"].items()
             },
-            "limit": None if limit is None else limit_points(limit, alarms),
         }
 
     @property
@@ -163,10 +148,6 @@ class Snapshot(OnGeometries):
             struck[rows, order] = True
             z[rows, order] += cell.size * sigma * rng.choice([-1.0, 1.0], order.shape)
         return Truth(z, struck)
-
-
-def _limit_key(cell: Cell) -> str:
-    return f"{cell.geometry} {cell.size}"
 
 
 def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
