@@ -58,13 +58,10 @@ def build_geometry(config: Config) -> Geometry:
         raise ConfigError("channels.units is given, but input is 'imus': each topic is a unit")
     if units and len(units) != geometry.n:
         raise ConfigError(f"channels.units has {len(units)} names, expected {geometry.n}, one for each channel")
-    names = config.channel_names or None
     # Of the presets some are made of triads; names with a point say the same.
-    by_names = config.has_units or any("." in name for name in config.channel_names)
-    built = Geometry(geometry.axes, names, units or None)
-    if not units and not by_names and geometry.units:
-        built = Geometry(geometry.axes, names, geometry.unit_of)
-    return built
+    if not config.has_units and not any("." in name for name in config.channel_names) and geometry.units:
+        units = units or geometry.unit_of
+    return Geometry(geometry.axes, config.channel_names or None, units or None)
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
@@ -81,27 +78,19 @@ def build_noise(config: Config, n: int) -> NoiseModel:
     return NoiseModel(*(_scalar(value) for value in values)).for_channels(n)
 
 
-def false_alarm_rate(config: Config, by_run_length: bool = False) -> FalseAlarmRate:
-    """False-alarm rate that a configuration asks for: the probability, if there is one, before the rate per hour.
+def alarm_probability(config: Config) -> float:
+    """False-alarm probability per sample that a configuration asks for."""
+    return _false_alarm_rate(config).per_sample()
 
-    Parameters
-    ----------
-    config
-        The settings.
-    by_run_length
-        For a detector that takes a run length: that, if there is one, before both.
-    """
+
+def _false_alarm_rate(config: Config, by_run_length: bool = False) -> FalseAlarmRate:
+    """Of what the settings state the first: a run length, if the detector takes one, a probability, a rate per hour."""
     settings, rate = config.detector, config.sample_rate
     if by_run_length and settings.run_length > 0:
         return FalseAlarmRate(run_length=settings.run_length, sample_rate=rate)
     if settings.false_alarm_probability > 0:
         return FalseAlarmRate(settings.false_alarm_probability, sample_rate=rate)
     return FalseAlarmRate(per_hour=settings.false_alarms_per_hour, sample_rate=rate)
-
-
-def alarm_probability(config: Config) -> float:
-    """False-alarm probability per sample that a configuration asks for."""
-    return false_alarm_rate(config).per_sample()
 
 
 _RATES = {"false_alarms_per_hour", "false_alarm_probability", "run_length"}
@@ -115,11 +104,11 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     known = {field.name for field in fields(settings)} - _RATES
     options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in known}
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
-    errors: dict[str, Any] = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
+    errors = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
     options |= {name: value for name, value in errors.items() if name in accepted}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     if options.get("tolerance") != "paper":
-        options |= false_alarm_rate(config, "run_length" in accepted).as_options(accepted)
+        options |= _false_alarm_rate(config, "run_length" in accepted).as_options(accepted)
     return create_detector(settings.name, geometry, noise, **options)
 
 
@@ -135,15 +124,10 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
     check_lengths(config, "channel", n)
     cores = allocate(Core)
     core = cores[0]
-    settings = core["settings"]
-    settings["n"] = n
-    describe_sensors(settings["sensors"], geometry, noise)
-    settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
-    _fill_health(settings["health"], config, n)
-    _fill_decision(settings["decision"], config, noise)
+    _fill_settings(core["settings"], config, geometry, noise)
     _fill_bias(core["bias"], config, noise)
     core["remaining"][:n] = noise.bias_std
-    _fill_errors(core, config, geometry, noise)
+    core["known"]["bias_std"][:n] = noise.bias_std if core["bias"]["learning"] else config.bias.turn_on_std
     core["last_stamp"] = -MAX_STAMP
     core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
     core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
@@ -165,48 +149,41 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
 
-def _fill_health(limits: Any, config: Config, n: int) -> None:
-    health = config.health
+def _fill_settings(settings: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
+    n, integrity = geometry.n, config.integrity
+    settings["n"] = n
+    describe_sensors(settings["sensors"], geometry, noise)
+    settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
+    settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
+    settings["max_drift"] = config.bias.max_drift
+    settings["risk"] = integrity.risk
+    settings["prior"][:n] = np.expm1(np.array(integrity.fault_rate) * integrity.exposure)
+    settings["reach"] = normal_isf(integrity.risk / 2) if integrity.risk > 0 else 0.0
+    settings["units"] = len(geometry.units)
+    settings["members"][: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
+    limits, health = settings["health"], config.health
     limits["max_rate"][:n] = health.max_rate
     limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
     limits["stuck_time"] = _nanoseconds(health.stuck_time)
     limits["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
     limits["stale_time"] = _nanoseconds(health.stale_timeout)
     limits["recovery_time"] = _nanoseconds(health.range_recovery_time)
-
-
-def _fill_decision(limits: Any, config: Config, noise: NoiseModel) -> None:
-    decision = config.decision
+    limits, decision = settings["decision"], config.decision
     limits["alarms"], limits["window"] = decision.confirm_alarms, decision.confirm_window
     limits["latch"], limits["clean_time"] = decision.latch, _nanoseconds(decision.clean_time)
-    limits["mean_limit"][: len(noise.noise_std)] = RETURN_MEAN * noise.noise_std
+    limits["mean_limit"][:n] = RETURN_MEAN * noise.noise_std
 
 
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
-    n, fixed = len(noise.noise_std), config.bias.fixed
+    n, fixed, learning = len(noise.noise_std), config.bias.fixed, config.bias.startup_bias_duration > 0
     bias["given"] = bool(fixed)
-    bias["value"][:n] = fixed or 0.0
+    bias["value"][:n] = bias["centre"][:n] = fixed or 0.0
     bias["known"] = whole_set(n)
     bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
-    bias["centre"][:n] = fixed or 0.0
     bias["max_rate"] = config.bias.max_rest_rate
     prepare_limits(bias)
     bias["max_std"][:n] = REST_NOISE * noise.noise_std
-    bias["learning"] = bias["duration"] > 0
-    bias["outcome"] = LEARNING if bias["duration"] > 0 else FIXED
-
-
-def _fill_errors(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
-    n, settings = geometry.n, core["settings"]
-    settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
-    settings["max_drift"] = config.bias.max_drift
-    settings["risk"] = config.integrity.risk
-    settings["prior"][:n] = np.expm1(np.array(config.integrity.fault_rate) * config.integrity.exposure)
-    settings["reach"] = normal_isf(config.integrity.risk / 2) if config.integrity.risk > 0 else 0.0
-    settings["units"] = len(geometry.units)
-    settings["members"][: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
-    learned = config.bias.startup_bias_duration > 0
-    core["known"]["bias_std"][:n] = noise.bias_std if learned else config.bias.turn_on_std
+    bias["learning"], bias["outcome"] = learning, LEARNING if learning else FIXED
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -18,7 +18,9 @@ from fdi_ros.monitor.output import Message, Topic
 from fdi_ros.system.text import plus_minus
 
 if TYPE_CHECKING:
-    from fdi_ros.monitor.status import ApartStatus, ChannelStatus, Status, UnitStatus
+    from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
+
+Values = tuple[tuple[str, str], ...]
 
 PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
@@ -111,20 +113,20 @@ class InputStatus:
 
 _LEVELS = {
     ChannelState.OK: Level.OK,
-    ChannelState.SUSPECT: Level.WARN,
     ChannelState.AMBIGUOUS: Level.ERROR,
     ChannelState.FAULTY: Level.ERROR,
     ChannelState.STALE: Level.STALE,
-    ChannelState.UNCHECKED: Level.WARN,
-    ChannelState.EXCLUDED: Level.WARN,
 }
-_LONGER = (
-    ("min", 60, 36_000),
-    ("h", 3600, 172_800),
-    ("days", 86_400, 63_072_000),
-    ("years", 31_557_600, math.inf),
+"""Of a state; of all others a warning."""
+_TIMES = (
+    ("ms", 1e-3, 0.1, 1),
+    ("s", 1, 600, 1),
+    ("min", 60, 36_000, 0),
+    ("h", 3600, 172_800, 0),
+    ("days", 86_400, 63_072_000, 0),
+    ("years", 31_557_600, math.inf, 0),
 )
-"""Units of time, each with its length and up to where it is used, s."""
+"""Units of time: name, length, below what it is used, s, and decimals."""
 ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
@@ -168,72 +170,77 @@ def describe(
     warning
         What else is wrong with the whole, while samples come.
     """
-    worse = find_degraded(status)
-    level, message = _whole(status, worse, silent)
-    if warning and silent is None:
-        level, message = max(level, Level.WARN), f"{message}; {warning}"
-    whole = StatusLine(level, prefix + WHOLE, message, hardware_id, (*_whole_values(status), *figures))
-    channels = []
-    for k, channel in enumerate(status.channels):
-        level, message = _channel_message(channel, status, worse.get(channel.name, []))
-        if silent is not None:
-            level, message = Level.STALE, _no_sample(status, silent)
-        values = _channel_values(channel, status, k, channel.since if since is None else since[k])
-        channels.append(StatusLine(level, prefix + channel.name, message, hardware_id, values))
-    return [whole, *channels, *(_input_line(line, hardware_id, prefix) for line in inputs)]
+    worse = _find_worse(status)
+    level, message = _whole_message(status, worse)
+    rows = [(WHOLE, max(level, Level.WARN) if warning else level, f"{message}; {warning}" if warning else message)]
+    rows += [(channel.name, *_channel_message(channel, status, worse)) for channel in status.channels]
+    if silent is not None:
+        words = f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
+        rows = [(name, Level.STALE, words) for name, *_ in rows]
+    began = since or [channel.since for channel in status.channels]
+    values = [
+        (*_whole_values(status), *figures),
+        *(_channel_values(channel, status, k, began[k]) for k, channel in enumerate(status.channels)),
+    ]
+    rows += [(f"{INPUT}{line.name}", *_input_message(line)) for line in inputs]
+    values += [_input_values(line) for line in inputs]
+    return [
+        StatusLine(level, prefix + name, message, hardware_id, pairs)
+        for (name, level, message), pairs in zip(rows, values, strict=True)
+    ]
 
 
-def _channel_message(channel: ChannelStatus, status: Status, worse: Sequence[str]) -> tuple[Level, str]:
-    """Say how a channel stands, with that in which it is worse than it should be."""
-    wrong = [*(_format_frozen(unit) for unit in _frozen_units(channel, status)), *worse]
-    unusual = [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
-    level = max(_LEVELS[channel.state], Level.WARN if wrong else Level.OK)
-    return level, "; ".join([_format_state(channel, status), *wrong, *unusual])
+def degraded(status: Status) -> dict[str, str]:
+    """Say in a line each what is used, and worse than it should be, beside what is declared: by channel and unit."""
+    units = {unit.name for unit in status.units}
+    return {
+        name: f"{name}{' as a whole' if name in units else ''}: {'; '.join(words)}"
+        for name, words in _find_worse(status).items()
+    }
 
 
-def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
-    return [unit for unit in status.units if unit.frozen and channel.name in unit.channels]
-
-
-def _format_frozen(unit: UnitStatus) -> str:
-    return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
-
-
-def find_degraded(status: Status) -> dict[str, list[str]]:
-    """Say what is used, and worse than it should be, beside what is declared: by channel and by unit."""
-    found: dict[str, list[str]] = {}
-    for channel in (one for one in status.channels if not one.is_left_out):
-        times = f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
-        rows = (
-            (channel.noisy, f"noise {times} times noise_std and above the others'"),
-            (
-                abs(channel.drift) > NEARLY * status.max_drift > 0,
-                f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g}"
-                " (bias.max_drift)",
-            ),
-            (
-                status.is_far(channel),
-                f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
-                f" {status.turn_on_std:g}: learned, as a fault from before the start would be",
-            ),
-        )
-        if words := [text for holds, text in rows if holds]:
-            found[channel.name] = words
+def _find_worse(status: Status) -> dict[str, list[str]]:
+    """Say the same without the name; what is worse of no channel and no unit has no entry."""
+    found = {one.name: _channel_worse(one, status) for one in status.channels if not one.is_left_out}
     for unit in status.units:
         if abs(unit.delay) > max(CERTAIN * unit.delay_std, LEAST_DELAY):
             side, off = "late" if unit.delay > 0 else "early", ", taken off" if unit.taken_off else ""
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"
             found[unit.name] = [f"its stamps are {size} {side} against {unit.against}'s{off}"]
-    return found
+    return {name: words for name, words in found.items() if words}
 
 
-def degraded(status: Status) -> dict[str, str]:
-    """Say the same in one line for each channel and unit."""
-    units = {unit.name for unit in status.units}
-    return {
-        name: f"{name}{' as a whole' if name in units else ''}: {'; '.join(words)}"
-        for name, words in find_degraded(status).items()
-    }
+def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
+    words = []
+    if channel.noisy:
+        times = f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
+        words.append(f"noise {times} times noise_std and above the others'")
+    if abs(channel.drift) > NEARLY * status.max_drift > 0:
+        limit = f"a fault beyond {status.max_drift:g} (bias.max_drift)"
+        words.append(f"bias has drifted by {_figure(channel.drift)} rad/s, {limit}")
+    if status.is_far(channel):
+        words.append(
+            f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
+            f" {status.turn_on_std:g}: learned, as a fault from before the start would be"
+        )
+    return words
+
+
+# The whole ------------------------------------------------------------------------------------------------------------
+
+
+def _whole_message(status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
+    total = len(status.channels)
+    healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
+    about = [channel.name for channel in status.channels if channel.name in worse]
+    words = [status.note, *_format_units(status, worse), f"degraded: {', '.join(about)}" if about else ""]
+    count, note = f"{healthy} of {total} channels healthy", "".join(f"; {one}" for one in words if one)
+    if not status.has_rate:
+        return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
+    odd = worse or status.copies or any(unit.frozen for unit in status.units)
+    complete = healthy == total and len(status.can_isolate) == total and not odd
+    level = Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
+    return level, f"{count}; {_reach(status)}{note}"
 
 
 def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[str]:
@@ -255,77 +262,21 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
     words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
     groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
-    words += [_format_unit_set(names) for group in groups if (names := _units_of(group, status.units))]
-    return words if status.apart is None else [*words, format_apart(status.apart)]
+    words += filter(None, (_format_unit_set(group, status.units) for group in groups))
+    return words if status.apart is None else [*words, str(status.apart)]
 
 
-def format_apart(pair: ApartStatus) -> str:
-    """Say of two channels of one axis by how much they differ."""
-    return f"{pair.who.removesuffix(',')}, {plus_minus(pair.size, pair.std)} rad/s apart"
+def _format_frozen(unit: UnitStatus) -> str:
+    return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
 
 
-def _units_of(group: Sequence[str], units: Sequence[UnitStatus]) -> list[str]:
-    """Names of the units that a set of channels consists of; empty if it consists of other than whole units."""
+def _format_unit_set(group: Sequence[str], units: Sequence[UnitStatus]) -> str:
+    """Say of a set of whole units that one is faulty; empty if it is none."""
     inside = [unit for unit in units if set(group).issuperset(unit.channels)]
-    return [unit.name for unit in inside] if sum(len(unit.channels) for unit in inside) == len(group) else []
-
-
-def _format_unit_set(names: Sequence[str]) -> str:
-    who = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-    return f"{who} is faulty as a whole or in part, the evidence cannot tell {'which' if len(names) > 1 else 'more'}"
-
-
-def _format_state(channel: ChannelStatus, status: Status) -> str:
-    # No sample has changed the state that a channel starts in.
-    ago = max(0, status.stamp - channel.since) / 1e9
-    lasting = "since the start" if not channel.since else f"for {_seconds(ago)}" if ago else "from this sample on"
-    if channel.state == ChannelState.OK:
-        return "agrees with the others"
-    if channel.state == ChannelState.AMBIGUOUS:
-        pair, units = status.apart, _units_of(channel.group, status.units)
-        if pair is not None and set(pair.channels) == set(channel.group):
-            return f"{format_apart(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
-        if len(channel.group) == 1:
-            return f"most likely faulty, the only one left in question: to be confirmed; {lasting}"
-        one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
-        seen = "" if pair is None else f"; seen on {format_apart(pair)}"
-        return f"{_format_unit_set(units) if units else one_of}{seen}; {lasting}"
-    words = channel.reason.value or channel.state.name.lower()
-    if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
-        words = f"{words} by {_figure(abs(channel.error))} rad/s"
-    if channel.reason == Reason.INTERMITTENT:
-        words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
-    ending = {
-        ChannelState.SUSPECT: "; under suspicion, left out for now",
-        ChannelState.FAULTY: "; isolated and left out",
-        ChannelState.UNCHECKED: "; left out" if channel.is_left_out else "; used unchecked",
-    }
-    return f"{words} {lasting}{ending.get(channel.state, '; left out')}"
-
-
-def _no_sample(status: Status, silent: float) -> str:
-    return f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
-
-
-def _whole(status: Status, worse: Mapping[str, Sequence[str]], silent: float | None) -> tuple[Level, str]:
-    if silent is not None:
-        return Level.STALE, _no_sample(status, silent)
-    total = len(status.channels)
-    healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
-    count = f"{healthy} of {total} channels healthy"
-    alive = sum(not channel.is_left_out for channel in status.channels)
-    undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
-    reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
-    about = [channel.name for channel in status.channels if channel.name in worse]
-    words = [status.note, *_format_units(status, worse), f"degraded: {', '.join(about)}" if about else ""]
-    note = "".join(f"; {one}" for one in words if one)
-    if not status.has_rate:
-        return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
-    if not status.can_detect:
-        return Level.ERROR, f"{count}; {reach}{note}"
-    odd = bool(worse or status.copies) or any(unit.frozen for unit in status.units)
-    complete = healthy == total and len(status.can_isolate) == total and not odd
-    return (Level.OK if complete else Level.WARN), f"{count}; {reach}{note}"
+    if not inside or sum(len(unit.channels) for unit in inside) != len(group):
+        return ""
+    who = f"{'one of ' if len(inside) > 1 else ''}{', '.join(unit.name for unit in inside)}"
+    return f"{who} is faulty as a whole or in part, the evidence cannot tell {'which' if len(inside) > 1 else 'more'}"
 
 
 def _why_no_rate(status: Status) -> str:
@@ -338,10 +289,12 @@ def _why_no_rate(status: Status) -> str:
     return f"biases not learned: {status.bias_state}; " if status.bias_state.startswith("refused") else ""
 
 
-def _reach(detect: int, isolate: int, alive: int, undecided: bool) -> str:
+def _reach(status: Status) -> str:
+    detect, isolate = len(status.can_detect), len(status.can_isolate)
+    alive = sum(not channel.is_left_out for channel in status.channels)
     if not detect:
         return "no further fault would be seen"
-    if undecided:
+    if any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels):
         return "while it is undecided which is faulty, no further fault would be isolated"
     if isolate == alive:
         return "a further fault would be isolated"
@@ -349,7 +302,7 @@ def _reach(detect: int, isolate: int, alive: int, undecided: bool) -> str:
     return f"{seen} " + (f"and isolated on {isolate} of {alive}" if isolate else "but not isolated")
 
 
-def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
+def _whole_values(status: Status) -> Values:
     return (
         ("detector", status.detector),
         ("statistic", _figure(status.statistic)),
@@ -359,21 +312,79 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
         ("faults seen on", ", ".join(status.can_detect) or "none"),
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),
         ("names rest on", status.names_rest_on or "one fault at a time"),
-        ("protection level (rad/s)", _figures(status.protection_level)),
-        ("protection level after one more loss (rad/s)", _figures(status.protection_level_after_loss)),
+        ("protection level (rad/s)", " ".join(map(_figure, status.protection_level))),
+        (
+            "protection level after one more loss (rad/s)",
+            " ".join(map(_figure, status.protection_level_after_loss)),
+        ),
         ("bias", status.bias_state),
         *((f"{unit.name}: stamps late (ms)", _late(unit)) for unit in status.units),
         ("note", status.note),
     )
 
 
-def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) -> tuple[tuple[str, str], ...]:
+def _late(unit: UnitStatus) -> str:
+    if not math.isfinite(unit.delay):
+        return "none"
+    if unit.name == unit.against:
+        return "0, the others are against it"
+    return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
+
+
+# One channel ----------------------------------------------------------------------------------------------------------
+
+
+def _channel_message(channel: ChannelStatus, status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
+    """Say how a channel stands, with that in which it is worse than it should be."""
+    wrong = [*map(_format_frozen, _frozen_units(channel, status)), *worse.get(channel.name, ())]
+    unusual = [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
+    level = max(_LEVELS.get(channel.state, Level.WARN), Level.WARN if wrong else Level.OK)
+    return level, "; ".join([_format_state(channel, status), *wrong, *unusual])
+
+
+def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
+    return [unit for unit in status.units if unit.frozen and channel.name in unit.channels]
+
+
+def _format_state(channel: ChannelStatus, status: Status) -> str:
+    # No sample has changed the state that a channel starts in.
+    ago = max(0, status.stamp - channel.since) / 1e9
+    lasting = "since the start" if not channel.since else f"for {_seconds(ago)}" if ago else "from this sample on"
+    if channel.state == ChannelState.OK:
+        return "agrees with the others"
+    if channel.state == ChannelState.AMBIGUOUS:
+        return f"{_format_set(channel, status)}; {lasting}"
+    words = channel.reason.value or channel.state.name.lower()
+    if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
+        words = f"{words} by {_figure(abs(channel.error))} rad/s"
+    if channel.reason == Reason.INTERMITTENT:
+        words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
+    ending = {
+        ChannelState.SUSPECT: "under suspicion, left out for now",
+        ChannelState.FAULTY: "isolated and left out",
+        ChannelState.UNCHECKED: "left out" if channel.is_left_out else "used unchecked",
+    }
+    return f"{words} {lasting}; {ending.get(channel.state, 'left out')}"
+
+
+def _format_set(channel: ChannelStatus, status: Status) -> str:
+    pair = status.apart
+    if pair is not None and set(pair.channels) == set(channel.group):
+        return f"{pair}: one of the two is faulty, the evidence cannot tell which"
+    if len(channel.group) == 1:
+        return "most likely faulty, the only one left in question: to be confirmed"
+    one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
+    return (_format_unit_set(channel.group, status.units) or one_of) + (f"; seen on {pair}" if pair else "")
+
+
+def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) -> Values:
     ago = f"{_seconds((status.stamp - channel.last_received) / 1e9)} ago" if channel.last_received else "never"
     pair = status.apart
+    scales = [error for error in status.errors if error.owner == channel.name and error.kind.startswith("scale")]
     return (
         ("state", channel.state.name),
         ("reason", channel.reason.value),
-        ("state since (stamp, s)", _stamp(since)),
+        ("state since (stamp, s)", f"{since // 10**9}.{since % 10**9:09d}"),
         ("one of", ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else ""),
         ("apart (rad/s)", plus_minus(pair.size, pair.std) if pair and channel.name in pair.channels else ""),
         ("residual (rad/s)", _figure(channel.residual)),
@@ -381,7 +392,10 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
         ("of that followed in flight (rad/s)", _figure(channel.drift)),
         ("bias known to (rad/s)", _figure(channel.bias_std)),
-        ("scale and misalignment (1)", _scales(channel, status)),
+        (
+            "scale and misalignment (1)",
+            ", ".join(f"{one.kind[-1]} {one.value:+.4f} +- {one.std:.4f}" for one in scales) or "none",
+        ),
         ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
         ("repeats for (s)", "".join(_figure(unit.frozen) for unit in _frozen_units(channel, status))),
         ("last value", ago),
@@ -393,30 +407,19 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
     )
 
 
-def _scales(channel: ChannelStatus, status: Status) -> str:
-    """Say what is known of the errors by the rate about each body axis."""
-    errors = [error for error in status.errors if error.owner == channel.name and error.kind.startswith("scale")]
-    return ", ".join(f"{error.kind[-1]} {error.value:+.4f} +- {error.std:.4f}" for error in errors) or "none"
+# One input ------------------------------------------------------------------------------------------------------------
 
 
-def _late(unit: UnitStatus) -> str:
-    if not math.isfinite(unit.delay):
-        return "none"
-    if unit.name == unit.against:
-        return "0, the others are against it"
-    return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
-
-
-def _input_line(line: InputStatus, hardware_id: str, prefix: str) -> StatusLine:
-    values = [("topic", line.topic), ("received", str(line.received)), ("rate (Hz)", f"{line.rate:.1f}")]
-    values += [("behind the other inputs (s)", _figure(line.lag))]
-    if line.offset is not None:
-        values += [("behind the clock (s)", _figure(line.offset))]
-    values += [(kind, str(count)) for kind, count in line.counts.items()]
-    if line.error:
-        values += [("last malformed", line.error)]
-    level, message = _input_message(line)
-    return StatusLine(level, f"{prefix}{INPUT}{line.name}", message, hardware_id, tuple(values))
+def _input_values(line: InputStatus) -> Values:
+    return (
+        ("topic", line.topic),
+        ("received", str(line.received)),
+        ("rate (Hz)", f"{line.rate:.1f}"),
+        ("behind the other inputs (s)", _figure(line.lag)),
+        *([] if line.offset is None else [("behind the clock (s)", _figure(line.offset))]),
+        *((kind, str(count)) for kind, count in line.counts.items()),
+        *([("last malformed", line.error)] if line.error else []),
+    )
 
 
 def _input_message(line: InputStatus) -> tuple[Level, str]:
@@ -442,24 +445,12 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
 
 
 def _seconds(value: float) -> str:
-    if abs(value) < 0.1:
-        return f"{1e3 * value:.1f} ms"
-    if abs(value) < 600:
-        return f"{value:.1f} s"
-    unit, seconds = next((unit, seconds) for unit, seconds, most in _LONGER if abs(value) <= most)
-    return f"{value / seconds:.0f} {unit}"
+    unit, seconds, _, digits = next(row for row in _TIMES if abs(value) < row[2])
+    return f"{value / seconds:.{digits}f} {unit}"
 
 
 def _figure(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "none"
-
-
-def _figures(values: Sequence[float]) -> str:
-    return " ".join(_figure(value) for value in values)
-
-
-def _stamp(stamp: int) -> str:
-    return f"{stamp // 10**9}.{stamp % 10**9:09d}"
 
 
 # As a message ---------------------------------------------------------------------------------------------------------

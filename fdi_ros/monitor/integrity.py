@@ -24,9 +24,9 @@ the largest of these is bounded in the sample path (`fdi_ros.core.subsets.fill_l
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,9 +63,8 @@ class ProtectionLevel:
     """(n, 3) weight of the variance of each channel in the square of the level of each axis, at most."""
 
 
-@dataclass(frozen=True)
-class _Modes:
-    """Fault modes of one size: h sets of channels."""
+class _Modes(NamedTuple):
+    """Fault modes: h sets of channels."""
 
     prior: Array
     """(h,)"""
@@ -115,8 +114,7 @@ class Integrity:
         self.risk = risk
         self.prior: Array = np.broadcast_to(np.asarray(fault_probability, dtype=np.float64), geometry.n)
         self.alarm_probability = alarm_probability
-        self._axes = geometry.axes
-        self._noise: Array = noise.noise_std**2
+        self._axes, self._noise = geometry.axes, noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale, timing = noise.scale_std * norm * max_rate, noise.timing_std * norm * max_acceleration
         self.variance: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
@@ -139,31 +137,19 @@ class Integrity:
             max_acceleration=settings.max_acceleration,
         )
 
-    def fill(self, subset: Any, mask: int) -> None:
-        """Write the level for the channels whose bits are set into their record, unless it is there.
-
-        Parameters
-        ----------
-        subset
-            `fdi_ros.core.subsets.Subset`.
-        mask
-            Its channels.
-        """
-        if not subset["has_level"]:
-            n = len(self._axes)
-            known = self._solved(flags_of(mask, n), self._noise)
-            subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
-            subset["has_level"] = True
-
-    def fill_losses(self, subsets: NDArray[Any], mask: int) -> None:
-        """Write the levels for the channels whose bits are set, and for the loss of each one of them."""
-        for left in (mask, *single_losses(mask)):
-            self.fill(subsets[left], left)
+    def fill(self, subsets: NDArray[Any], *masks: int) -> None:
+        """Write the levels for sets of channels, by their bits, into their records (2^n,), unless they are there."""
+        n = len(self._axes)
+        for mask in masks:
+            if not subsets["has_level"][mask]:
+                known, subset = self._solved(flags_of(mask, n), self._noise), subsets[mask]
+                subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
+                subset["has_level"] = True
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
         """Level after one more loss, in the greatest motion, on each axis the worst one to lose, rad/s; inf if none."""
-        self.fill_losses(subsets, mask)
-        if not (rest := single_losses(mask)):
+        self.fill(subsets, mask, *(rest := single_losses(mask)))
+        if not rest:
             return NO_LEVEL
         x, y, z = (self.scale * subsets["level"][rest].max(axis=0)).tolist()
         return x, y, z
@@ -171,9 +157,8 @@ class Integrity:
     def prepare(self, subsets: NDArray[Any]) -> None:
         """Write the levels for all channels and for every loss of one and two: a fault must not wait for them."""
         whole = len(subsets) - 1
-        self.fill_losses(subsets, whole)
-        for left in single_losses(whole):
-            self.fill_losses(subsets, left)
+        for left in (whole, *single_losses(whole)):
+            self.fill(subsets, left, *single_losses(left))
 
     def of(self, mask: Mask) -> ProtectionLevel:
         """Level in the greatest motion when exactly the channels marked in mask (n,) are fused."""
@@ -200,7 +185,8 @@ class Integrity:
         prior = self.prior[kept]
         sets = [np.array(list(combinations(range(len(kept)), size)), dtype=np.intp) for size in (1, 2)]
         test_parts = parts * (test / np.maximum(spread, MIN_SPREAD * np.sqrt(variance)) ** 2)[:, None]
-        modes = _joined([_modes(chosen, prior, gain, residual, variance, test_parts) for chosen in sets])
+        alike = [_modes(chosen, prior, gain, residual, variance, test_parts) for chosen in sets]
+        modes = _Modes(*map(np.concatenate, zip(*alike, strict=True)))
         sigma = np.sqrt((gain**2 * variance).sum(axis=1))
         level = _solve(sigma, prior, modes, self.risk)
         share = np.zeros((len(mask), 3))
@@ -233,10 +219,6 @@ def _modes(
     )
 
 
-def _joined(modes: list[_Modes]) -> _Modes:
-    return _Modes(*(np.concatenate([getattr(mode, f.name) for mode in modes]) for f in fields(_Modes)))
-
-
 def _share(level: Array, share: Array, modes: _Modes) -> Array:
     """Largest share (k, 3) of each variance in the square of the level (3,), over all modes that it holds back.
 
@@ -253,8 +235,11 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     """Level (3,) from the sigma (3,) of the fused rate, the priors (k,) and the fault modes."""
     priors, sigmas, limits = modes.prior, modes.sigma, modes.limit
     covered = np.isfinite(limits[:, 0])
-    none = float((1 - prior).prod())
-    budget = risk - _three_or_more(prior) - float(priors[~covered].sum())
+    none, by_number = float((1 - prior).prod()), np.ones(1)
+    # Probability of each number of faulty channels, without cancellation: the product of all 1 - p + p x.
+    for p in prior:
+        by_number = np.convolve(by_number, [1 - p, p])
+    budget = risk - float(by_number[3:].sum()) - float(priors[~covered].sum())
     if budget <= 0:
         return np.full(3, np.inf)
     priors, sigmas, limits = priors[covered, None], sigmas[covered], limits[covered]
@@ -270,14 +255,6 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
         above = missed(middle) > budget
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     return high
-
-
-def _three_or_more(prior: Array) -> float:
-    """Probability that three or more channels are faulty, without cancellation: the product of all 1 - p + p x."""
-    by_number = np.ones(1)
-    for p in prior:
-        by_number = np.convolve(by_number, [1 - p, p])
-    return float(by_number[3:].sum())
 
 
 def _tail(x: Array) -> Array:

@@ -122,17 +122,40 @@ class Output:
         self.n = n
         self.events = events
         self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
+        self.stamp: NDArray[np.int64] = rows["stamp"]
+        """(N,) ns."""
+        self.instant: NDArray[np.int64] = rows["instant"]
+        """(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."""
+        self.rate: Array = rows["rate"]
+        """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
+        self.valid: NDArray[np.bool_] = rows["valid"].view(_FLAG)
+        """(N,) whether there is a fused rate."""
+        self.statistic: Array = rows["statistic"]
+        """(N,) the detector's; NaN where the sample could not be judged."""
+        self.threshold: Array = rows["threshold"]
+        """(N,) the detector's; NaN where the sample could not be judged."""
+        self.alarm: NDArray[np.bool_] = rows["alarm"].view(_FLAG)
+        """(N,) the detector's, before confirmation."""
+        self.state: NDArray[np.uint8] = rows["state"][:, :n]
+        """(N, n) ChannelState of each channel after the sample."""
+        self.residual: Array = rows["residual"][:, :n]
+        """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
+        self.level: Array = rows["level"]
+        """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
+
+    @property
+    def covariance(self) -> Array:
+        """(N, 3, 3) of the fused rate, (rad/s)^2; NaN where there is none."""
+        return np.asarray(self.rows["covariance"][:, _FULL].reshape(-1, 3, 3))
 
     def __repr__(self) -> str:
-        return f"Output({self._format_summary()})"
-
-    def _repr_html_(self) -> str:
-        return html_table(self._format_summary(), _HEAD, (_cells(event, self.channel_names) for event in self.events))
-
-    def _format_summary(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
         rated = f", a rate in {np.mean(self.valid):.0%}" if len(self) else ""
-        return f"{len(self)} samples of {self.n} channels, {seconds:.3f} s{rated}; {len(self.events)} changes of state"
+        size = f"{len(self)} samples of {self.n} channels, {seconds:.3f} s"
+        return f"Output({size}{rated}; {len(self.events)} changes of state)"
+
+    def _repr_html_(self) -> str:
+        return html_table(repr(self), _HEAD, (_cells(event, self.channel_names) for event in self.events))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with one row a sample; needs pandas.
@@ -163,61 +186,6 @@ class Output:
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    @property
-    def stamp(self) -> NDArray[np.int64]:
-        """(N,) ns."""
-        return self.rows["stamp"]
-
-    @property
-    def instant(self) -> NDArray[np.int64]:
-        """(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."""
-        return self.rows["instant"]
-
-    @property
-    def rate(self) -> Array:
-        """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
-        return self.rows["rate"]
-
-    @property
-    def covariance(self) -> Array:
-        """(N, 3, 3) of the fused rate, (rad/s)^2; NaN where there is none."""
-        return np.asarray(self.rows["covariance"][:, _FULL].reshape(-1, 3, 3))
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """(N,) whether there is a fused rate."""
-        return self.rows["valid"].view(_FLAG)
-
-    @property
-    def statistic(self) -> Array:
-        """(N,) the detector's; NaN where the sample could not be judged."""
-        return self.rows["statistic"]
-
-    @property
-    def threshold(self) -> Array:
-        """(N,) the detector's; NaN where the sample could not be judged."""
-        return self.rows["threshold"]
-
-    @property
-    def alarm(self) -> NDArray[np.bool_]:
-        """(N,) the detector's, before confirmation."""
-        return self.rows["alarm"].view(_FLAG)
-
-    @property
-    def state(self) -> NDArray[np.uint8]:
-        """(N, n) ChannelState of each channel after the sample."""
-        return np.asarray(self.rows["state"][:, : self.n])
-
-    @property
-    def residual(self) -> Array:
-        """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
-        return np.asarray(self.rows["residual"][:, : self.n])
-
-    @property
-    def level(self) -> Array:
-        """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
-        return self.rows["level"]
 
 
 # As messages: one encoder for the live node and for the output bag ----------------------------------------------------
@@ -252,18 +220,10 @@ class SampleOutput:
     """Whether the live sample path fills it, by the same function."""
 
 
-def _fill_fused(out: Template, row: Any, n: int, shift: int) -> None:
-    fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"])
-
-
-def _fill_integrity(out: Template, row: Any, n: int, shift: int) -> None:
-    fill_integrity(out.bytes, out.at, row, n)
-
-
 FUSED = SampleOutput(
     Topic("fused", "sensor_msgs/msg/Imu"),
     lambda frame_id, n: ImuTemplate(frame_id),
-    _fill_fused,
+    lambda out, row, n, shift: fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]),
     needs_rate=True,
     by_path=True,
 )
@@ -271,7 +231,7 @@ FUSED = SampleOutput(
 INTEGRITY = SampleOutput(
     Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
     lambda frame_id, n: ChannelsTemplate(n + 5),
-    _fill_integrity,
+    lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n),
     on_demand=True,
     by_path=True,
 )
@@ -291,15 +251,7 @@ class Message(NamedTuple):
 
 
 class Encoder:
-    """Makes messages of the output of a monitor.
-
-    Parameters
-    ----------
-    frame_id
-        Of the fused rate.
-    n
-        Number of channels.
-    """
+    """Makes messages of the output of a monitor of n channels, from the frame_id of the fused rate on."""
 
     def __init__(self, frame_id: str, n: int) -> None:
         self.n = n
@@ -310,15 +262,7 @@ class Encoder:
         output.fill(self.templates[output], row, self.n, shift)
 
     def encode(self, results: Output, shift: int = 0) -> Iterator[Message]:
-        """Encode what is said of samples: of each its fused rate, if there is one, and all else.
-
-        Parameters
-        ----------
-        results
-            Of the samples.
-        shift
-            To be taken off their stamps to have those of the messages, ns.
-        """
+        """Encode what is said of samples; shift is taken off their stamps to have those of the messages, ns."""
         for row in results.rows:
             for output, template in self.templates.items():
                 if row["valid"] or not output.needs_rate:

@@ -153,7 +153,7 @@ class Pipeline:
 
     def status(self) -> Status:
         """Snapshot after the last sample."""
-        return status_of(self.core[0], self.subsets, self.channel_names, self.detector, self.integrity, self.config)
+        return status_of(self.core[0], self.subsets, self.detector, self.integrity, self.config)
 
     def prepare(self) -> None:
         """Prepare every loss of one channel and of one whole unit, now and after each change of the detector.
@@ -182,7 +182,7 @@ class Pipeline:
         if core["now"]["waiting"]:
             self.detector.prepare(int(core["now"]["input_mask"]))
         if core["wanted"]:
-            self.integrity.fill(self.subsets[core["wanted"]], int(core["wanted"]))
+            self.integrity.fill(self.subsets, int(core["wanted"]))
             update_level(core, self.subsets)
 
     def _equip(self, config: Config, before: Config | None) -> None:

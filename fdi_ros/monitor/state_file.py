@@ -12,7 +12,6 @@ import math
 import re
 import stat
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.decision import WHY
-from fdi_ros.core.subsets import is_in, mask_of
+from fdi_ros.core.subsets import mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import LONGEST_DELAY
@@ -53,6 +52,13 @@ def configuration_hash(config: Config) -> str:
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
+class RefusalError(Exception):
+    """Why a state is not taken over, in words; what is merely damaged shows as one of `DAMAGED`."""
+
+
+DAMAGED = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+
+
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Estimated errors of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
@@ -70,54 +76,52 @@ class Errors:
         if not detector.takes_any or not detector.states[0]["begun"]:
             return None
         estimator, count = detector.states[0]["estimator"], int(detector.constants[0]["layout"]["count"])
-        states = estimator["states"]
-        late = estimator["late"][: len(detector.geometry.units)]
-        return cls(states["x"][:count].copy(), states["p"][:count, :count].copy(), late.copy())
+        x, p = estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count]
+        return cls(x.copy(), p.copy(), estimator["late"][: len(detector.geometry.units)].copy())
 
     def as_json(self) -> dict[str, object]:
         """Fields of the state file; of the covariance the lower triangle."""
-        triangle = self.covariance[np.tril_indices(len(self.value))]
-        return {
-            "value": [float(f"{value:.{DIGITS}g}") for value in self.value],
-            "covariance": [float(f"{value:.{DIGITS}g}") for value in triangle],
-            "late": self.late.tolist(),
-        }
+        figures = {"value": self.value, "covariance": self.covariance[np.tril_indices(len(self.value))]}
+        rounded = {name: [float(f"{one:.{DIGITS}g}") for one in values] for name, values in figures.items()}
+        return {**rounded, "late": self.late.tolist()}
 
     @classmethod
-    def parsed(cls, saved: Any, detector: Detector) -> Errors | None:
-        """Errors from what a file holds; None if it is damaged, or not for this detector."""
+    def parsed(cls, saved: Any, detector: Detector) -> Errors:
+        """Errors from what a file holds; one of `DAMAGED` if they are none, or not of this detector."""
         count, units = int(detector.constants[0]["layout"]["count"]), len(detector.geometry.units)
-        value, triangle = np.array(saved["value"], dtype=np.float64), np.array(saved["covariance"], dtype=np.float64)
-        late = np.array(saved["late"], dtype=np.float64)
+        value, triangle, late = (np.array(saved[name], dtype=np.float64) for name in ("value", "covariance", "late"))
         if value.shape != (count,) or triangle.shape != (count * (count + 1) // 2,) or late.shape != (units,):
-            return None
+            raise ValueError
         covariance = np.zeros((count, count))
         covariance[np.tril_indices(count)] = triangle
         covariance += np.tril(covariance, -1).T
-        if not (np.isfinite(value).all() and np.isfinite(covariance).all() and np.isfinite(late).all()):
-            return None
+        if not np.isfinite([*value, *triangle]).all() or not (np.abs(late) <= LONGEST_DELAY).all():
+            raise ValueError
         # Rounding may leave a covariance a little short of one.
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-        whole = np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > -1e-6
-        usable = bool((np.diag(covariance) >= 0).all() and whole and (np.abs(late) <= LONGEST_DELAY).all())
-        return cls(value, covariance, late) if usable else None
+        if (np.diag(covariance) < 0).any() or np.linalg.eigvalsh(covariance / np.outer(std, std)).min() <= -1e-6:
+            raise ValueError
+        return cls(value, covariance, late)
 
-    def doubt(self, detector: Detector, bias: Array, turn_on: float) -> str:
-        """Say what is not plausible about errors, beside biases (n,) at the start, rad/s; empty if nothing is."""
+    def check(self, detector: Detector, bias: Array, turn_on: float) -> None:
+        """Refuse errors that are not plausible beside biases (n,) at the start, rad/s."""
         geometry, layout = detector.geometry, detector.constants[0]["layout"]
         n, count = geometry.n, len(self.value)
-        limit = PLAUSIBLE * np.sqrt(layout["prior"][:count] ** 2 + np.diag(self.covariance))
-        limit[:n] = PLAUSIBLE * np.sqrt(turn_on**2 + np.diag(self.covariance)[:n])
+        prior = layout["prior"][:count].copy()
+        prior[:n] = turn_on
+        limit = PLAUSIBLE * np.sqrt(prior**2 + np.diag(self.covariance))
         delays = layout["delays"][1 : len(geometry.units)]
         # Of what was saved before the first sample there are biases only.
         limit[delays[delays < count]] = LONGEST_DELAY
         worst = int(np.argmax(np.abs(self.value) / np.maximum(limit, 1e-300)))
         if abs(self.value[worst]) > limit[worst]:
-            return f"error state {worst + 1} is {self.value[worst]:.3g}, expected within {limit[worst]:.3g}"
+            raise RefusalError(
+                f"error state {worst + 1} is {self.value[worst]:.3g}, expected within {limit[worst]:.3g}"
+            )
         common = float(np.abs(geometry.least_squares @ (bias + self.value[:n])).max())
         if common > PLAUSIBLE * turn_on:
-            return f"its biases pass for a turn of {common:.3g} rad/s, expected within {PLAUSIBLE * turn_on:.3g}"
-        return ""
+            most = PLAUSIBLE * turn_on
+            raise RefusalError(f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}")
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,87 @@ class SavedState:
     """Channels whose bias is known."""
     declared: dict[str, Any]
     """``faulty``: channels declared faulty, and why, one of `WHY`; ``ambiguous``: a set of which one is faulty."""
+
+    @classmethod
+    def of(cls, pipeline: Pipeline) -> SavedState:
+        """Return what is to be kept of a monitor."""
+        core, names = pipeline.core[0], pipeline.channel_names
+        bias, decision, learned = core["bias"], core["decision"], not core["bias"]["learning"]
+        return cls(
+            bias=dict(zip(names, bias["value"][: len(names)].tolist(), strict=True)) if learned else None,
+            errors=Errors.of(pipeline.detector) if learned else None,
+            in_motion=bool(bias["outcome"] == IN_MOTION),
+            known=[names[i] for i in members(int(bias["known"]))],
+            declared={
+                "faulty": {names[i]: WHY[decision["why"][i]] for i in members(int(decision["faulty"]))},
+                "ambiguous": [names[i] for i in members(int(decision["ambiguous"]))],
+            },
+        )
+
+    @classmethod
+    def parsed(cls, saved: Any, pipeline: Pipeline) -> SavedState:
+        """State from what a file holds, if it fits and is plausible; else a refusal, or one of `DAMAGED`."""
+        names, detector, settings = pipeline.channel_names, pipeline.detector, pipeline.config.bias
+        faulty, ambiguous = dict(saved["declared"]["faulty"]), list(saved["declared"]["ambiguous"])
+        known, declared = list(saved["known"]), {"faulty": faulty, "ambiguous": ambiguous}
+        sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *known}.issubset(names)
+        if not sane or not all(why and why in WHY for why in faulty.values()):
+            raise ValueError
+        if saved["bias"] is None:
+            return cls(None, None, False, known, declared)
+        values = np.array([saved["bias"][name] for name in names])
+        if values.dtype != np.float64 or not np.isfinite(values).all():
+            raise ValueError
+        follows = detector.takes_any
+        errors = Errors.parsed(saved["errors"], detector) if saved["errors"] is not None and follows else None
+        off, bound = values - np.array(settings.fixed or 0.0), settings.max_rest_rate
+        if (largest := float(np.abs(off).max())) > bound:
+            raise RefusalError(
+                f"a bias is {largest:.3g} rad/s off the one expected, at most {bound:g} (bias.max_rest_rate)"
+            )
+        if follows:
+            n = len(names)
+            (errors or Errors(np.zeros(n), np.zeros((n, n)), np.zeros(0))).check(detector, off, settings.turn_on_std)
+        bias = dict(zip(names, values.tolist(), strict=True))
+        return cls(bias, errors, saved["in_motion"] is True, known, declared)
+
+    def restore(self, pipeline: Pipeline, age: float) -> None:
+        """Write the state, which is so many seconds old, into the records of a monitor."""
+        core, names, n = pipeline.core[0], pipeline.channel_names, pipeline.geometry.n
+        number, settings = {name: i for i, name in enumerate(names)}, core["settings"]
+        if self.bias is not None:
+            bias = core["bias"]
+            bias["value"][:n] = [self.bias[name] for name in names]
+            bias["known"], bias["learning"] = mask_of(number[name] for name in self.known), False
+            bias["outcome"] = IN_MOTION if self.in_motion else RESTORED
+            std = settings["turn_on"] if self.in_motion else settings["learned"][:n]
+            core["known"]["bias_std"][:n] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
+            core["remaining"][:n] = core["known"]["bias_std"][:n]
+        if self.errors is not None:
+            # Known as well as their walk since then leaves them.
+            detector, count = pipeline.detector, len(self.errors.value)
+            detector.states["restored"] = True
+            estimator = detector.states["estimator"][0]
+            estimator["late"][: len(self.errors.late)] = self.errors.late
+            estimator["states"]["x"][:count] = self.errors.value
+            estimator["states"]["p"][:count, :count] = self.errors.covariance
+            predict(detector.constants[0]["layout"], detector.states["estimator"]["states"][0], age)
+            core["estimate"]["bias"][:n] = self.errors.value[:n]
+        decision = core["decision"]
+        decision["faulty"] = mask_of(number[name] for name in self.declared["faulty"])
+        decision["ambiguous"] = decision["voted"] = mask_of(number[name] for name in self.declared["ambiguous"])
+        for name, why in self.declared["faulty"].items():
+            decision["why"][number[name]] = WHY.index(why)
+
+    def differs(self, kept: SavedState | None) -> bool:
+        """Whether it is to be saved, with another one kept: estimated errors always change a little."""
+        if kept is None or replace(self, errors=None) != replace(kept, errors=None):
+            return True
+        if self.errors is None or kept.errors is None:
+            return self.errors is not kept.errors
+        std, then = np.sqrt(np.diag(self.errors.covariance)), np.sqrt(np.diag(kept.errors.covariance))
+        moved = np.abs(self.errors.value - kept.errors.value) > MOVED * std
+        return bool((moved | (then > MOVED * std)).any() or (self.errors.late != kept.errors.late).any())
 
 
 class StateFile:
@@ -178,11 +263,11 @@ class StateFile:
         ConfigError
             If the file holds something else than a state: the next save must not replace it.
         """
-        refusal = ""
         self._check_ours(self.path)
         self._check_ours(self._old)
+        self.is_rejected = True
         try:
-            refusal = self._restore_from(json.loads(trusted_file.read(self.path, MAX_BYTES).decode()), pipeline)
+            self._restore_from(json.loads(trusted_file.read(self.path, MAX_BYTES).decode()), pipeline)
         except FileNotFoundError:
             self.is_rejected = False
             self.words = f"no state taken from {self.path}: there is none yet"
@@ -191,12 +276,15 @@ class StateFile:
             refusal = str(error.strerror)
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
+        except RefusalError as error:
+            refusal = str(error)
+        except DAMAGED:
             refusal = "damaged"
-        self.is_rejected = bool(refusal)
-        if refusal:
-            self.words = f"no state taken from {self.path}: {refusal}; it is kept as {self._old.name}"
-        return not refusal
+        else:
+            self.is_rejected = False
+            return True
+        self.words = f"no state taken from {self.path}: {refusal}; it is kept as {self._old.name}"
+        return False
 
     @property
     def _old(self) -> Path:
@@ -221,8 +309,8 @@ class StateFile:
 
         The file is replaced as a whole or not at all; what goes wrong is in `words`.
         """
-        state = _state_of(pipeline)
-        if not _changed(state, self._kept) or time.monotonic() < self._not_before:
+        state = SavedState.of(pipeline)
+        if not state.differs(self._kept) or time.monotonic() < self._not_before:
             return False
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
         try:
@@ -240,120 +328,22 @@ class StateFile:
             self.words = f"state saved to {self.path}"
         return True
 
-    def _restore_from(self, saved: Any, pipeline: Pipeline) -> str:
-        """Take over a state; return why not, empty if it was."""
+    def _restore_from(self, saved: Any, pipeline: Pipeline) -> None:
         if saved["format"] != FORMAT:
-            return f"format {saved['format']!r}, expected {FORMAT}"
+            raise RefusalError(f"format {saved['format']!r}, expected {FORMAT}")
         if saved["configuration"] != configuration_hash(pipeline.config):
-            return "it was saved with another configuration"
+            raise RefusalError("it was saved with another configuration")
         age = time.time() - float(saved["saved"])
         if not math.isfinite(age):
-            return "damaged"
+            raise ValueError
         if age < 0:
-            return f"saved {-age:.0f} s ahead of the clock, which was set back"
+            raise RefusalError(f"saved {-age:.0f} s ahead of the clock, which was set back")
         if age > self.max_age:
-            return f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
-        names, detector = pipeline.channel_names, pipeline.detector
-        state = _parsed(saved, names, detector)
-        if state is None:
-            return "damaged"
-        centre, turn_on = np.array(pipeline.config.bias.fixed or 0.0), pipeline.config.bias.turn_on_std
-        if state.bias is not None:
-            off = np.array([state.bias[name] for name in names]) - centre
-            largest = float(np.abs(off).max())
-            if largest > pipeline.config.bias.max_rest_rate:
-                bound = pipeline.config.bias.max_rest_rate
-                return f"a bias is {largest:.3g} rad/s off the one expected, at most {bound:g} (bias.max_rest_rate)"
-            errors = state.errors or Errors(np.zeros(len(names)), np.zeros((len(names),) * 2), np.zeros(0))
-            if doubt := errors.doubt(detector, off, turn_on) if detector.takes_any else "":
-                return doubt
-        _restore(pipeline, state, age)
-        restored = [f"{name} FAULTY" for name in state.declared["faulty"]]
-        restored += [f"{name} AMBIGUOUS" for name in state.declared["ambiguous"]]
-        what = ", ".join(["biases", *restored] if state.bias is not None else restored) or "nothing to restore"
+            raise RefusalError(f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)")
+        state = SavedState.parsed(saved, pipeline)
+        state.restore(pipeline, age)
+        restored = ["biases"] if state.bias is not None else []
+        restored += [f"{name} {kind.upper()}" for kind, names in state.declared.items() for name in names]
+        what = ", ".join(restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
-        self._kept = _state_of(pipeline)
-        return ""
-
-
-def _parsed(saved: Any, names: Sequence[str], detector: Detector) -> SavedState | None:
-    """State from what a file holds; None, or one of the errors that `StateFile.restore` catches, if it is damaged."""
-    faulty, ambiguous, known = dict(saved["declared"]["faulty"]), list(saved["declared"]["ambiguous"]), saved["known"]
-    sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *known}.issubset(names)
-    if not sane or not all(why and why in WHY for why in faulty.values()):
-        return None
-    declared = {"faulty": faulty, "ambiguous": ambiguous}
-    if saved["bias"] is None:
-        return SavedState(None, None, False, list(known), declared)
-    values = np.array([saved["bias"][name] for name in names])
-    if values.dtype != np.float64 or not np.isfinite(values).all():
-        return None
-    errors = None
-    if saved["errors"] is not None and detector.takes_any:
-        errors = Errors.parsed(saved["errors"], detector)
-        if errors is None:
-            return None
-    bias = dict(zip(names, values.tolist(), strict=True))
-    return SavedState(bias, errors, saved["in_motion"] is True, list(known), declared)
-
-
-def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
-    """Write a state that is so many seconds old into the records of a monitor."""
-    core, names = pipeline.core[0], pipeline.channel_names
-    number = {name: i for i, name in enumerate(names)}
-    if state.bias is not None:
-        bias = core["bias"]
-        bias["value"][: len(names)] = [state.bias[name] for name in names]
-        bias["known"], bias["learning"] = mask_of(number[name] for name in state.known), False
-        bias["outcome"] = IN_MOTION if state.in_motion else RESTORED
-        settings = core["settings"]
-        std = settings["turn_on"] if state.in_motion else settings["learned"][: len(names)]
-        core["known"]["bias_std"][: len(names)] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
-        core["remaining"][: len(names)] = core["known"]["bias_std"][: len(names)]
-    if state.errors is not None:
-        _go_on_estimating(pipeline.detector, state.errors, age)
-        core["estimate"]["bias"][: len(names)] = state.errors.value[: len(names)]
-    faulty, ambiguous = state.declared["faulty"], state.declared["ambiguous"]
-    core["decision"]["faulty"] = mask_of(number[name] for name in faulty)
-    core["decision"]["ambiguous"] = core["decision"]["voted"] = mask_of(number[name] for name in ambiguous)
-    for name, why in faulty.items():
-        core["decision"]["why"][number[name]] = WHY.index(why)
-
-
-def _go_on_estimating(detector: Detector, errors: Errors, age: float) -> None:
-    """Go on from errors as they were, known as well as their walk since then leaves them."""
-    state, layout = detector.states, detector.constants[0]["layout"]
-    estimator, count = state["estimator"], len(errors.value)
-    state["restored"] = True
-    estimator["late"][0, : len(errors.late)] = errors.late
-    estimator["states"]["x"][0, :count] = errors.value
-    estimator["states"]["p"][0, :count, :count] = errors.covariance
-    predict(layout, estimator["states"][0], age)
-
-
-def _changed(state: SavedState, kept: SavedState | None) -> bool:
-    """Whether a state is to be saved: estimated errors always change a little."""
-    if kept is None or replace(state, errors=None) != replace(kept, errors=None):
-        return True
-    if state.errors is None or kept.errors is None:
-        return state.errors is not kept.errors
-    std, then = np.sqrt(np.diag(state.errors.covariance)), np.sqrt(np.diag(kept.errors.covariance))
-    moved = np.abs(state.errors.value - kept.errors.value) > MOVED * std
-    return bool((moved | (then > MOVED * std)).any() or (state.errors.late != kept.errors.late).any())
-
-
-def _state_of(pipeline: Pipeline) -> SavedState:
-    """Return what is kept: biases, unless they are being learned, and what is declared and why."""
-    core, names = pipeline.core[0], pipeline.channel_names
-    bias, decision, n = core["bias"], core["decision"], len(names)
-    faulty, ambiguous, known = int(decision["faulty"]), int(decision["ambiguous"]), int(bias["known"])
-    return SavedState(
-        bias=None if bias["learning"] else dict(zip(names, bias["value"][:n].tolist(), strict=True)),
-        errors=None if bias["learning"] else Errors.of(pipeline.detector),
-        in_motion=bool(bias["outcome"] == IN_MOTION),
-        known=[name for i, name in enumerate(names) if is_in(i, known)],
-        declared={
-            "faulty": {name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
-            "ambiguous": [name for i, name in enumerate(names) if is_in(i, ambiguous)],
-        },
-    )
+        self._kept = SavedState.of(pipeline)

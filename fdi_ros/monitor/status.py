@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,16 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
 from fdi_ros.core.records import Condition
 from fdi_ros.core.states import REASONS, ChannelState, Reason
-from fdi_ros.core.subsets import is_in, mask_of, members
+from fdi_ros.core.subsets import flags_of, is_in, mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
-from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
+from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_words
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
+from fdi_ros.system.text import plus_minus
 
 CERTAIN = 4.0
 """Two channels of a larger set surely differ from so many standard deviations on."""
@@ -109,6 +110,9 @@ class ApartStatus:
     """By how much they differ, rad/s."""
     std: float
     """Standard deviation of that, rad/s; NaN: not known."""
+
+    def __str__(self) -> str:
+        return f"{self.who.removesuffix(',')}, {plus_minus(self.size, self.std)} rad/s apart"
 
 
 @dataclass(frozen=True)
@@ -194,32 +198,18 @@ class Status:
         return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.turn_on_std > 0
 
 
-def status_of(
-    core: Any, subsets: NDArray[Any], names: Sequence[str], detector: Detector, integrity: Integrity, config: Config
-) -> Status:
-    """Snapshot of a monitor after its last sample.
-
-    Parameters
-    ----------
-    core
-        Record of the monitor.
-    subsets
-        What every set of channels can do.
-    names
-        Of the channels.
-    detector, integrity, config
-        Of the monitor.
-    """
-    n, last, begun = len(names), core["last"], bool(core["samples"])
-    state = core["state"][:n]
-    repeated = [is_in(i, int(core["copies"]["channels"])) for i in range(n)]
+def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: Integrity, config: Config) -> Status:
+    """Snapshot of a monitor after its last sample, from its record and what every set of channels can do, (2^n,)."""
+    geometry = detector.geometry
+    names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
+    begun, state, settings = bool(core["samples"]), core["state"][:n], core["settings"]
+    repeated = flags_of(int(core["copies"]["channels"]), n)
     detectable, isolable, note, rests_on = _capability(detector, ~(np.isin(state, LOST) | repeated))
     seen = detectable & (state != ChannelState.UNCHECKED)
     well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
     late, late_std = _delays(detector, begun)
-    settings = core["settings"]
     return Status(
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
@@ -228,41 +218,37 @@ def status_of(
         statistic=float(last["statistic"]) if begun else math.nan,
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
-        withheld=begun and bool(core["now"]["withheld"]) and not core["now"]["learned_from"],
-        all_repeat=begun and bool(core["now"]["all_repeat"]),
-        can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
-        can_isolate=tuple(names[i] for i in np.flatnonzero(isolable & seen).tolist()),
+        withheld=begun and bool(now["withheld"]) and not now["learned_from"],
+        all_repeat=begun and bool(now["all_repeat"]),
+        can_detect=_named(names, seen),
+        can_isolate=_named(names, isolable & seen),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
         bias_state=_format_bias(core["bias"], names, float(settings["turn_on"])),
         note=note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
-        protection_level_after_loss=integrity.after_loss(subsets, int(core["now"]["fused"]) & well)
-        if valid
-        else NO_LEVEL,
+        protection_level_after_loss=integrity.after_loss(subsets, int(now["fused"]) & well) if valid else NO_LEVEL,
         units=_units(core, detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
         turn_on_std=float(settings["turn_on"]),
-        errors=_errors(detector, names, begun),
+        errors=_errors(detector, begun),
         names_rest_on=rests_on,
-        copies=_copies(core, detector, config),
-        apart=_apart(detector, core, names),
+        copies=_copies(core, geometry, config),
+        apart=_apart(detector, core),
     )
 
 
 def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     health, state = core["health"], ChannelState(core["state"][i])
-    count, begun = health["counts"][:, i], bool(core["samples"])
-    group = int(core["group"]) if state == ChannelState.AMBIGUOUS else 0
-    followed = bool(core["settings"]["estimates"])
+    count, begun, followed = health["counts"][:, i], bool(core["samples"]), bool(core["settings"]["estimates"])
     return ChannelStatus(
         name=names[i],
         state=state,
         reason=REASONS[core["reason"][i]],
         since=int(core["since"][i]),
-        group=tuple(name for j, name in enumerate(names) if is_in(j, group)),
+        group=tuple(names[k] for k in members(int(core["group"]))) if state == ChannelState.AMBIGUOUS else (),
         error=float(core["error"][i]),
         residual=float(core["last"]["residual"][i]) if begun else math.nan,
         last_received=int(health["received_stamp"][i]) if health["samples"][i] else 0,
@@ -280,6 +266,10 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     )
 
 
+def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
+    return tuple(names[i] for i in np.flatnonzero(marked).tolist())
+
+
 def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     """Return what the channels marked in mask (n,) can do with a detector.
 
@@ -288,22 +278,19 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     Channels whose fault would be seen, and those whose fault would be isolated, (n,); why others would not, in words;
     what no data can tell, and every isolation rests on.
     """
-    nothing = np.zeros(len(mask), dtype=bool)
-    names = detector.geometry.channel_names
+    detectable, isolable = np.zeros((2, len(mask)), dtype=bool)
     try:
         reduced = detector.geometry.subset(mask)
     except GeometryError:
-        return nothing, nothing, _too_little(int(mask.sum())), ""
+        return detectable, isolable, _too_little(int(mask.sum())), ""
     bits = mask_of(np.flatnonzero(mask))
     method = detector.fewer(bits)
     if method is None:
-        return nothing, nothing, detector.refusals[bits], ""
-    detectable, isolable = nothing.copy(), nothing.copy()
+        return detectable, isolable, detector.refusals[bits], ""
     detectable[mask], isolable[mask] = reduced.detectable, method.isolable
-    blind = ", ".join(names[i] for i in np.flatnonzero(mask & ~detectable))
-    vague = ", ".join(names[i] for i in np.flatnonzero(detectable & ~isolable))
-    notes = [f"a fault of {blind} would not be seen"] if blind else []
-    notes += [f"a fault of {vague} would be seen but not isolated"] if vague else []
+    limits = ((mask & ~detectable, "not be seen"), (detectable & ~isolable, "be seen but not isolated"))
+    names = detector.geometry.channel_names
+    notes = [f"a fault of {', '.join(_named(names, marked))} would {words}" for marked, words in limits if marked.any()]
     return detectable, isolable, "; ".join(notes), assumption_words(reduced)
 
 
@@ -315,6 +302,10 @@ def _too_little(left: int) -> str:
         return f"no channel is left: {MIN_CHANNELS} are needed to see a fault"
     plural = "s are" if left > 1 else " is"
     return f"only {left} channel{plural} left: a fault of one would not be seen, {MIN_CHANNELS} are needed"
+
+
+def _unit_names(geometry: Geometry) -> list[str]:
+    return [geometry.unit_of[channels[0]] for channels in geometry.units]
 
 
 def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
@@ -334,76 +325,24 @@ def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
     return np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
 
 
-def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[ErrorStatus, ...]:
-    if not detector.takes_any or not begun:
-        return ()
-    estimator, layout, n = detector.states[0]["estimator"], detector.constants[0]["layout"], len(names)
-    states, found = estimator["states"], []
-    prior = np.sqrt(layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"]))
-    units = [detector.geometry.unit_of[channels[0]] for channels in detector.geometry.units]
-    for kind in ERROR_KINDS:
-        owners = units[1:] if kind.per_unit else names
-        for owner, places in zip(owners, places_of(kind.name, n, len(units)), strict=True):
-            parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [f" {k + 1}" for k in range(len(places))]
-            for place, part in zip(places, parts, strict=True):
-                value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
-                found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
-    return tuple(found)
-
-
-def _apart(detector: Detector, core: Any, names: Sequence[str]) -> ApartStatus | None:
-    """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
-    group, found, largest = set(members(int(core["group"]))), None, 0.0
-    case = detector.states[0]["case"] if detector.takes_any else None
-    for a, b in lone_pairs(detector.geometry) if group else ():
-        if not group.issuperset((a, b)):
-            continue
-        size, std = abs(float(core["error"][b])), math.nan
-        if case is not None and case["open"]:
-            # What the detector explains: the mean since the onset, with all that is not known of it.
-            axes, mean, covariance = detector.geometry.axes, case["inference"]["y"], case["inference"]["covariance"]
-            share = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
-            size = abs(float(mean[a] - share * mean[b]))
-            std = math.sqrt(max(covariance[a, a] + share**2 * covariance[b, b] - 2 * share * covariance[a, b], 0.0))
-        elif len(group) > 2:
-            continue
-        certainty = size / std if std > 0.0 else math.inf
-        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
-            found, largest = (
-                ApartStatus((names[a], names[b]), one_of_words(detector.geometry, (a, b)), size, std),
-                certainty,
-            )
-    return found
-
-
 def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
     geometry, measured = detector.geometry, len(late) > 0
+    names = _unit_names(geometry)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
-    found = []
-    for u, channels in enumerate(geometry.units):
-        unit = UnitStatus(
-            geometry.unit_of[channels[0]],
+    off = detector.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
+    return tuple(
+        UnitStatus(
+            names[u],
             tuple(geometry.channel_names[i] for i in channels),
             delay=float(late[u, middle]) if measured else math.nan,
             delay_std=float(late_std[u, middle]) if measured else math.nan,
-            against=geometry.unit_of[geometry.units[middle][0]] if measured else "",
+            against=names[middle] if measured else "",
+            taken_off=bool(off[u] != off[middle]),
             frozen=_frozen(core, channels),
         )
-        if measured:
-            off = detector.states[0]["estimator"]["late"]
-            unit = replace(unit, taken_off=bool(off[u] != off[middle]))
-        found.append(unit)
-    return tuple(found)
-
-
-def _copies(core: Any, detector: Detector, config: Config) -> tuple[tuple[str, str], ...]:
-    geometry = detector.geometry
-    names = [geometry.unit_of[channels[0]] for channels in geometry.units]
-    if config.has_units:
-        names = [f"{name} ({topic})" for name, topic in zip(names, config.topics, strict=True)]
-    original = core["copies"]["original"][: len(names)].tolist()
-    return tuple((names[first - 1], names[unit]) for unit, first in enumerate(original) if first)
+        for u, channels in enumerate(geometry.units)
+    )
 
 
 def _frozen(core: Any, channels: Sequence[int]) -> float:
@@ -414,50 +353,86 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     return seconds if is_old and seconds >= core["settings"]["health"]["stuck_time"] / 1e9 > 0 else 0.0
 
 
-def _format_motion(bias: Any) -> str:
-    """Say why a time was refused as rest in which no more than one channel was restless by itself."""
-    if bias["common_rate"] > bias["max_common_rate"]:
-        return (
-            f"refused, not at rest: the channels agree on a turn of {bias['common_rate']:.3g} rad/s (at most"
-            f" {bias['max_common_rate']:.3g} with biases that differ as little); if it was at rest, give bias.fixed"
-        )
-    if bias["sway"] > bias["max_sway"]:
-        return (
-            f"refused, not at rest: a motion that the channels agree on, {bias['sway']:.3g} rad/s (at most"
-            f" {bias['max_sway']:.3g})"
-        )
-    heard = int(bias["heard"]).bit_count()
-    return f"refused: {heard} channels gave values, one of them was not at rest, expected 3 at rest at least"
+def _errors(detector: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
+    if not detector.takes_any or not begun:
+        return ()
+    estimator, layout, names = detector.states[0]["estimator"], detector.constants[0]["layout"], detector.geometry
+    states, units, found = estimator["states"], _unit_names(names), []
+    prior = np.sqrt(layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"]))
+    for kind in ERROR_KINDS:
+        owners = units[1:] if kind.per_unit else names.channel_names
+        for owner, places in zip(owners, places_of(kind.name, names.n, len(units)), strict=True):
+            parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [f" {k + 1}" for k in range(len(places))]
+            for place, part in zip(places, parts, strict=True):
+                value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
+                found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
+    return tuple(found)
+
+
+def _apart(detector: Detector, core: Any) -> ApartStatus | None:
+    """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
+    geometry, group = detector.geometry, set(members(int(core["group"])))
+    case, found, largest = detector.states[0]["case"] if detector.takes_any else None, None, 0.0
+    for a, b in lone_pairs(geometry) if group else ():
+        if not group.issuperset((a, b)):
+            continue
+        size, std = abs(float(core["error"][b])), math.nan
+        if case is not None and case["open"]:
+            # What the detector explains: the mean since the onset, with all that is not known of it.
+            axes, mean, covariance = geometry.axes, case["inference"]["y"], case["inference"]["covariance"]
+            share = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
+            size = abs(float(mean[a] - share * mean[b]))
+            std = math.sqrt(max(covariance[a, a] + share**2 * covariance[b, b] - 2 * share * covariance[a, b], 0.0))
+        elif len(group) > 2:
+            continue
+        certainty = size / std if std > 0.0 else math.inf
+        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
+            names = geometry.channel_names[a], geometry.channel_names[b]
+            found, largest = ApartStatus(names, one_of_words(geometry, (a, b)), size, std), certainty
+    return found
+
+
+def _copies(core: Any, geometry: Geometry, config: Config) -> tuple[tuple[str, str], ...]:
+    names = _unit_names(geometry)
+    if config.has_units:
+        names = [f"{name} ({topic})" for name, topic in zip(names, config.topics, strict=True)]
+    original = core["copies"]["original"][: len(names)].tolist()
+    return tuple((names[first - 1], names[unit]) for unit, first in enumerate(original) if first)
 
 
 def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
     outcome = int(bias["outcome"])
-    words = {
+    if outcome in (LEARNED, RESTORED):
+        missed = [name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))]
+        words = "learned" if outcome == LEARNED else "restored from the state file"
+        return f"{words}, but not of {', '.join(missed)}" if missed else words
+    known = {
         FIXED: "fixed" if bias["given"] else "zero",
         LEARNING: "learning",
         IN_MOTION: "not at rest at the start: biases as given, what the channels see of each other is followed; the"
         f" common bias is unknown to {turn_on:g} rad/s",
-        LEARNED: "learned",
-        RESTORED: "restored from the state file",
-    }.get(outcome, "")
-    if outcome in (LEARNED, RESTORED):
-        missed = [name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))]
-        return f"{words}, but not of {', '.join(missed)}" if missed else words
-    if words:
-        return words
-    if outcome == TOO_FEW:
-        heard = int(bias["heard"]).bit_count()
-        return f"refused: {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
-    if int(bias["restless"]).bit_count() <= 1:
-        return _format_motion(bias)
-    mean, std, max_std = bias["average"], bias["scatter"], bias["max_std"]
-    excess = [
-        abs(mean[i]) / bias["max_rate"] + std[i] / max_std[i] if is_in(i, int(bias["restless"])) else 0.0
-        for i in range(len(names))
-    ]
-    worst = int(np.argmax(excess))
-    return (
-        f"refused, not at rest: {names[worst]} had mean {mean[worst]:.3g} rad/s (at most {bias['max_rate']:g})"
-        f" and standard deviation {std[worst]:.3g} rad/s (at most {max_std[worst]:.3g})"
-    )
+    }
+    return known.get(outcome) or f"refused{_format_refusal(bias, names)}"
+
+
+def _format_refusal(bias: Any, names: Sequence[str]) -> str:
+    heard, restless = int(bias["heard"]).bit_count(), list(members(int(bias["restless"])))
+    if bias["outcome"] == TOO_FEW:
+        return f": {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
+    mean, std, max_mean, max_std = bias["average"], bias["scatter"], bias["max_rate"], bias["max_std"]
+    if len(restless) > 1:
+        worst = max(restless, key=lambda i: abs(mean[i]) / max_mean + std[i] / max_std[i])
+        return (
+            f", not at rest: {names[worst]} had mean {mean[worst]:.3g} rad/s (at most {max_mean:g})"
+            f" and standard deviation {std[worst]:.3g} rad/s (at most {max_std[worst]:.3g})"
+        )
+    if bias["common_rate"] > bias["max_common_rate"]:
+        return (
+            f", not at rest: the channels agree on a turn of {bias['common_rate']:.3g} rad/s (at most"
+            f" {bias['max_common_rate']:.3g} with biases that differ as little); if it was at rest, give bias.fixed"
+        )
+    if bias["sway"] > bias["max_sway"]:
+        motion = f"{bias['sway']:.3g} rad/s (at most {bias['max_sway']:.3g})"
+        return f", not at rest: a motion that the channels agree on, {motion}"
+    return f": {heard} channels gave values, one of them was not at rest, expected 3 at rest at least"

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.path import HAS_EVENTS, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe, format_apart
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
@@ -86,7 +86,7 @@ class ChangeLog:
         for event in events:
             if self._is_due(event, now):
                 words = format_reason(event, self._names)
-                words += f"; {format_apart(pair)}" if pair is not None and len(event.group) > 1 else ""
+                words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
                 line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
                 lines.setdefault((event.after, f"{line}{words and ': '}{words}"), []).append(event.channel)
         for (state, words), channels in lines.items():

@@ -140,7 +140,7 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
     }[mounting]
     noise = NoiseModel(rng.uniform(1.0, 3.0, 6))
     own, subsets = integrity(geometry, noise.noise_std, prior=1e-4, risk=1e-7), prepare_subsets(geometry, noise)
-    own.fill(subsets[63], 63)
+    own.fill(subsets, 63)
     level, growth = np.zeros(3), np.zeros(12)
     for ratio in (np.full(6, rng.uniform(1.0, 9.0)), rng.uniform(1.0, 9.0, 6)):
         own.variance, growth[:6] = ratio * noise.noise_std**2, ratio
