@@ -44,7 +44,8 @@ two methods that differ by less than half a point are alike. Bayes' decision tha
 is at most half a point better than the best of them. `guaranteed` is brought to the common false-alarm rate by
 its threshold, far below the ten bounds of its own; its set of suspects is then all channels. Delay: *best
 possible* is that of a method that knows channel, sign and size (Moustakides 1986). `sequential` begins each
-trial with no noise measured, for which it allows most at first, and some of its streams end before the alarm (a dash); in flights it is quicker, see there.""",
+trial with no noise measured, for which it allows most at first, and some of its streams end before the alarm
+(a dash); in flights it is quicker, see there.""",
     "roc": "Detection at other false-alarm rates.",
     "double": """Single-fault methods name one channel and call it isolated; where two are off that
 is wrong by construction. The set of `likelihood_ratio` holds both from 20 standard deviations on; below, one

@@ -224,8 +224,8 @@ def _watch(block: Block, config: Config, active: Int) -> tuple[tuple[Span, ...],
     stamp, state = watched.columns
     among = np.asarray(state == ChannelState.AMBIGUOUS)
     runs = [([k], run) for k, states in enumerate(state.T) for run in flag_runs(states == ChannelState.FAULTY)]
-    for run in flag_runs(np.asarray(among.any(axis=1))):
-        runs.append((np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run))
+    doubted = flag_runs(np.asarray(among.any(axis=1)))
+    runs += [(np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run) for run in doubted]
     seconds = (stamp - stamp[0]) * 1e-9
     spans = [Span(tuple(channels), float(seconds[first]), float(seconds[end - 1])) for channels, (first, end) in runs]
     return tuple(sorted(spans, key=lambda span: span.start)), watched.spectrum
