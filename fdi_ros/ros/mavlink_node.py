@@ -19,7 +19,6 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -36,7 +35,6 @@ from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.output import INTEGRITY
-from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import (
     REPORT_PERIOD,
     diagnostics_publisher,
@@ -45,7 +43,8 @@ from fdi_ros.ros.messages import (
     prefix_of,
     read_diagnostics,
 )
-from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
+from fdi_ros.ros.node import CheckedNode
+from fdi_ros.ros.process import Stop, guarded, make_executor
 from fdi_ros.sources.channels import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
@@ -67,7 +66,7 @@ _VALUE_EVERY = 450_000_000
 """Between two NAMED_VALUE_FLOAT of a name, ns."""
 
 
-class AutopilotNode(parameters.CheckedParameters, Node):
+class AutopilotNode(CheckedNode):
     """Publishes the IMUs of an autopilot, one topic a unit.
 
     Raises
@@ -77,9 +76,8 @@ class AutopilotNode(parameters.CheckedParameters, Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("mavlink_node", **options)
-        self.config = parameters.declare(self, MAVLINK, subscribes=False)
-        params = self.values(MAVLINK)
+        super().__init__("mavlink_node", MAVLINK, subscribes=False, **options)
+        params = self.values()
         settings = self._settings(params)
         self.link = open_link(params["url"])
         self.vehicle = Vehicle(settings, self.link.send, time.time)
@@ -149,16 +147,16 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         One thread: what comes over the link is bounded per turn, so the executor never waits for long.
         """
         # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
-        executor, guard = make_executor(self, "single"), ErrorGuard(self, ExternalShutdownException)
+        executor = make_executor(self, "single")
         due = time.monotonic()
         try:
             while rclpy.ok() and not stop.asked:
                 self.link.wait(max(0.0, due - time.monotonic()))
-                with guard:
+                with guarded(self):
                     self.turn()
                 if (now := time.monotonic()) >= due:
                     due = now + WAIT
-                    with guard:
+                    with guarded(self):
                         self._give_turn(executor)
             self._put_back()
         except ExternalShutdownException:

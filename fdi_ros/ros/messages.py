@@ -9,16 +9,14 @@ import importlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from fdi_ros.core.path import HAS_RATE, WORKED
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine, encode_diagnostics
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
@@ -46,40 +44,6 @@ def output_qos() -> QoSProfile:
 def diagnostics_publisher(node: Node) -> Any:
     """Publish diagnostics; they are handed over as bytes."""
     return node.create_publisher(message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10))
-
-
-class Publishers:
-    """The node's output topics."""
-
-    def __init__(self, node: Node) -> None:
-        overriding = QoSOverridingOptions.with_default_policies()
-        self._node = node
-        self._of_samples = {
-            output: node.create_publisher(
-                message_class(output.topic.type), output.topic.name, output_qos(), qos_overriding_options=overriding
-            )
-            for output in OUTPUTS
-        }
-        self.diagnostics = diagnostics_publisher(node)
-        self.count_subscribers()
-
-    def count_subscribers(self) -> None:
-        """Check which outputs are wanted: with a subscriber, or published whether there is one or not."""
-        self.wanted = [
-            (HAS_RATE if output.needs_rate else WORKED, output, publisher)
-            for output, publisher in self._of_samples.items()
-            if not output.on_demand or publisher.get_subscription_count() > 0
-        ]
-        """Each with the flag of the samples that it is published of."""
-
-    def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
-        """Publish diagnostics at the clock time now, ns."""
-        self.diagnostics.publish(encode_diagnostics(lines, now).data)
-
-    def destroy(self) -> None:
-        """Take the topics down."""
-        for publisher in (*self._of_samples.values(), self.diagnostics):
-            self._node.destroy_publisher(publisher)
 
 
 def read_diagnostics(message: Any, node: str) -> list[StatusLine]:

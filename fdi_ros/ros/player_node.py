@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -25,9 +24,9 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.config.settings import PLAYER
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.errors import BagError
-from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import message_class, output_qos
-from fdi_ros.ros.process import ErrorGuard, Stop
+from fdi_ros.ros.node import CheckedNode
+from fdi_ros.ros.process import Stop, guarded
 from fdi_ros.sources import source_of
 
 PATIENCE = 0.1
@@ -42,7 +41,7 @@ CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
 
-class PlayerNode(parameters.CheckedParameters, Node):
+class PlayerNode(CheckedNode):
     """Plays the input topics of a monitor's settings.
 
     Raises
@@ -52,9 +51,8 @@ class PlayerNode(parameters.CheckedParameters, Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("player_node", **options)
-        self.config = parameters.declare(self, PLAYER, subscribes=False)
-        values = self.values(PLAYER)
+        super().__init__("player_node", PLAYER, subscribes=False, **options)
+        values = self.values()
         if not values["bag"]:
             raise BagError("no recording given: set the parameter bag")
         self.rate: float = values["rate"]
@@ -79,11 +77,11 @@ class PlayerNode(parameters.CheckedParameters, Node):
 
     def live(self, stop: Stop) -> None:
         """Publish every message when its time comes, and answer requests meanwhile."""
-        executor, guard = SingleThreadedExecutor(), ErrorGuard(self, ExternalShutdownException)
+        executor = SingleThreadedExecutor()
         executor.add_node(self)
 
         def spin(seconds: float) -> None:
-            with guard:
+            with guarded(self):
                 executor.spin_once(timeout_sec=seconds)
 
         try:

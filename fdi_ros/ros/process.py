@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-import ast
+import contextlib
 import gc
 import importlib
 import re
@@ -62,7 +62,6 @@ def spin(node: Any, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    inputs, guard = node.inputs, ErrorGuard(node, ExternalShutdownException)
     try:
         executor = make_executor(node)
     except ExternalShutdownException:
@@ -73,10 +72,10 @@ def spin(node: Any, stop: Stop) -> None:
     gc.freeze()
     try:
         while rclpy.ok() and not stop.asked:
-            with guard:
-                executor.spin_once(timeout_sec=SHORT if inputs.flooded else TIMEOUT)
-                if inputs.turn(executor, time.monotonic(), bounded):
-                    executor = replace_executor(node, executor, guard)
+            with guarded(node):
+                executor.spin_once(timeout_sec=SHORT if node.inputs.flooded else TIMEOUT)
+                if node.inputs.turn(executor, time.monotonic(), bounded):
+                    executor = replace_executor(node, executor)
                 node.keep_up()
     except ExternalShutdownException:
         return
@@ -84,24 +83,21 @@ def spin(node: Any, stop: Stop) -> None:
         executor.remove_node(node)
 
 
-class ErrorGuard:
-    """Logs exceptions raised inside, but for some kinds, and goes on."""
+@contextlib.contextmanager
+def guarded(node: Any) -> Iterator[None]:
+    """Log what is raised inside and go on, but for the end of ROS."""
+    from rclpy.executors import ExternalShutdownException
 
-    def __init__(self, node: Any, *passed: type[BaseException]) -> None:
-        self._node, self._passed = node, passed
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> bool:
-        if kind is None or not issubclass(kind, Exception) or issubclass(kind, self._passed):
-            return False
-        words = f"left aside, as it cannot be worked: {kind.__name__}: {' '.join(str(error).split())}"
-        self._node.get_logger().error(words, throttle_duration_sec=1.0)
-        return True
+    try:
+        yield
+    except ExternalShutdownException:
+        raise
+    except Exception as error:
+        words = f"left aside, as it cannot be worked: {type(error).__name__}: {' '.join(str(error).split())}"
+        node.get_logger().error(words, throttle_duration_sec=1.0)
 
 
-def replace_executor(node: Any, executor: Any, guard: ErrorGuard) -> Any:
+def replace_executor(node: Any, executor: Any) -> Any:
     """Return a new executor with an empty queue; nothing else empties that of the former one.
 
     Requests that were announced to the former one are announced to no other: they are answered here. The new one finds
@@ -115,7 +111,7 @@ def replace_executor(node: Any, executor: Any, guard: ErrorGuard) -> Any:
                 request, header = service.handle.service_take_request(service.srv_type.Request)
             if request is None:
                 break
-            with guard:
+            with guarded(node):
                 service.send_response(service.callback(request, service.srv_type.Response()), header)
                 node.keep_up()
     return executor
@@ -187,20 +183,28 @@ def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | 
         import rclpy
     except ImportError as error:
         return _refuse(name, f"{NO_ROS} ({error})")
+    from rclpy.exceptions import ParameterException
     from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
 
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         # RuntimeError: what rclpy raises for a parameter file that it cannot read.
-        rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
-        arguments = list(sys.argv[1:] if argv is None else argv)
-        _check_arguments(name, arguments)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        if left := remove_ros_args([name, *arguments])[1:]:
+            # It would have no effect.
+            expected = f"{name} --ros-args --params-file FILE -p NAME:=VALUE"
+            raise FdiError(f"unknown argument {left[0]!r}, expected: {expected}")
         node = _make(name) if make is None else make()
         _check_files(node, arguments)
         stop = Stop()
-    except (FdiError, ImportError, RuntimeError) as error:
+    except (FdiError, ImportError, RuntimeError, ParameterException) as error:
         rclpy.try_shutdown()
-        # rcl adds where in its sources it noticed.
-        return _refuse(name, _unknown_ros_argument(str(error)) or str(error).split(", at ")[0])
+        # rcl adds where in its sources it noticed, and of unknown arguments says nothing but which they are.
+        words = str(error).split(", at ")[0]
+        if unknown := re.match(r"\[.*?'(-.*?)'", words):
+            words = f"unknown ROS argument {unknown[1]!r}, expected one of: {', '.join(ROS_ARGUMENTS)}"
+        return _refuse(name, words)
     code = 0
     try:
         node.live(stop)
@@ -217,24 +221,6 @@ def _refuse(name: str, words: str) -> int:
     return 2
 
 
-def _check_arguments(name: str, arguments: list[str]) -> None:
-    """Refuse what ROS has left of the arguments: it would have no effect."""
-    from rclpy.utilities import remove_ros_args
-
-    left = remove_ros_args([name, *arguments])[1:]
-    if left:
-        expected = f"{name} --ros-args --params-file FILE -p NAME:=VALUE"
-        raise FdiError(f"unknown argument {left[0]!r}, expected: {expected}")
-
-
-def _unknown_ros_argument(words: str) -> str:
-    """Return better words for unknown ROS arguments than those of rclpy, which are nothing but a list of them."""
-    if not re.fullmatch(r"\['.*'\]", words):
-        return ""
-    unknown = next((word for word in ast.literal_eval(words) if word.startswith("-")), words)
-    return f"unknown ROS argument {unknown!r}, expected one of: {', '.join(ROS_ARGUMENTS)}"
-
-
 def _check_files(node: Any, arguments: list[str]) -> None:
     """Refuse parameter files without parameters of this node: it would run with nothing but defaults, or old values."""
     # Here: without ROS 2 there may be no YAML either, and that is to be said by its name.
@@ -243,25 +229,19 @@ def _check_files(node: Any, arguments: list[str]) -> None:
     name = node.get_fully_qualified_name()
     for file in (file for word, file in pairwise(arguments) if word == "--params-file"):
         document = read_yaml(file, "parameter file", ConfigError)
-        if not any(re.fullmatch(_pattern(key), name) for key in _node_names("", document)):
+        if not any(re.fullmatch(pattern, name) for pattern in _node_names("", document)):
             raise FdiError(f"no parameters for {name} in {file}, nor in /**")
 
 
 def _node_names(prefix: str, document: Any) -> Iterator[str]:
-    """Names of nodes, with wildcards, for which a parameter file has at least one parameter."""
-    if not isinstance(document, Mapping):
-        return
-    for key, value in document.items():
-        if key == "ros__parameters" and value:
+    """Names of nodes, as regular expressions, for which a parameter file has at least one parameter."""
+    wildcards = {"**": r"(/\w+)*", "*": r"/\w+"}
+    for key, value in document.items() if isinstance(document, Mapping) else ():
+        if key != "ros__parameters":
+            parts = [wildcards.get(part, "/" + re.escape(part)) for part in str(key).split("/") if part]
+            yield from _node_names(prefix + "".join(parts), value)
+        elif value:
             yield prefix
-        elif key != "ros__parameters":
-            yield from _node_names(f"{prefix}/{str(key).strip('/')}", value)
-
-
-def _pattern(name: str) -> str:
-    """Regular expression of the names that a name with the wildcards of ROS stands for."""
-    parts = {"**": r"(/\w+)*", "*": r"/\w+"}
-    return "".join(parts.get(part, "/" + re.escape(part)) for part in name.split("/") if part)
 
 
 # What is installed as commands.

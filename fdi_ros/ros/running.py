@@ -10,24 +10,31 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.core.path import HAS_EVENTS, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
-from fdi_ros.monitor.output import ChannelState, Event, format_reason
+from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe, encode_diagnostics
+from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
-from fdi_ros.ros.inputs import InputQueue, InputTopic
-from fdi_ros.ros.messages import REPORT_PERIOD, BoundedLog, Publishers, message_class, prefix_of
-from fdi_ros.ros.parameters import resolved
+from fdi_ros.ros.inputs import InputTopic
+from fdi_ros.ros.messages import (
+    REPORT_PERIOD,
+    BoundedLog,
+    diagnostics_publisher,
+    message_class,
+    output_qos,
+    prefix_of,
+)
+from fdi_ros.ros.node import CheckedNode
 
 REMEMBERED = 4096
 """Samples whose latency is remembered."""
@@ -125,31 +132,37 @@ class ChangeLog:
             self._log.warning(line)
 
 
-class Supervisor:
-    """Logs and publishes what an operator should know of one monitor."""
+class Running:
+    """A configured monitor: the path of its messages, its outputs, and what an operator should know of it."""
 
-    def __init__(
-        self,
-        node: Node,
-        queue: InputQueue,
-        receiver: Receiver,
-        publishers: Publishers,
-        latencies: Collection[int],
-        state_file: StateFile | None,
-    ) -> None:
+    def __init__(self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None) -> None:
+        self._node, self._state_file = node, state_file
+        self._outputs = {
+            output: node.create_publisher(
+                message_class(output.topic.type),
+                output.topic.name,
+                output_qos(),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for output in OUTPUTS
+        }
+        self._diagnostics = diagnostics_publisher(node)
+        self._latencies: deque[int] = deque(maxlen=REMEMBERED)
+        self.start(receiver)
+
+    def start(self, receiver: Receiver) -> None:
+        """Run a monitor from now on, its first or another one."""
         config = receiver.pipeline.config
-        names = [resolved(node, topic) for topic in config.topics]
-        self.topics = tuple(InputTopic(receiver, k, name) for k, name in enumerate(names))
-        self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
-        self._latencies, self._state_file = latencies, state_file
-        self._prefix = prefix_of(node)
-        self._changes = ChangeLog(node.log, receiver.pipeline.channel_names)
+        self.receiver = receiver
+        self.topics = [InputTopic(receiver, k, self._node.resolved(topic)) for k, topic in enumerate(config.topics)]
+        self._count_subscribers()
+        self._changes = ChangeLog(self._node.log, receiver.pipeline.channel_names)
         self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._rate, self._counted, self._counted_at = 0.0, 0, 0
         """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
         self._due = 0.0
-        """Steady time of the next regular report, s: the first at once, however soon there is another supervisor."""
+        """Steady time of the next regular report, s: the first at once, however soon there is another monitor."""
         self._at_once = MAX_AT_ONCE
         """Changes that may still be reported at once before it."""
         self._restarts = receiver.restarts
@@ -157,144 +170,148 @@ class Supervisor:
         self._shifts: dict[int, tuple[int, int]] = {}
         """By channel: stamp of its last change of state, and what to take off for that of the message, ns."""
 
-    @property
-    def is_out_of_time(self) -> bool:
-        """Whether the stamps of the samples are beyond what can be worked: the monitor must begin anew."""
-        return not 0 <= self._receiver.live["last_stamp"][0] < END_OF_TIME
+    def close(self) -> None:
+        """Take the topics down."""
+        for publisher in (*self._outputs.values(), self._diagnostics):
+            self._node.destroy_publisher(publisher)
+
+    # The path of a message ----------------------------------------------------------------------------------------
+
+    def listen(self) -> None:
+        """Subscribe to the input topics."""
+        source = self.receiver.source
+        kind = message_class(source.type)
+        for k, topic in enumerate(source.topics):
+            self._node.inputs.open(kind, topic, partial(self._take, k))
+
+    def _take(self, inlet: int, data: bytes) -> None:
+        """Take in a message, and publish what comes of it and of all samples that it completes."""
+        begun, receiver = time.perf_counter_ns(), self.receiver
+        # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
+        result = receiver.receive(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
+        while result:
+            if result & SUPPLY:
+                receiver.supply()
+            for flag, output, publisher in self._wanted:
+                if result & flag:
+                    publisher.publish(receiver.messages[output].tobytes())
+            if result & WORKED:
+                self._latencies.append(time.perf_counter_ns() - begun)
+            if result & HAS_EVENTS:
+                self._report_events(receiver.events)
+            if result & MALFORMED:
+                receiver.refused(inlet, data)
+            result = receiver.go_on() if result & MORE else 0
+
+    def _report_events(self, events: Sequence[Event]) -> None:
+        """Log and report changes of state, as far as there are not too many."""
+        in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
+        pair = self.receiver.pipeline.status().apart if in_sets else None
+        for event in events:
+            self._shifts[event.channel] = (event.stamp, self.receiver.shift)
+        self._changes.add(events, self.receiver.shift, pair)
+        if self._at_once > 0:
+            self._at_once -= 1
+            self._report()
+
+    # Supervision --------------------------------------------------------------------------------------------------
 
     def check(self) -> None:
         """Look for everything that may have changed; to be called many times in the period of the reports."""
-        self._publishers.count_subscribers()
-        now = self._node.get_clock().now().nanoseconds
-        if self._check_silence(now):
-            self.report()
-        self._check_time()
+        self._count_subscribers()
+        now, log = self._node.get_clock().now().nanoseconds, self._node.log
+        is_open = bool(self._node.inputs.subscriptions)
+        changes = [topic.check(now, log) for topic in self.topics] if is_open else []
+        if is_open and (self._watchdog.check(self._samples, now) or any(changes)):
+            self._report()
+        if self.receiver.restarts != self._restarts:
+            self._restarts = self.receiver.restarts
+            words = "all stamps jumped together, or paused: the time of the samples begins anew"
+            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
         self._check_bias()
         self._changes.check()
         if (steady := time.monotonic()) >= self._due:
             # One that came late is not made up for.
             self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
-            self._check_sources()
-            self.report()
+            for topic in self.topics if is_open else ():
+                topic.check_sources(self._node, self.topics, log)
+            self._report()
             self._count_anew(now)
 
-    def report_events(self, events: Sequence[Event]) -> None:
-        """Log and report changes of state, as far as there are not too many."""
-        in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
-        pair = self._receiver.pipeline.status().apart if in_sets else None
-        for event in events:
-            self._shifts[event.channel] = (event.stamp, self._receiver.shift)
-        self._changes.add(events, self._receiver.shift, pair)
-        if self._at_once > 0:
-            self._at_once -= 1
-            self.report()
-
-    def report(self) -> None:
-        """Publish the diagnostics."""
-        now = self._node.get_clock().now().nanoseconds
-        hardware = self._receiver.pipeline.config.hardware_id
-        if not self._queue.is_open:
-            lines = [StatusLine(Level.STALE, self._prefix + WHOLE, "inactive: not monitoring", hardware, ())]
-        else:
-            status = self._receiver.pipeline.status()
-            lines = describe(
-                *(status, hardware, self._prefix),
-                inputs=[topic.status(now) for topic in self.topics],
-                figures=self._figures(),
-                silent=self._watchdog.seconds(now) if self._has_no_samples else None,
-                since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
-                warning=self._rate_check.words,
-            )
-        self._publishers.diagnose(lines, now)
+    @property
+    def is_out_of_time(self) -> bool:
+        """Whether the stamps of the samples are beyond what can be worked: the monitor must begin anew."""
+        return not 0 <= self.receiver.live["last_stamp"][0] < END_OF_TIME
 
     def why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
-        if not self._queue.is_open or self._has_no_samples:
+        if not self._node.inputs.subscriptions or self._has_no_samples:
             return "no samples"
-        rate = float(np.linalg.norm(self._receiver.rate))
+        rate = float(np.linalg.norm(self.receiver.rate))
         if not np.isfinite(rate):
             return "no fused rate, so nothing says that the vehicle is at rest"
-        limit = self._receiver.pipeline.config.bias.max_rest_rate
+        limit = self.receiver.pipeline.config.bias.max_rest_rate
         return f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s" if rate > limit else ""
 
     @property
     def _samples(self) -> int:
-        return int(self._receiver.pipeline.core["samples"][0])
+        return int(self.receiver.pipeline.core["samples"][0])
 
     @property
     def _has_no_samples(self) -> bool:
         return self._watchdog.silent or not self._samples
 
-    # Checks -------------------------------------------------------------------------------------------------------
-
-    def _check_silence(self, now: int) -> bool:
-        """Check everything that may fall silent; return whether anything did, or came back."""
-        if not self._queue.is_open:
-            return False
-        changes = [self._check_topic(topic, now) for topic in self.topics]
-        return self._watchdog.check(self._samples, now) or any(changes)
-
-    def _check_topic(self, topic: InputTopic, now: int) -> bool:
-        changed = topic.watchdog.check(topic.received, now)
-        logger = self._node.log
-        if changed and topic.watchdog.silent and not topic.received:
-            logger.warning(f"{topic.name}: no message yet on {topic.topic}")
-        elif changed and topic.watchdog.silent:
-            logger.error(f"{topic.name}: no message on {topic.topic}")
-        elif changed:
-            logger.info(f"{topic.name}: messages on {topic.topic}{' again' if topic.was_heard else ''}")
-        topic.was_heard |= topic.received > 0
-        if topic.is_unstamped and not topic.was_unstamped:
-            logger.warning(f"{topic.topic}: stamps are not set")
-        topic.was_unstamped |= topic.is_unstamped
-        return changed
-
-    def _check_sources(self) -> None:
-        """Log when a topic comes to have more than one publisher, or is read by two inputs."""
-        if not self._queue.is_open:
-            return
-        for topic in self.topics:
-            before, topic.sources = topic.sources, topic.find_sources(self._node, self.topics)
-            if topic.sources and topic.sources != before:
-                self._node.log.warning(topic.sources)
-
-    def _check_time(self) -> None:
-        if self._receiver.restarts != self._restarts:
-            self._restarts = self._receiver.restarts
-            words = "all stamps jumped together, or paused: the time of the samples begins anew"
-            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+    def _count_subscribers(self) -> None:
+        """Check which outputs are wanted: with a subscriber, or published whether there is one or not."""
+        self._wanted = [
+            (HAS_RATE if output.needs_rate else WORKED, output, publisher)
+            for output, publisher in self._outputs.items()
+            if not output.on_demand or publisher.get_subscription_count() > 0
+        ]
+        """Each with the flag of the samples that it is published of."""
 
     def _check_bias(self) -> None:
         """Log where the biases come from, and why not from a time at rest, whenever that changes."""
-        pipeline = self._receiver.pipeline
+        pipeline, logger = self.receiver.pipeline, self._node.get_logger()
         outcome = int(pipeline.core["bias"]["outcome"][0])
         if outcome == self._bias_outcome or not self._samples:
             return
         self._bias_outcome = outcome
         words = f"bias: {pipeline.status().bias_state}"
         if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION):
-            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+            logger.warning(words, throttle_duration_sec=1.0)
         else:
-            self._node.get_logger().info(words, throttle_duration_sec=1.0)
-
-    def _check_rate(self, count: int) -> None:
-        """Log when the samples are found to come at another rate than the configured one."""
-        before = self._rate_check.words
-        self._rate_check.check(count, int(self._receiver.live["last_stamp"][0]))
-        if self._rate_check.words and not before:
-            self._node.log.warning(self._rate_check.words)
-
-    # Log and figures ----------------------------------------------------------------------------------------------
+            logger.info(words, throttle_duration_sec=1.0)
 
     def _count_anew(self, now: int) -> None:
         """Begin a new time between two regular reports."""
         for topic in self.topics:
-            topic.reported(now)
+            topic.count_anew(now)
         count, samples, before = self._samples, self._counted, self._counted_at
         self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
-        self._counted, self._counted_at = count, now
-        self._check_rate(count)
-        self._at_once = MAX_AT_ONCE
+        self._counted, self._counted_at, self._at_once = count, now, MAX_AT_ONCE
+        was_wrong = self._rate_check.words
+        self._rate_check.check(count, int(self.receiver.live["last_stamp"][0]))
+        if self._rate_check.words and not was_wrong:
+            self._node.log.warning(self._rate_check.words)
+
+    def _report(self) -> None:
+        """Publish the diagnostics."""
+        now, prefix = self._node.get_clock().now().nanoseconds, prefix_of(self._node)
+        hardware = self.receiver.pipeline.config.hardware_id
+        if not self._node.inputs.subscriptions:
+            lines = [StatusLine(Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware, ())]
+        else:
+            status = self.receiver.pipeline.status()
+            lines = describe(
+                *(status, hardware, prefix),
+                inputs=[topic.status(now) for topic in self.topics],
+                figures=self._figures(),
+                silent=self._watchdog.seconds(now) if self._has_no_samples else None,
+                since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
+                warning=self._rate_check.words,
+            )
+        self._diagnostics.publish(encode_diagnostics(lines, now).data)
 
     def _message_stamp(self, channel: int, since: int) -> int:
         """Return the stamp of the message, ns, that brought a channel into its state."""
@@ -302,63 +319,12 @@ class Supervisor:
         return since - shift if stamp == since else since
 
     def _figures(self) -> list[tuple[str, str]]:
-        known = np.array(self._latencies or [0])
-        median, late = np.percentile(known, (50, 99), method="lower") / 1e6
+        median, late = np.percentile(np.array(self._latencies or [0]), (50, 99), method="lower") / 1e6
         return [
             ("sample rate (Hz)", f"{self._rate:.1f}"),
             ("latency p50 (ms)", f"{median:.3f}"),
             ("latency p99 (ms)", f"{late:.3f}"),
-            ("samples without fused rate", str(self._receiver.live["without_rate"][0])),
+            ("samples without fused rate", str(self.receiver.live["without_rate"][0])),
             ("restarts of time", str(self._restarts)),
             *([("state file", self._state_file.words)] if self._state_file is not None else []),
         ]
-
-
-class Running:
-    """A configured monitor."""
-
-    def __init__(self, node: Node, queue: InputQueue, receiver: Receiver, state_file: StateFile | None) -> None:
-        self.publishers = Publishers(node)
-        self._latencies: deque[int] = deque(maxlen=REMEMBERED)
-        self._node, self._queue, self._state_file = node, queue, state_file
-        self.start(receiver)
-
-    def start(self, receiver: Receiver) -> None:
-        """Run a monitor from now on, its first or another one."""
-        self.receiver = receiver
-        self.supervisor = Supervisor(
-            *(self._node, self._queue, receiver, self.publishers),
-            latencies=self._latencies,
-            state_file=self._state_file,
-        )
-
-    def listen(self) -> None:
-        """Subscribe to the input topics."""
-        source = self.receiver.source
-        kind = message_class(source.type)
-        for k, topic in enumerate(source.topics):
-            self._queue.open(kind, topic, partial(self._take, k))
-
-    def _take(self, inlet: int, data: bytes) -> None:
-        begun = time.perf_counter_ns()
-        # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
-        result = self.receiver.receive(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
-        if result:
-            self._publish(result, begun, inlet, data)
-
-    def _publish(self, result: int, begun: int, inlet: int, data: bytes) -> None:
-        """Publish what a message has brought, and go on with all samples that it completes."""
-        receiver, publishers = self.receiver, self.publishers
-        while result:
-            if result & SUPPLY:
-                receiver.supply()
-            for flag, output, publisher in publishers.wanted:
-                if result & flag:
-                    publisher.publish(receiver.messages[output].tobytes())
-            if result & WORKED:
-                self._latencies.append(time.perf_counter_ns() - begun)
-            if result & HAS_EVENTS:
-                self.supervisor.report_events(receiver.events)
-            if result & MALFORMED:
-                receiver.refused(inlet, data)
-            result = receiver.go_on() if result & MORE else 0

@@ -24,8 +24,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.core.states import ChannelState
-from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, LONGEST, InputQueue, drain
-from fdi_ros.ros.process import ErrorGuard, replace_executor
+from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, LONGEST, InputQueue
+from fdi_ros.ros.process import replace_executor
 
 
 class Taker(Node):
@@ -75,7 +75,7 @@ def test_a_flood_is_polled_and_then_taken_by_events_again(flooded) -> None:
             # Announced to the executor, and then behind all that waits in its queue.
             requests.append(client.call_async(Trigger.Request()))
             time.sleep(0.2)
-            executor = replace_executor(node, executor, ErrorGuard(node))
+            executor = replace_executor(node, executor)
         return True
 
     def burst(count: int) -> bool:
@@ -84,14 +84,14 @@ def test_a_flood_is_polled_and_then_taken_by_events_again(flooded) -> None:
         return turn()
 
     try:
-        queued = node.inputs.subscriptions[0]
+        (queued,) = node.inputs.subscriptions
         assert wait(lambda: burst(1) and by_event)
         assert not node.inputs.flooded
         # More in a turn than a turn uses up: each message leaves an event behind.
         assert wait(lambda: burst(DEPTH // 2) and node.inputs.flooded)
         assert len(node.got) > FLOOD
         # Before another turn, in which the flood may be over: nobody knows how long a turn takes on a busy machine.
-        assert queued.subscription not in list(node.subscriptions)
+        assert queued not in list(node.subscriptions)
         listening = rclpy.executors.SingleThreadedExecutor(context=context)
         listening.add_node(source)
         assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[0].done()), 5.0)
@@ -116,19 +116,19 @@ def test_what_takes_long_is_taken_in_parts_and_in_order(flooded) -> None:
         time.sleep(LONGEST / 4)
         node.got.append(data)
 
-    one.take = work
+    node.inputs.subscriptions[one] = work
     assert wait(output.get_subscription_count)
     template = ImuTemplate("imu")
     sent = [bytes(template.fill(k, (0.0, 0.0, 0.0), (0.0,) * 9)) for k in range(20)]
     # Until one has come no other is sent: the first are lost while the two find each other.
     assert wait(lambda: output.publish(sent[0]) or node.inputs.drain() or node.got)
-    assert wait(lambda: not drain([one]))
+    assert wait(lambda: not node.inputs.drain())
     node.got.clear()
     for data in sent:
         output.publish(data)
     parts = []
     while len(node.got) < len(sent) and len(parts) < 100_000:
-        parts.append(drain([one]))
+        parts.append(node.inputs.drain())
     assert node.got == sent
     assert max(parts) <= 5
 

@@ -17,7 +17,7 @@ from ros.harness import TWO_IMUS, monitoring, wait
 from ros.storm import KINDS, vehicle, weather
 
 from fdi_ros.ros import messages as log
-from fdi_ros.ros.parameters import MOST_PARAMETERS
+from fdi_ros.ros.node import MOST_PARAMETERS
 
 SECONDS = 0.7
 THROTTLED = 10
