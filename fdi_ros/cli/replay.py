@@ -105,7 +105,8 @@ def _replay(arguments: Namespace) -> int:
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
-        words += f"{failover_text(summary.scores.events, geometry.channel_names)}\n"
+        changes = [(one.at_s, one.channel, one.state) for one in summary.scores.events]
+        words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
         words += f"note: no --config, so assumed: {assumed}\n"
     code = outputs.finish(words, severity=found.severity)

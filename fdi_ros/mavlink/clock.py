@@ -11,6 +11,7 @@ Requests of the autopilot itself are not answered: it would take this computer's
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -67,15 +68,7 @@ class TimeSync:
         return now
 
     def answer(self, sent: int, remote: int, now: int) -> bool:
-        """Take an answer to a request of ours; return whether it was one, and is believed.
-
-        Parameters
-        ----------
-        sent, remote
-            What it repeats, and the time there, ns.
-        now
-            The time here, ns.
-        """
+        """Take an answer: the time that it repeats, the time there, and now, ns; return whether it is believed."""
         if sent not in self._sent or not 0 < remote < 1 << 62:
             return False
         self._sent.remove(sent)
@@ -96,11 +89,8 @@ class TimeSync:
 
     def arrived(self, remote: int, now: int) -> None:
         """Take the time of a message that has just arrived, ns: without answers it is all there is."""
-        difference = float(remote - now)
-        before = self._arrival
-        if before is not None:
-            difference = max(difference, before - DRIFT * (now - self._arrival_at))
-        self._arrival, self._arrival_at = difference, now
+        known = -math.inf if self._arrival is None else self._arrival - DRIFT * (now - self._arrival_at)
+        self._arrival, self._arrival_at = max(float(remote - now), known), now
 
     @property
     def synchronised(self) -> bool:
@@ -113,11 +103,8 @@ class TimeSync:
 
     def offset(self, now: int) -> int | None:
         """Return the offset to be used, ns; None: nothing was heard yet."""
-        if self._best is not None:
-            wanted = float(self._best[1])
-        elif self._arrival is not None:
-            wanted = self._arrival
-        else:
+        wanted = self._arrival if self._best is None else float(self._best[1])
+        if wanted is None:
             return None
         used = self._used
         if used is not None and abs(wanted - used) <= STEP:
@@ -128,13 +115,7 @@ class TimeSync:
 
 
 class SystemTime:
-    """What the time of the system is ahead of the monotonic clock, ns: measured now and then, between interruptions.
-
-    Parameters
-    ----------
-    monotonic, system
-        The clocks, ns.
-    """
+    """What the time of the system is ahead of the monotonic clock, ns: measured now and then, between interruptions."""
 
     EVERY = NS
     TRIES = 5
@@ -147,13 +128,11 @@ class SystemTime:
         """Return by how much, at the monotonic time now, ns."""
         if now >= self._next:
             self._next = now + self.EVERY
+            tries = [(self._monotonic(), self._system(), self._monotonic()) for _ in range(self.TRIES)]
             # Of several readings the one during which the least time has passed.
-            self._ahead = min(self._measured() for _ in range(self.TRIES))[1]
+            before, there, after = min(tries, key=lambda one: one[2] - one[0])
+            self._ahead = there - (before + after) // 2
         return self._ahead
-
-    def _measured(self) -> tuple[int, int]:
-        before, there, after = self._monotonic(), self._system(), self._monotonic()
-        return after - before, there - (before + after) // 2
 
 
 class BootClock:
@@ -180,18 +159,9 @@ class BootClock:
         self._odd = 0
 
     def unwrap(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
-        """Return a time of a message, made whole, ns; None: it is not to be used.
+        """Return a time that a message says, made whole, ns; None: it is not to be used.
 
-        Parameters
-        ----------
-        time
-            ns on the autopilot's clock, as the message says.
-        now
-            The time here, ns.
-        milliseconds
-            It runs over as milliseconds in 32 bits do.
-        about
-            What time it should be there, if that is known, ns.
+        It is looked at at the time now here, runs over if it comes in milliseconds, and should be about so much there.
         """
         if not 0 <= time < 1 << 61:
             return None
@@ -199,12 +169,10 @@ class BootClock:
         if milliseconds and reference is not None:
             # As many whole runs as bring it nearest.
             time += max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
-        if self._latest is None:
-            self._latest, self._lead = time, time - now
-            return time
-        if self._latest - self.BACK <= time <= now + self._lead + self.AHEAD:
+        latest, lead = (time, time - now) if self._latest is None else (self._latest, self._lead)
+        if latest - self.BACK <= time <= now + lead + self.AHEAD:
             self._odd = 0
-            self._latest, self._lead = max(self._latest, time), max(self._lead, time - now)
+            self._latest, self._lead = max(latest, time), max(lead, time - now)
             return time
         self._odd += 1
         if self._odd >= SURE:

@@ -15,7 +15,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
@@ -122,10 +121,9 @@ class Failover:
         self.declarations = Declarations(count)
         self._values: list[tuple[bool, int] | None] = [None] * count
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
-        self._system, ours = self._restore()
-        self._state = FailoverState.resumed(ours)
-        self._saved = ours
-        """Out of use by our hand, as the file says."""
+        self._system, self._saved = self._restore()
+        """Of which system IMUs are out of use by our hand, and which, as the file says."""
+        self._state = FailoverState.resumed(self._saved)
         self._save()
 
     @property
@@ -135,20 +133,19 @@ class Failover:
 
     # What is known -----------------------------------------------------------------------------------------------
 
-    def _unit(self, k: int, now: int, ours: bool) -> FailoverUnit:
-        use, heard = self._values[k] or (None, 0)
-        track = self._vehicle.units.get(k)
-        delivers = track is not None and now - track.last < SILENT
-        use = use if ours and now - heard < FORGOTTEN else None
-        return FailoverUnit(use, heard, *self.declarations.of(k), delivers)
-
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle = self._vehicle
         # What another system says of its parameters is nothing about the one that an IMU was taken out of.
         ours = vehicle.system == self._system or not self._state.orders
+        units = []
+        for k, said in enumerate(self._values):
+            use, heard = said or (None, 0)
+            delivers = k in vehicle.units and now - vehicle.units[k].last < SILENT
+            use = use if ours and now - heard < FORGOTTEN else None
+            units.append(FailoverUnit(use, heard, *self.declarations.of(k), delivers))
         reported = self.reported >= self.declarations.begun and now - self.reported < ABSENT
         return Known(
-            units=tuple(self._unit(k, now, ours) for k in range(len(self._values))),
+            units=tuple(units),
             linked=vehicle.in_reach and vehicle.autopilot == ARDUPILOT and vehicle.kind == "SCALED_IMU" and ours,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
@@ -167,7 +164,7 @@ class Failover:
             if action.kind == "set":
                 self._vehicle.set_parameter(PARAMETERS[action.unit], float(action.use))
             else:
-                self._announce(action.kind, action.unit, action.why or self._size(action.kind, action.unit))
+                self._announce(action.kind, action.unit, action.why)
         if self._state.orders.keys() != self._saved and now >= self._save_at:
             self._system, self._save_at = self._vehicle.system or 0, now + NS
             try:
@@ -199,24 +196,24 @@ class Failover:
             vehicle.read_parameter(PARAMETERS[self._next])
             self._next = (self._next + 1) % len(self._values)
 
-    def _announce(self, kind: str, unit: int, more: str = "") -> None:
+    def _announce(self, kind: str, unit: int, why: str) -> None:
         severity, words = TEXTS[kind]
-        text = f"FDI: {format_imu(unit, self._channels)} {words}{more}"
+        words += why or (self._size(unit) if kind == "out" else "")
+        text = f"FDI: {format_imu(unit, self._channels)} {words}"
         if len(text) > LENGTH:
-            text = f"FDI: IMU {unit + 1} {words}{more}"[:LENGTH]
+            text = f"FDI: IMU {unit + 1} {words}"[:LENGTH]
         self._vehicle.send_text(severity, text)
         self._vehicle.events.append(text)
 
-    def _size(self, kind: str, unit: int) -> str:
+    def _size(self, unit: int) -> str:
         """Say of which axis an IMU is faulty, and by how much, in the autopilot's axes: y to the right, z down."""
-        declared = self.declarations.channels
-        faulty = [i for i in range(3 * unit, 3 * unit + 3) if declared[i] is not None]
-        if kind != "out" or not faulty:
+        declared = self.declarations.channels[3 * unit : 3 * unit + 3]
+        axis = max(range(3), key=lambda axis: declared[axis] or 0)
+        if declared[axis] is None:
             return ""
-        newest = max(faulty, key=lambda i: declared[i] or 0)
-        size = self.errors.get(self._channels[newest], math.nan)
-        words = "" if math.isnan(size) else f" {size if newest % 3 == 0 else -size:+.2f} rad/s"
-        return f" (gyro {'xyz'[newest % 3]}{words})"
+        size = self.errors.get(self._channels[3 * unit + axis], math.nan)
+        words = "" if math.isnan(size) else f" {size if axis == 0 else -size:+.2f} rad/s"
+        return f" (gyro {'xyz'[axis]}{words})"
 
     # The file, and what is said of it all ------------------------------------------------------------------------
 
@@ -254,47 +251,31 @@ class Failover:
         return (Level.OK, name, "ready") if "" in against else (Level.WARN, name, f"no failover: {against[0]}")
 
 
-class DeclaredChange(Protocol):
-    """A change of state in a recording."""
-
-    @property
-    def at_s(self) -> float:
-        """Since the start of the recording, s."""
-
-    @property
-    def channel(self) -> str:
-        """Name of the channel."""
-
-    @property
-    def state(self) -> str:
-        """Its new state."""
-
-
-def failover_text(events: Sequence[DeclaredChange], channels: Sequence[str]) -> str:
-    """Say what failover would have done in a recorded flight: armed, all IMUs in use, parameters set at once.
+def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[str]) -> str:
+    """Say in a line what failover would have done in a recorded flight: armed, all in use, parameters set at once.
 
     Parameters
     ----------
-    events
-        All changes of state of a recording, in order.
+    changes
+        All changes of state of a recording, in order: when, s since its start, name of the channel, new state.
     channels
-        Names of the channels, three for each IMU.
-
-    Returns
-    -------
-    One line; empty where failover would not run.
+        Names of the channels, three for each IMU; where failover would not run, nothing is said.
     """
     count = len(channels) // 3
     if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:
         return ""
     declarations, states, state = Declarations(count), [float(ChannelState.UNCHECKED)] * len(channels), FailoverState()
-    use, done, waiting = [True] * count, [], deque(events)
-    for now in _policy_times(events):
+    use, done = [True] * count, []
+    waiting = deque((_BEFORE + round(at * NS), channel, name) for at, channel, name in changes)
+    # It is asked at every change, and while what was declared is young.
+    asked = {at for at, _, _ in waiting}
+    asked |= {at + k * _STEP for at, _, name in waiting if name == "FAULTY" for k in range(YOUNG // _STEP + 3)}
+    for now in sorted(asked):
         # Between two changes the monitor was heard all the time.
         declarations.heard = now - 1
-        while waiting and _policy_time(waiting[0]) <= now:
-            event = waiting.popleft()
-            states[channels.index(event.channel)] = float(ChannelState[event.state])
+        while waiting and waiting[0][0] <= now:
+            _, channel, name = waiting.popleft()
+            states[channels.index(channel)] = float(ChannelState[name])
         declarations.hear(states, now)
         stale = [ChannelState.STALE in states[3 * k : 3 * k + 3] for k in range(count)]
         units = tuple(FailoverUnit(use[k], now, *declarations.of(k), delivers=not stale[k]) for k in range(count))
@@ -306,14 +287,3 @@ def failover_text(events: Sequence[DeclaredChange], channels: Sequence[str]) -> 
                 words = TEXTS[action.kind][1] + action.why
                 done.append(f"{format_imu(action.unit, channels)} {words} at {(now - _BEFORE) / NS:.1f} s")
     return f"failover, if armed: {'; '.join(done) or 'nothing to do'}"
-
-
-def _policy_time(event: DeclaredChange) -> int:
-    return _BEFORE + round(event.at_s * NS)
-
-
-def _policy_times(events: Sequence[DeclaredChange]) -> list[int]:
-    """Return when the policy is asked: at every change, and while what was declared is young, ns."""
-    declared = [_policy_time(event) for event in events if event.state == ChannelState.FAULTY.name]
-    young = (at + k * _STEP for at in declared for k in range(YOUNG // _STEP + 3))
-    return sorted({*map(_policy_time, events), *young})

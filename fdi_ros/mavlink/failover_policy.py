@@ -15,8 +15,8 @@ state and what is to be done. It has no clock, no link and no memory, so every s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fdi_ros.mavlink.clock import MS, NS
@@ -83,17 +83,17 @@ class Order(NamedTuple):
         return not (self.use and self.confirmed)
 
 
-@dataclass(frozen=True)
+@dataclass
 class FailoverState:
-    """What was decided before, by IMU; never changed in place."""
+    """What was decided before, by IMU."""
 
-    orders: Mapping[int, Order] = field(default_factory=dict)
+    orders: dict[int, Order] = field(default_factory=dict)
     """Of those that are, or may be, out of use by our hand."""
-    seen: Mapping[int, bool] = field(default_factory=dict)
+    seen: dict[int, bool] = field(default_factory=dict)
     """What each parameter said last."""
-    left_alone: frozenset[int] = frozenset()
+    left_alone: set[int] = field(default_factory=set)
     """Those that somebody else has taken out or put back: left alone until the vehicle is disarmed."""
-    answered: Mapping[int, int] = field(default_factory=dict)
+    answered: dict[int, int] = field(default_factory=dict)
     """Declarations that were acted on, or of which it was said why not: when they were made, ns."""
 
     @classmethod
@@ -102,8 +102,8 @@ class FailoverState:
 
         What somebody else has set meanwhile is not known: they are put back, and not taken out again in this flight.
         """
-        units = frozenset(ours)
-        return cls(orders={unit: Order(False, TRIES + 1) for unit in units}, left_alone=units)
+        orders = {unit: Order(False, TRIES + 1) for unit in ours}
+        return cls(orders, left_alone=set(orders))
 
 
 class Action(NamedTuple):
@@ -118,15 +118,7 @@ class Action(NamedTuple):
 
 
 def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
-    """Say what speaks against taking an IMU out of use, but for the age of its declaration; empty if nothing does.
-
-    Parameters
-    ----------
-    state, known, limit
-        As for `decide`.
-    unit
-        Which IMU, from 0.
-    """
+    """Say what speaks against taking an IMU, from 0, out of use, but for the age of its declaration; empty: nothing."""
     one = known.units[unit]
     out = {k for k, order in state.orders.items() if k != unit and order.is_out}
     # One that we may have taken out is no reserve, though its parameter was last heard to say that it is in use.
@@ -146,126 +138,111 @@ def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
 
 
 def decide(state: FailoverState, known: Known, now: int, limit: int = 1) -> tuple[FailoverState, list[Action]]:
-    """Decide what is to be done.
+    """Return the next state, and what is to be done, in this order.
 
     Parameters
     ----------
-    state
-        What was decided before.
-    known
-        What is known now.
+    state, known
+        What was decided before, which stays as it is, and what is known now.
     now
         ns.
     limit
         At most so many IMUs are out of use by our hand, at most all but one.
-
-    Returns
-    -------
-    state, actions
-        The next state, and what is to be done, in this order.
     """
-    state, actions = _notice(state, known)
+    state = FailoverState(dict(state.orders), dict(state.seen), set(state.left_alone), dict(state.answered))
+    actions: list[Action] = []
+    for k, unit in enumerate(known.units):
+        if unit.use is not None:
+            _notice(state, k, unit, actions)
     if known.linked:
-        state = _answer(_put_back(state, known), known, now, limit, actions)
-        state = _send(state, known, now, limit, actions)
+        _put_back(state, known)
+        for k, unit in enumerate(known.units):
+            if unit.declared is not None and unit.declared != state.answered.get(k):
+                _answer(state, known, k, now, limit, actions)
+        for k, order in state.orders.items():
+            if not order.confirmed and now - order.sent >= RETRY:
+                state.orders[k] = _sent(state, known, k, now, limit, actions)
     return state, actions
 
 
-def _notice(state: FailoverState, known: Known) -> tuple[FailoverState, list[Action]]:
-    """Notice which orders are confirmed, and what somebody else has set, or may have set."""
-    orders, seen, left_alone, actions = dict(state.orders), dict(state.seen), set(state.left_alone), []
-    for k, unit in enumerate(known.units):
-        if unit.use is None:
-            continue
-        order, kind, ours = _compared(orders.get(k), unit, seen.get(k, unit.use))
-        if order is not None:
-            orders[k] = order
-        else:
-            orders.pop(k, None)
-        if kind:
-            actions.append(Action(kind, k))
-        if not ours:
-            left_alone.add(k)
-        seen[k] = unit.use
-    return replace(state, orders=orders, seen=seen, left_alone=frozenset(left_alone)), actions
-
-
-def _compared(order: Order | None, unit: FailoverUnit, seen: bool) -> tuple[Order | None, str, bool]:
-    """Compare an order with what the parameter says: what is left of it, what is to be told, and whether it is ours."""
-    if order is None:
-        return (None, "", True) if unit.use == seen else (None, "changed", False)
-    settled = unit.heard - order.sent >= SETTLED
-    if unit.use == order.use and unit.heard > order.begun:
-        kind = "" if order.confirmed else "back" if order.use else "out"
-        # Put back late: by our hand, or by somebody else's while ours was not answered.
-        ours = order.confirmed or not order.use or unit.heard - order.begun < SETTLED
-        return (None if order.use and settled else order._replace(confirmed=True)), kind, ours
-    if unit.use == order.use or not order.confirmed:
-        return order, "", True
-    if order.use:
+def _notice(state: FailoverState, k: int, unit: FailoverUnit, actions: list[Action]) -> None:
+    """Notice whether an order is confirmed, and what somebody else has set, or may have set."""
+    assert unit.use is not None
+    order, seen = state.orders.get(k), state.seen.get(k, unit.use)
+    state.seen[k] = unit.use
+    settled = order is not None and unit.heard - order.sent >= SETTLED
+    changed = unit.use != seen if order is None else unit.use and not order.use and order.confirmed and settled
+    if changed:
+        actions.append(Action("changed", k))
+        state.left_alone.add(k)
+        state.orders.pop(k, None)
+    elif order is not None and unit.use == order.use and unit.heard > order.begun:
+        if not order.confirmed:
+            actions.append(Action("back" if order.use else "out", k))
+        if not order.confirmed and order.use and unit.heard - order.begun >= SETTLED:
+            # Put back late: by our hand, or by somebody else's while ours was not answered.
+            state.left_alone.add(k)
+        state.orders[k] = order._replace(confirmed=True)
+        if order.use and settled:
+            del state.orders[k]
+    elif order is not None and order.use and order.confirmed and not unit.use:
         # Out by what we sent before and came after it, or by somebody else's hand: back it goes.
-        return order._replace(tries=0, confirmed=False), "", not settled
-    return (None, "changed", False) if settled else (order, "", True)
+        state.orders[k] = order._replace(tries=0, confirmed=False)
+        if settled:
+            state.left_alone.add(k)
 
 
-def _put_back(state: FailoverState, known: Known) -> FailoverState:
+def _put_back(state: FailoverState, known: Known) -> None:
     """Turn round all orders at the end of a flight, or earlier where that must be."""
     grounded = known.disarmed >= GROUNDED
+    if known.restore:
+        state.left_alone |= set(state.orders)
+    if grounded:
+        state.left_alone.clear()
     # The autopilot is never left without an IMU by what was done here, whoever has taken out the others.
-    none_left = all(unit.use is False for unit in known.units)
-    left_alone = frozenset() if grounded else state.left_alone | (set(state.orders) if known.restore else set())
-    orders = dict(state.orders)
-    if known.restore or grounded or none_left:
-        orders = {k: order if order.use else Order(True) for k, order in orders.items()}
-    return replace(state, orders=orders, left_alone=left_alone)
+    if known.restore or grounded or all(unit.use is False for unit in known.units):
+        state.orders = {k: order if order.use else Order(True) for k, order in state.orders.items()}
 
 
-def _answer(state: FailoverState, known: Known, now: int, limit: int, actions: list[Action]) -> FailoverState:
-    """Answer declarations: take an IMU out, make room for that, or say why not."""
-    for k, unit in enumerate(known.units):
-        if unit.declared is None or unit.declared == state.answered.get(k):
-            continue
-        why = objection(state, known, k, limit)
-        if now - unit.declared > YOUNG:
-            if why not in ("not armed", "out already"):
-                actions.append(Action("stays", k, True, why or "declared too long ago"))
-        elif not why:
-            state = replace(state, orders={**state.orders, k: Order(False)})
-        else:
-            if why == "limit":
-                state = _make_room(state, known, now)
-            continue
-        state = replace(state, answered={**state.answered, k: unit.declared})
-    return state
+def _answer(state: FailoverState, known: Known, k: int, now: int, limit: int, actions: list[Action]) -> None:
+    """Answer a declaration: take the IMU out, make room for that, or say why not."""
+    unit, why = known.units[k], objection(state, known, k, limit)
+    assert unit.declared is not None
+    if now - unit.declared > YOUNG:
+        if why not in ("not armed", "out already"):
+            actions.append(Action("stays", k, True, why or "declared too long ago"))
+    elif not why:
+        state.orders[k] = Order(False)
+    else:
+        if why == "limit":
+            _make_room(state, known, now)
+        return
+    state.answered[k] = unit.declared
 
 
-def _make_room(state: FailoverState, known: Known, now: int) -> FailoverState:
+def _make_room(state: FailoverState, known: Known, now: int) -> None:
     """Have one IMU put back that is out of use and has long been healthy, unless one is being put back."""
     for k, order in state.orders.items():
         if order.use and not order.confirmed:
-            return state
+            return
         unit = known.units[k]
         if not order.use and unit.delivers and unit.ok and unit.well is not None and now - unit.well >= HEALED:
-            return replace(state, orders={**state.orders, k: Order(True)})
-    return state
+            state.orders[k] = Order(True)
+            return
 
 
-def _send(state: FailoverState, known: Known, now: int, limit: int, actions: list[Action]) -> FailoverState:
-    """Send the orders that are due, once more if need be."""
-    orders = dict(state.orders)
-    for k, order in state.orders.items():
-        if order.confirmed or now - order.sent < RETRY:
-            continue
-        # One that may no longer be taken out is not asked for again; it may be out all the same.
-        late = order.begun > 0 and now - order.begun >= YOUNG + TRIES * RETRY
-        stands = order.use or not (late or objection(state, known, k, limit))
-        tries = order.tries if stands else max(order.tries, TRIES)
-        if order.use and now - order.sent >= AGAIN:
-            tries = 0
-        orders[k] = order._replace(tries=tries + 1)
-        if tries < TRIES:
-            orders[k] = Order(order.use, tries + 1, order.begun or now, now)
-            actions.append(Action("set", k, order.use))
-        elif tries == TRIES:
-            actions.append(Action("not back" if order.use else "not out", k))
-    return replace(state, orders=orders)
+def _sent(state: FailoverState, known: Known, k: int, now: int, limit: int, actions: list[Action]) -> Order:
+    """Send an order once more if that is to be."""
+    order = state.orders[k]
+    # One that may no longer be taken out is not asked for again; it may be out all the same.
+    late = order.begun > 0 and now - order.begun >= YOUNG + TRIES * RETRY
+    stands = order.use or not (late or objection(state, known, k, limit))
+    tries = order.tries if stands else max(order.tries, TRIES)
+    if order.use and now - order.sent >= AGAIN:
+        tries = 0
+    if tries < TRIES:
+        actions.append(Action("set", k, order.use))
+        return Order(order.use, tries + 1, order.begun or now, now)
+    if tries == TRIES:
+        actions.append(Action("not back" if order.use else "not out", k))
+    return order._replace(tries=tries + 1)

@@ -18,7 +18,6 @@ A message that carries only a magnetometer has zeros for gyro and accelerometer:
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Vector = tuple[float, float, float]
@@ -34,8 +33,7 @@ NO_AUTOPILOT = 8
 MOST_UNITS = 4
 
 
-@dataclass(frozen=True)
-class ImuMessage:
+class ImuMessage(NamedTuple):
     """One kind of message."""
 
     name: str
@@ -44,12 +42,10 @@ class ImuMessage:
     """Messages of one kind tell several units of one sort apart."""
     size: int
     """Bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away."""
-    time: str
-    """Type of the time, as `struct` writes it."""
+    head: struct.Struct
+    """Time, acceleration and rate, three each, with which it begins."""
     microseconds: int
     """In one unit of the time."""
-    value: str
-    """Type of acceleration and rate, three each, which follow the time."""
     gyro: float
     """rad/s in one unit of the rate."""
     acceleration: float
@@ -60,25 +56,20 @@ class ImuMessage:
     """Where it does, bytes."""
     updated_at: int = -1
     """Where it says which fields are new, bytes; -1: nowhere."""
-    head: struct.Struct = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "head", struct.Struct(f"<{self.time}6{self.value}"))
 
 
-def _scaled(name: str, number: int, unit: int) -> ImuMessage:
-    milli = 1e-3
-    return ImuMessage(name, number, "SCALED_IMU", 24, "I", 1000, "h", milli, milli * STANDARD_GRAVITY, unit)
-
-
+_MILLI = (1e-3, 1e-3 * STANDARD_GRAVITY)
+_SCALED = ("SCALED_IMU", 24, struct.Struct("<I6h"), 1000, *_MILLI)
 MESSAGES: dict[int, ImuMessage] = {
     message.number: message
     for message in (
-        _scaled("SCALED_IMU", 26, 0),
-        _scaled("SCALED_IMU2", 116, 1),
-        _scaled("SCALED_IMU3", 129, 2),
-        ImuMessage("RAW_IMU", 27, "RAW_IMU", 29, "Q", 1, "h", 1e-3, 1e-3 * STANDARD_GRAVITY, unit_at=26),
-        ImuMessage("HIGHRES_IMU", 105, "HIGHRES_IMU", 63, "Q", 1, "f", 1.0, 1.0, unit_at=62, updated_at=60),
+        ImuMessage("SCALED_IMU", 26, *_SCALED, unit=0),
+        ImuMessage("SCALED_IMU2", 116, *_SCALED, unit=1),
+        ImuMessage("SCALED_IMU3", 129, *_SCALED, unit=2),
+        ImuMessage("RAW_IMU", 27, "RAW_IMU", 29, struct.Struct("<Q6h"), 1, *_MILLI, unit_at=26),
+        ImuMessage(
+            "HIGHRES_IMU", 105, "HIGHRES_IMU", 63, struct.Struct("<Q6f"), 1, 1.0, 1.0, unit_at=62, updated_at=60
+        ),
     )
 }
 """By message id."""
@@ -112,15 +103,7 @@ class Reading(NamedTuple):
 
 
 def read(number: int, payload: bytes) -> Reading | None:
-    """Read the payload of a message; None: it holds no new sample of a gyro.
-
-    Parameters
-    ----------
-    number
-        Of the message, one of `MESSAGES`.
-    payload
-        As it came; what is missing at its end is zero.
-    """
+    """Read the payload, as it came, of one of `MESSAGES`; None: it holds no new sample of a gyro."""
     message = MESSAGES[number]
     data = payload.ljust(message.size, b"\0")
     time, *values = message.head.unpack_from(data)

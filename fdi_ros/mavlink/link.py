@@ -21,7 +21,6 @@ import select
 import socket
 import stat
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
@@ -49,7 +48,7 @@ class Received(NamedTuple):
 
 
 class Link(ABC):
-    """A way to an autopilot."""
+    """A way to an autopilot; messages that are sent wait, whole, until there is room."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -62,125 +61,45 @@ class Link(ABC):
         self._attempt = 0
         self._handle: Any = None
         """The socket or the serial port; None: there is none."""
-
-    def fileno(self) -> int:
-        """File descriptor to wait for; -1: there is none."""
-        return -1 if self._handle is None else int(self._handle.fileno())
+        self._waiting = bytearray()
 
     @abstractmethod
     def _open(self) -> None:
-        """Open, or begin to; raises OSError."""
+        """Make the handle, which never waits; raises OSError."""
+
+    def _is_connected(self) -> bool:
+        """Whether the handle can be used; raises OSError if it never can."""
+        return True
 
     @abstractmethod
-    def _read(self) -> Iterator[Received]:
-        """Read what is there; raises OSError when the link is lost."""
+    def _read(self) -> tuple[Any, bytes]:
+        """Read once, from whom and what; raises BlockingIOError where nothing is there, OSError when lost."""
 
-    @abstractmethod
-    def send(self, data: bytes, peer: Any) -> None:
-        """Send one message, or drop it."""
-
-    def close(self) -> None:
-        """Close."""
-        if self._handle is not None:
-            with contextlib.suppress(OSError):
-                self._handle.close()
-        self._handle = None
-
-    def wait(self, seconds: float) -> None:
-        """Wait until there is something to read, at most so long."""
-        descriptor = self.fileno()
-        try:
-            select.select([descriptor] if descriptor >= 0 else [], self._waits_to_send(descriptor), [], seconds)
-        except (OSError, ValueError):
-            self._lost("the descriptor is gone")
-
-    def _waits_to_send(self, descriptor: int) -> list[int]:
-        return []
+    def _write(self, data: bytes) -> int:
+        """Write what there is room for, and return how much."""
+        return os.write(self._handle.fileno(), data)
 
     def receive(self, now: int) -> list[Received]:
-        """Return what has arrived, opening the link first if it is not open; now in ns."""
-        if self.trouble and self.fileno() < 0:
-            if now < self._attempt:
-                return []
-            self._attempt = now + RETRY
-            try:
-                self._open()
-            except OSError as error:
-                self._lost(error.strerror or str(error))
-                return []
+        """Return what has arrived, opening the link first if it is not open, and send what waits; now in ns."""
         found: list[Received] = []
         size = 0
         try:
-            for received in self._read():
-                found.append(received)
-                size += len(received.data)
-                if size >= MOST_AT_ONCE:
-                    break
+            if self._handle is None:
+                if now < self._attempt:
+                    return []
+                self._attempt, self.trouble = now + RETRY, "connecting"
+                self._open()
+            if self.trouble and self._is_connected():
+                self.trouble, self.opened = "", self.opened + 1
+            while not self.trouble and size < MOST_AT_ONCE:
+                found.append(Received(*self._read()))
+                size += len(found[-1].data)
+        except (BlockingIOError, InterruptedError):
+            pass
         except OSError as error:
             self._lost(error.strerror or str(error))
+        self._flush()
         return found
-
-    def _is_open(self) -> None:
-        self.trouble = ""
-        self.opened += 1
-
-    def _lost(self, why: str) -> None:
-        self.close()
-        self.trouble = why
-
-
-class Udp(Link):
-    """UDP, either listening at an address or sending to one."""
-
-    def __init__(self, url: str, address: tuple[str, int], family: int, listens: bool) -> None:
-        super().__init__(url)
-        self._address, self._family, self._listens = address, family, listens
-
-    def _open(self) -> None:
-        one = socket.socket(self._family, socket.SOCK_DGRAM)
-        try:
-            one.setblocking(False)
-            if self._listens:
-                one.bind(self._address)
-        except OSError:
-            one.close()
-            raise
-        self._handle = one
-        self._is_open()
-
-    def _read(self) -> Iterator[Received]:
-        while self._handle is not None:
-            try:
-                data, peer = self._handle.recvfrom(_DATAGRAM)
-            except (BlockingIOError, InterruptedError):
-                return
-            except OSError as error:
-                # An answer to what was sent to nobody.
-                if error.errno in _UNREACHABLE:
-                    return
-                raise
-            yield Received(peer, data)
-
-    def send(self, data: bytes, peer: Any) -> None:
-        """Send one message, or drop it."""
-        to = peer if self._listens else self._address
-        if self._handle is None or to is None:
-            return
-        try:
-            self._handle.sendto(data, to)
-        except OSError:
-            self.dropped += 1
-
-
-class _Stream(Link):
-    """What streams of bytes have in common: messages wait, whole, until there is room."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
-        self._waiting = bytearray()
-
-    def _waits_to_send(self, descriptor: int) -> list[int]:
-        return [descriptor] if self._waiting and descriptor >= 0 else []
 
     def send(self, data: bytes, peer: Any) -> None:
         """Send one message, or drop it."""
@@ -193,6 +112,8 @@ class _Stream(Link):
         self._flush()
 
     def _flush(self) -> None:
+        if not self._waiting or self.trouble:
+            return
         try:
             del self._waiting[: self._write(bytes(self._waiting))]
         except (BlockingIOError, InterruptedError):
@@ -200,23 +121,63 @@ class _Stream(Link):
         except OSError as error:
             self._lost(error.strerror or str(error))
 
-    @abstractmethod
-    def _write(self, data: bytes) -> int:
-        """Write what there is room for, and return how much."""
+    def wait(self, seconds: float) -> None:
+        """Wait until there is something to read, or to go on with, at most so long."""
+        handles = [] if self._handle is None else [self._handle]
+        try:
+            # A connection that is made, or fails, can be written to.
+            select.select(handles, handles if self.trouble or self._waiting else [], [], seconds)
+        except (OSError, ValueError):
+            self._lost("the descriptor is gone")
 
-    def receive(self, now: int) -> list[Received]:
-        """Return what has arrived, and send what waits."""
-        found = super().receive(now)
-        if self._waiting and not self.trouble:
-            self._flush()
-        return found
+    def close(self) -> None:
+        """Close."""
+        if self._handle is not None:
+            with contextlib.suppress(OSError):
+                self._handle.close()
+        self._handle = None
 
     def _lost(self, why: str) -> None:
+        self.close()
         self._waiting.clear()
-        super()._lost(why)
+        self.trouble = why
 
 
-class Tcp(_Stream):
+class Udp(Link):
+    """UDP, either listening at an address or sending to one."""
+
+    def __init__(self, url: str, address: tuple[str, int], family: int, listens: bool) -> None:
+        super().__init__(url)
+        self._address, self._family, self._listens = address, family, listens
+
+    def _open(self) -> None:
+        self._handle = socket.socket(self._family, socket.SOCK_DGRAM)
+        self._handle.setblocking(False)
+        if self._listens:
+            self._handle.bind(self._address)
+
+    def _read(self) -> tuple[Any, bytes]:
+        try:
+            data, peer = self._handle.recvfrom(_DATAGRAM)
+        except OSError as error:
+            if error.errno not in _UNREACHABLE:
+                raise
+            # An answer to what was sent to nobody.
+            raise BlockingIOError from error
+        return peer, data
+
+    def send(self, data: bytes, peer: Any) -> None:
+        """Send one message, or drop it."""
+        to = peer if self._listens else self._address
+        if self._handle is None or to is None:
+            return
+        try:
+            self._handle.sendto(data, to)
+        except OSError:
+            self.dropped += 1
+
+
+class Tcp(Link):
     """A connection to a TCP server."""
 
     def __init__(self, url: str, address: tuple[str, int], family: int) -> None:
@@ -227,37 +188,26 @@ class Tcp(_Stream):
         self._handle = socket.socket(self._family, socket.SOCK_STREAM)
         self._handle.setblocking(False)
         self._handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.trouble = "connecting"
-        code = self._handle.connect_ex(self._address)
+        self._check(self._handle.connect_ex(self._address))
+
+    def _is_connected(self) -> bool:
+        if not select.select([], [self._handle], [], 0)[1]:
+            return False
+        self._check(self._handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
+        return True
+
+    def _check(self, code: int) -> None:
         if code not in (0, errno.EINPROGRESS):
             raise OSError(code, os.strerror(code))
 
-    def _waits_to_send(self, descriptor: int) -> list[int]:
-        # A connection that is made, or fails, can be written to.
-        return [descriptor] if descriptor >= 0 and (self.trouble or self._waiting) else []
-
-    def _read(self) -> Iterator[Received]:
-        if self._handle is not None and self.trouble:
-            if not select.select([], [self._handle], [], 0)[1]:
-                return
-            code = self._handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-            if code:
-                raise OSError(code, os.strerror(code))
-            self._is_open()
-        while self._handle is not None:
-            try:
-                data = self._handle.recv(_DATAGRAM)
-            except (BlockingIOError, InterruptedError):
-                return
-            if not data:
-                raise OSError(errno.ECONNRESET, "the other side has closed the connection")
-            yield Received(None, data)
-
-    def _write(self, data: bytes) -> int:
-        return 0 if self._handle is None else self._handle.send(data)
+    def _read(self) -> tuple[Any, bytes]:
+        data = self._handle.recv(_DATAGRAM)
+        if not data:
+            raise OSError(errno.ECONNRESET, "the other side has closed the connection")
+        return None, data
 
 
-class Serial(_Stream):
+class Serial(Link):
     """A serial line, by pyserial."""
 
     def __init__(self, url: str, device: str, baud: int) -> None:
@@ -270,18 +220,15 @@ class Serial(_Stream):
     def _open(self) -> None:
         # Two programs that read one line each get half of it.
         self._handle = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
-        self._is_open()
 
-    def _read(self) -> Iterator[Received]:
+    def _read(self) -> tuple[Any, bytes]:
         # A line without bytes reads as empty, too: one that claims to have some and has none was pulled out.
-        while self._handle is not None and select.select([self._handle], [], [], 0)[0]:
-            data = os.read(self._handle.fileno(), _DATAGRAM)
-            if not data:
-                raise OSError(errno.EIO, "the device is gone")
-            yield Received(None, data)
-
-    def _write(self, data: bytes) -> int:
-        return os.write(self._handle.fileno(), data) if self._handle is not None else 0
+        if not select.select([self._handle], [], [], 0)[0]:
+            raise BlockingIOError
+        data = os.read(self._handle.fileno(), _DATAGRAM)
+        if not data:
+            raise OSError(errno.EIO, "the device is gone")
+        return None, data
 
 
 def open_link(url: str) -> Link:
@@ -299,11 +246,9 @@ def open_link(url: str) -> Link:
         return Serial(url, place, number)
     if kind not in ("udpin", "udpout", "tcp") or not place or not 0 < number < 1 << 16:
         raise FdiError(f"url is {url!r}, expected {_FORMS}")
-    kinds = {"tcp": socket.SOCK_STREAM}
+    sort = socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM
     try:
-        family, _, _, _, address = socket.getaddrinfo(
-            place.strip("[]"), number, type=kinds.get(kind, socket.SOCK_DGRAM)
-        )[0]
+        family, _, _, _, address = socket.getaddrinfo(place.strip("[]"), number, type=sort)[0]
     except OSError as error:
         raise FdiError(f"url {url}: no address of {place!r}: {error.strerror}") from error
     except UnicodeError as error:
@@ -358,13 +303,7 @@ def read_key(path: str) -> bytes:
 
 
 class Verifier:
-    """Checks signatures, and that none comes a second time.
-
-    Parameters
-    ----------
-    key
-        32 bytes.
-    """
+    """Checks signatures made with a key of 32 bytes, and that none comes a second time."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key

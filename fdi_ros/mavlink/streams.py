@@ -81,17 +81,15 @@ class Streams:
             current = self._wanted[self._current]
             if now < current.asked + PATIENCE:
                 return None
-            if current.tries < TRIES:
-                return self._ask(self._current, now)
-            current.answer = "no answer"
-            self._current = None
-        return self._ask(self._queue.popleft(), now) if self._queue else None
-
-    def _ask(self, number: int, now: int) -> tuple[int, int]:
-        wanted = self._wanted[number]
-        self._current, wanted.asked = number, now
-        wanted.tries += 1
-        return number, wanted.interval
+            if current.tries >= TRIES:
+                current.answer, self._current = "no answer", None
+        if self._current is None:
+            if not self._queue:
+                return None
+            self._current = self._queue.popleft()
+        wanted = self._wanted[self._current]
+        wanted.asked, wanted.tries = now, wanted.tries + 1
+        return self._current, wanted.interval
 
     def acknowledged(self, result: int) -> None:
         """Take an acknowledgement (MAV_RESULT) of the request under way."""

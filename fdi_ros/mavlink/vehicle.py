@@ -61,8 +61,8 @@ _PEERS = 8
 """Addresses whose bytes are put together, at most."""
 _LEFT = 1 << 12
 """Bytes that pymavlink's parser may carry on; it frees them only when it has used the very last."""
-FIRST_SYSTEM = 1
-"""What is sent before an autopilot was heard comes from this system."""
+LARGEST = 3.4e38
+"""Of a float that a message holds."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,6 @@ def dialect() -> Any:
     return ardupilotmega
 
 
-LARGEST_FLOAT = 3.4e38
-"""That a message holds."""
-
-
 class Vehicle:
     """One autopilot as it is heard.
 
@@ -178,12 +174,10 @@ class Vehicle:
         """What has happened, in words, for the log."""
         self.heard = 0
         """When it was last heard, ns; 0: never."""
-        self.armed = False
-        self.gives_gyros = False
-        """Whether it has sent any."""
+        self.armed = self.gives_gyros = False
+        """Whether its last heartbeat says that it is armed; whether it has sent any gyros."""
         self.disarmed = 0
         """For how long all its heartbeats have said that it is not armed, ns."""
-        self._disarmed_at: int | None = None
         self.begun = 0
         """How often a conversation with it began: what it said of parameters before may no longer be so."""
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
@@ -196,23 +190,22 @@ class Vehicle:
         self._send, self._seconds = send, seconds
         self._verifier = Verifier(settings.key) if settings.key else None
         self._parsers: dict[Any, Any] = {}
-        self._out = self._mavlink.MAVLink(None, settings.system or FIRST_SYSTEM, settings.component)
+        # What is sent before an autopilot was heard comes from system 1.
+        self._out = self._mavlink.MAVLink(None, settings.system or 1, settings.component)
         if settings.key:
-            self._out.signing.secret_key = settings.key
-            self._out.signing.sign_outgoing = True
+            self._out.signing.secret_key, self._out.signing.sign_outgoing = settings.key, True
             self._out.signing.timestamp = now_in_steps(seconds())
-        self._seen: Counter[tuple[str, int]] = Counter()
-        """Samples by kind of message and unit, until a kind is chosen."""
-        self._first_imu = self._found = 0
+        self._seen: set[tuple[str, int]] = set()
+        """Kinds of messages and units of which samples came, until a kind is chosen."""
+        self._first_imu = self._found = self._beat = self._checked = 0
         self._scaled_at = 0
         """When SCALED_IMU of IMU 1 came last, or was asked for, ns."""
         self._sequence: int | None = None
         self._late = 0
         """Late messages in a row."""
-        self._beat = self._checked = 0
-        self._lost = False
+        self._lost = self._chosen = False
+        self._disarmed_at: int | None = None
         self._interval = round(1e6 / settings.rate)
-        self._chosen = False
 
     # What comes in ------------------------------------------------------------------------------------------------
 
@@ -235,17 +228,16 @@ class Vehicle:
         """Take one message; return the sample in it, if it is one of the autopilot in use."""
         number, data = message.get_msgId(), bytes(message.get_msgbuf())
         header = 10 if data[0] == 0xFD else 6
-        sequence, system, component = (data[4], data[5], data[6]) if header == 10 else (data[2], data[3], data[4])
+        sequence, system, component = data[4:7] if header == 10 else data[2:5]
         self.counts["messages"] += 1
-        if self._verifier is not None:
-            steps = now_in_steps(self._seconds())
-            if not self._verifier.accepts(data, system, component, steps):
-                self.counts["unsigned"] += 1
-                if self._verifier.behind:
-                    self.counts["signed late"] += 1
-                    self.behind, self._behind_from = self._verifier.behind, peer
-                return None
-        if number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
+        if self._verifier is not None and not self._verifier.accepts(
+            data, system, component, now_in_steps(self._seconds())
+        ):
+            self.counts["unsigned"] += 1
+            if self._verifier.behind:
+                self.counts["signed late"] += 1
+                self.behind, self._behind_from = self._verifier.behind, peer
+        elif number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
             # Of another dialect: without its layout there is no checksum to believe it by.
             self.counts["unknown"] += 1
             if self._sequence is not None and sequence == (self._sequence + 1) & 255:
@@ -254,17 +246,13 @@ class Vehicle:
             is_new = self._count_lost(sequence)
             if number in MESSAGES:
                 return self._sample(number, data[header : header + data[1]], now)
-            self._answer(number, message, is_new, now)
+            if number == TIMESYNC:
+                self.sync.answer(message.ts1, message.tc1, now)
+            elif number == PARAM_VALUE and is_new:
+                self.parameters.append((message.param_id.partition("\0")[0], message.param_value))
+            elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
+                self.streams.acknowledged(message.result)
         return None
-
-    def _answer(self, number: int, message: Any, is_new: bool, now: int) -> None:
-        """Take what the autopilot answers to a request."""
-        if number == TIMESYNC:
-            self.sync.answer(message.ts1, message.tc1, now)
-        elif number == PARAM_VALUE and is_new:
-            self.parameters.append((message.param_id.partition("\0")[0], message.param_value))
-        elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
-            self.streams.acknowledged(message.result)
 
     def _parsed(self, received: Received) -> list[Any]:
         """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
@@ -288,19 +276,12 @@ class Vehicle:
 
     def _is_ours(self, message: Any, number: int, system: int, component: int, peer: Any, now: int) -> bool:
         """Whether a message comes from the autopilot in use, at the address in use; takes one into use."""
-        beats = (
-            number == HEARTBEAT
-            and component == AUTOPILOT_COMPONENT
-            and message.autopilot != NO_AUTOPILOT
-            and message.type != GROUND_STATION
-        )
-        if (
-            system != self.system
-            and component == AUTOPILOT_COMPONENT
-            and self._may_change_to(system, beats, number, now)
-        ):
+        is_autopilot = component == AUTOPILOT_COMPONENT
+        beats = is_autopilot and number == HEARTBEAT
+        beats = beats and message.autopilot != NO_AUTOPILOT and message.type != GROUND_STATION
+        if is_autopilot and system != self.system and self._may_change_to(system, beats, number, now):
             self._change_to(system)
-        if system != self.system or component != AUTOPILOT_COMPONENT:
+        if system != self.system or not is_autopilot:
             self.counts["of others"] += 1
             if beats:
                 if system not in self.others:
@@ -328,11 +309,12 @@ class Vehicle:
 
         The one in use is lost, or has not given any yet; then one that does goes before one that says it is there.
         """
-        if self.settings.system or not system or not (self.system is None or self._lost or not self.gives_gyros):
+        is_gone = self.system is None or self._lost
+        if self.settings.system or not system or not (is_gone or not self.gives_gyros):
             return False
         if number in MESSAGES:
             return now - self.others.get(system, -LOST) < LOST
-        return beats and (self.system is None or self._lost or now - self._found > LOST)
+        return beats and (is_gone or now - self._found > LOST)
 
     def _change_to(self, system: int) -> None:
         """Begin anew with another system; it is taken into use with its next heartbeat."""
@@ -373,8 +355,7 @@ class Vehicle:
         return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
-        reading = read(number, payload)
-        message = MESSAGES[number]
+        reading, message = read(number, payload), MESSAGES[number]
         if reading is None:
             if message.unit >= 0 and message.unit not in self.units:
                 self.magnetometers.add(message.unit)
@@ -386,8 +367,9 @@ class Vehicle:
         kind, self.gives_gyros = message.kind, True
         if number == SCALED:
             self._scaled_at = now
-        elif stands_in(number, self.autopilot) and reading.unit == 0 and self.kind != kind:
-            kind = MESSAGES[SCALED].kind if now - self._scaled_at > STAND_IN else kind
+        elif stands_in(number, self.autopilot) and reading.unit == 0 and now - self._scaled_at > STAND_IN:
+            # Unless it is in use itself.
+            kind = kind if self.kind == kind else MESSAGES[SCALED].kind
         if not self._chosen and not self._choose(kind, reading.unit, now):
             return None
         return self._timed(reading, now) if kind == self.kind else None
@@ -396,8 +378,7 @@ class Vehicle:
         """Return a reading as a sample with its stamp, if it is new and its time can be."""
         track = self.units.setdefault(reading.unit, UnitTrack())
         self.magnetometers.discard(reading.unit)
-        restarts = self.clock.restarts
-        offset = self.sync.offset(now)
+        restarts, offset = self.clock.restarts, self.sync.offset(now)
         about = None if offset is None else now + offset
         time = self.clock.unwrap(reading.time * US, now, reading.message.microseconds > 1, about)
         if self.clock.restarts != restarts:
@@ -410,8 +391,7 @@ class Vehicle:
         if time <= track.time:
             track.repeated += 1
             return None
-        track.time = time
-        track.received += 1
+        track.time, track.received = time, track.received + 1
         track.arrivals.append(now)
         if not self.sync.synchronised and now - self._found < UNSYNCHRONISED:
             return None
@@ -426,11 +406,10 @@ class Vehicle:
         """Choose the kind of messages with the most units, the finest of several; return whether that is done."""
         if not self.kind:
             self._first_imu = self._first_imu or now
-            self._seen[kind, unit] += 1
+            self._seen.add((kind, unit))
             if now - self._first_imu < CHOICE:
                 return False
-            units = {kind: sum(seen == kind for seen, _ in self._seen) for kind in IMU_MESSAGES}
-            self.kind = max(IMU_MESSAGES, key=lambda kind: units[kind])
+            self.kind = max(IMU_MESSAGES, key=lambda kind: sum(seen == kind for seen, _ in self._seen))
             self._seen.clear()
             for other in IMU_MESSAGES:
                 if other != self.kind and understood(other, self.autopilot):
@@ -453,23 +432,17 @@ class Vehicle:
         """Send what is due; called often."""
         if now - self._beat >= NS:
             self._beat = now
-            self._transmit(self._out.heartbeat_encode(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE))
+            self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
         if self._found and not self._lost and now - self.heard > LOST:
             self._lost = True
             self.events.append(f"nothing of {self.name}, system {self.system}, for {LOST // NS} s")
         if not self.in_reach:
             return
-        sent = self.sync.request(now)
-        if sent is not None:
-            self._transmit(self._out.timesync_encode(0, sent))
-        request = self.streams.due(now)
-        if request is not None:
-            number, interval = request
-            self._transmit(
-                self._out.command_long_encode(
-                    self.system, AUTOPILOT_COMPONENT, SET_MESSAGE_INTERVAL, 0, number, interval, 0, 0, 0, 0, 0
-                )
-            )
+        if (sent := self.sync.request(now)) is not None:
+            self._say("timesync", 0, sent)
+        if (request := self.streams.due(now)) is not None:
+            fields = (SET_MESSAGE_INTERVAL, 0, *request, 0, 0, 0, 0, 0)
+            self._say("command_long", self.system, AUTOPILOT_COMPONENT, *fields)
         if now - self._checked >= NS:
             self._checked = now
             self.streams.check(self.rates(now), now)
@@ -480,37 +453,35 @@ class Vehicle:
         """Messages in use, by id, with the samples a second of each unit that they bring; the slowest counts."""
         found = []
         for number in numbers(self.kind) if self.kind else ():
-            message = MESSAGES[number]
-            of = [message.unit] if message.unit >= 0 else list(self.units) or [0]
-            if message.unit in self.magnetometers:
-                continue
-            found.append((number, min(self.units.get(k, UnitTrack()).rate(now) for k in of)))
+            unit = MESSAGES[number].unit
+            if unit not in self.magnetometers:
+                brought = [unit] if unit >= 0 else list(self.units) or [0]
+                found.append((number, min(self.units.get(k, UnitTrack()).rate(now) for k in brought)))
         return found
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
-        self._transmit(self._out.statustext_encode(severity, text.encode("ascii", "replace")[:50]))
+        self._say("statustext", severity, text.encode("ascii", "replace")[:50])
 
     def read_parameter(self, name: str) -> None:
         """Ask for a parameter; what it says comes in `parameters`."""
-        self._transmit(self._out.param_request_read_encode(self.system, AUTOPILOT_COMPONENT, name.encode(), -1))
+        self._say("param_request_read", self.system, AUTOPILOT_COMPONENT, name.encode(), -1)
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter; it says so to all."""
-        message = self._out.param_set_encode(self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32)
-        self._transmit(message)
+        self._say("param_set", self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32)
 
     def send_value(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""
         time = (now + (self.sync.offset(now) or 0)) // MS & 0xFFFFFFFF
-        value = min(max(value, -LARGEST_FLOAT), LARGEST_FLOAT)
-        self._transmit(self._out.named_value_float_encode(time, name.encode("ascii")[:10], value))
+        self._say("named_value_float", time, name.encode("ascii")[:10], min(max(value, -LARGEST), LARGEST))
 
-    def _transmit(self, message: Any) -> None:
-        signing = self._out.signing
-        signing.timestamp = max(signing.timestamp, now_in_steps(self._seconds()))
-        data = message.pack(self._out)
-        self._out.seq = (self._out.seq + 1) % 256
+    def _say(self, name: str, *fields: Any) -> None:
+        """Send a message of the dialect."""
+        out = self._out
+        out.signing.timestamp = max(out.signing.timestamp, now_in_steps(self._seconds()))
+        data = getattr(out, f"{name}_encode")(*fields).pack(out)
+        out.seq = (out.seq + 1) % 256
         # One whose time of signatures is behind is told ours by what is sent: MAVLink has it take over later times.
         self._send(bytes(data), self._behind_from if self.peer is None else self.peer)
 

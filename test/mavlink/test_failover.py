@@ -24,7 +24,6 @@ from fdi_ros.mavlink.failover_policy import (
     decide,
     objection,
 )
-from fdi_ros.replay.summary import StateChange
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 from mavlink.conversation import Conversation
 from mavlink.flights import Flight
@@ -326,13 +325,10 @@ def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
 
 
 def test_what_failover_would_have_done_in_a_recording() -> None:
-    def change(at: float, channel: str, state: str) -> StateChange:
-        return StateChange(channel, at, state, "OK", "", (channel,), 0.1)
-
-    begin = [change(0.5, name, "OK") for name in CHANNELS]
+    begin = [(0.5, name, "OK") for name in CHANNELS]
     assert failover_text(begin, CHANNELS) == "failover, if armed: nothing to do"
-    first = [change(105.2, "imu_1.x", "SUSPECT"), change(105.3, "imu_1.x", "FAULTY"), change(122.0, "imu_1.x", "OK")]
-    second = [change(130.0, "imu_3.y", "FAULTY"), change(131.5, "imu_2.z", "FAULTY")]
+    first = [(105.2, "imu_1.x", "SUSPECT"), (105.3, "imu_1.x", "FAULTY"), (122.0, "imu_1.x", "OK")]
+    second = [(130.0, "imu_3.y", "FAULTY"), (131.5, "imu_2.z", "FAULTY")]
     assert failover_text(begin + first + second, CHANNELS) == (
         "failover, if armed: IMU 1 (imu_1) out of use at 105.3 s; IMU 1 (imu_1) in use again at 130.0 s;"
         " IMU 3 (imu_3) out of use at 130.0 s;"
