@@ -11,7 +11,7 @@ alike are one text.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from fdi_ros.mavlink.clock import MS, NS
@@ -97,9 +97,9 @@ class Reporter:
     def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle
         track, answer = vehicle.units.get(unit), vehicle.streams.answer_to(self._message(unit))
+        if track is None and unit in vehicle.magnetometers:
+            return Level.ERROR, "the autopilot has no such IMU: only its magnetometer comes"
         if track is None:
-            if unit in vehicle.magnetometers:
-                return Level.ERROR, "the autopilot has no such IMU: only its magnetometer comes"
             return (Level.ERROR if vehicle.in_reach else Level.STALE), f"nothing of this unit yet; request: {answer}"
         rate, asked = track.rate(now), vehicle.settings.rate
         if not rate:
@@ -108,13 +108,12 @@ class Reporter:
         return (Level.WARN, f"{words}; request: {answer}") if rate < ENOUGH * asked else (Level.OK, words)
 
     def _unit_values(self, unit: int, now: int) -> tuple[tuple[str, str], ...]:
-        vehicle, number = self._vehicle, self._message(unit)
-        track = vehicle.units.get(unit, UnitTrack())
+        number, track = self._message(unit), self._vehicle.units.get(unit, UnitTrack())
         return (
             ("topic", self._topics[unit]),
             ("message", MESSAGES[number].name if number is not None else "none"),
             ("rate (Hz)", f"{track.rate(now):.1f}"),
-            ("asked for (Hz)", f"{vehicle.settings.rate:g}"),
+            ("asked for (Hz)", f"{self._vehicle.settings.rate:g}"),
             ("samples", str(track.received)),
             ("times repeated", str(track.repeated)),
             ("times impossible", str(track.impossible)),
@@ -164,22 +163,16 @@ def _format_whole(line: StatusLine) -> str:
 
 
 class Announcer:
-    """Decides which texts are sent, and when.
-
-    Parameters
-    ----------
-    channels
-        Names of the channels, in units of three; others are not listened to.
-    """
+    """Decides which texts are sent, and when, about channels in units of three; others are not listened to."""
 
     def __init__(self, channels: Sequence[str]) -> None:
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
-        self._now: dict[str, tuple[str, str]] = dict.fromkeys(channels, ("OK", ""))
+        self._now: dict[str, tuple[str, str]] = {**dict.fromkeys(channels, ("OK", "")), WHOLE: ("", "")}
+        """State of each channel, with the set that it is one of, and what is wrong with the whole, empty: nothing."""
         self._said = dict(self._now)
-        """State and group of each channel: as it stands, and as the ground station knows it."""
+        """The same as the ground station knows it."""
         self._apart = dict.fromkeys(channels, "")
         """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
-        self._whole = self._whole_said = ""
         self._heard = 0
         self._changed: int | None = None
         """When the first of what has changed since the last texts did, ns."""
@@ -193,76 +186,56 @@ class Announcer:
             if line.value("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
                 state = FROZEN
             if line.name == WHOLE:
-                self._change_whole(_format_whole(line), now)
-            elif line.name in self._now and (state in _STATES or state in _FINE):
-                found = (state if state in _STATES else "OK", line.value("one of") if state == "AMBIGUOUS" else "")
+                self._note(WHOLE, (_format_whole(line), ""), now)
+            elif line.name in self._apart and (state in _STATES or state in _FINE):
                 self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
-                if found != self._now[line.name]:
-                    self._now[line.name] = found
-                    self._note_change(now)
+                group = line.value("one of") if state == "AMBIGUOUS" else ""
+                self._note(line.name, (state if state in _STATES else "OK", group), now)
 
-    def _change_whole(self, state: str, now: int) -> None:
-        if state != self._whole:
-            self._whole = state
-            self._note_change(now)
-
-    def _note_change(self, now: int) -> None:
-        if self._changed is None:
-            self._changed = now
+    def _note(self, name: str, found: tuple[str, str], now: int) -> None:
+        if found != self._now[name]:
+            self._now[name] = found
+            self._changed = now if self._changed is None else self._changed
 
     def due(self, now: int) -> list[Text]:
         """Return the texts to be sent now, ns."""
         if self._heard and now - self._heard > SILENT:
-            self._change_whole("the monitor is silent", now)
+            self._note(WHOLE, ("the monitor is silent", ""), now)
         self._tokens = min(AT_ONCE, self._tokens + (now - self._filled) / EVERY)
         self._filled = now
         if self._changed is not None and now - self._changed < SETTLE:
             return []
         self._changed = None
-        texts = []
-        for text, names in self._pending():
-            if self._tokens < 1.0:
-                break
-            self._tokens -= 1.0
-            texts.append(text)
-            if not names:
-                self._whole_said = self._whole
-            for name in names:
-                self._said[name] = self._now[name]
-        return texts
+        pending = [(self._text(names), names) for names in self._alike()]
+        # The gravest first.
+        told = sorted(pending, key=lambda one: one[0].severity)[: int(self._tokens)]
+        self._tokens -= len(told)
+        self._said |= {name: self._now[name] for _, names in told for name in names}
+        return [text for text, _ in told]
 
-    def _pending(self) -> list[tuple[Text, tuple[str, ...]]]:
-        """Texts that the ground station is to know, each with the channels it is about; the gravest first."""
-        found: list[tuple[Text, tuple[str, ...]]] = []
-        if self._whole != self._whole_said:
-            text = Text(CRITICAL, f"FDI: {self._whole}") if self._whole else Text(INFO, "FDI: all is judged again")
-            found.append((text, ()))
-        changed = {name: now for name, now in self._now.items() if now != self._said[name]}
-        for names in self._alike(changed):
-            state, group = changed[names[0]]
-            if state == "AMBIGUOUS":
-                members = tuple(name for name in names if changed[name] == (state, group))
-                found.append((Text(CRITICAL, self._set_text(group)), members))
-                continue
-            unit = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
-            severity, words = _STATES.get(state, (INFO, "in use again"))
-            found.append((Text(severity, f"FDI: {unit} {words}"[:LENGTH]), names))
-        return sorted(found, key=lambda one: one[0].severity)
-
-    def _alike(self, changed: Mapping[str, tuple[str, str]]) -> list[tuple[str, ...]]:
-        """Channels that have changed, together where they stand alike: those of a set, those of a whole unit."""
-        groups = dict.fromkeys(now for now in changed.values() if now[0] == "AMBIGUOUS")
-        left = dict(changed)
+    def _alike(self) -> list[tuple[str, ...]]:
+        """Return what has changed, together where it stands alike: the channels of a set, those of a whole unit."""
+        left = {name: now for name, now in self._now.items() if now != self._said[name]}
+        groups = dict.fromkeys(now for now in left.values() if now[0] == "AMBIGUOUS")
         found = [tuple(name for name in left if left[name] == group) for group in groups]
-        for names in found:
-            for name in names:
-                del left[name]
         for unit in self._units:
-            if len(unit) == 3 and len({left.get(name, ("", "")) for name in unit}) == 1 and unit[0] in left:
+            states = {left.get(name, ("", "")) for name in unit}
+            if len(unit) == 3 and len(states) == 1 and not states & {*groups, ("", "")}:
                 found.append(unit)
-                for name in unit:
-                    del left[name]
-        return found + [(name,) for name in left]
+        together = {name for names in found for name in names}
+        # What is wrong with the whole comes first of what is as grave.
+        return sorted(found + [(name,) for name in left if name not in together], key=lambda names: names != (WHOLE,))
+
+    def _text(self, names: tuple[str, ...]) -> Text:
+        """Return the text about channels that stand alike, or about the whole."""
+        state, group = self._now[names[0]]
+        if names == (WHOLE,):
+            return Text(CRITICAL, f"FDI: {state}") if state else Text(INFO, "FDI: all is judged again")
+        if state == "AMBIGUOUS":
+            return Text(CRITICAL, self._set_text(group))
+        severity, words = _STATES.get(state, (INFO, "in use again"))
+        who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
+        return Text(severity, f"FDI: {who} {words}"[:LENGTH])
 
     def _set_text(self, group: str) -> str:
         """Text for a set of channels, their names separated by commas; of whole units those are named."""
@@ -272,9 +245,7 @@ class Announcer:
             return f"FDI: {units[0]} faulty (axis cannot be told apart)"[:LENGTH]
         if len(names) == 1:
             return f"FDI: {group} faulty"[:LENGTH]
+        texts = [f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"]
         if len(names) == 2 and (size := self._apart.get(max(names))):
-            text = f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s"
-            if len(text) <= LENGTH:
-                return text
-        text = f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
-        return text if len(text) <= LENGTH else f"FDI: one faulty of {len(names)} channels"
+            texts.insert(0, f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s")
+        return next((text for text in texts if len(text) <= LENGTH), f"FDI: one faulty of {len(names)} channels")

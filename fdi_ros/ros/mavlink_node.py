@@ -83,19 +83,19 @@ class AutopilotNode(CheckedNode):
         self.vehicle = Vehicle(settings, self.link.send, time.time)
         topics = self.config.topics if self.config.has_units else TOPICS
         names = self.config.imu_names if self.config.has_units else [topic.partition("/")[0] for topic in TOPICS]
-        kind = message_class(IMU)
-        self._outputs = [self.create_publisher(kind, topic, output_qos()) for topic in topics]
+        self._outputs = [self.create_publisher(message_class(IMU), topic, output_qos()) for topic in topics]
+        self._topics = [output.topic_name for output in self._outputs]
+        """Names as they are after remapping."""
         self._messages = [ImuMessageBytes(name) for name in names]
-        self._reporter = Reporter(self.link, self.vehicle, names, [output.topic_name for output in self._outputs])
+        self._reporter = Reporter(self.link, self.vehicle, names, self._topics)
         self._diagnostics = diagnostics_publisher(self)
-        self._opened = 0
-        self._trouble = self.link.trouble
+        self._opened, self._trouble = 0, self.link.trouble
         self._valued = self._due = 0
         self._time = SystemTime()
         self._called = False
         """Whether the executor has found something to do."""
-        channels = [f"{name}.{axis}" for name in names for axis in "xyz"]
-        self._announcer = Announcer(self.config.channel_names or channels) if params["statustext"] else None
+        channels = self.config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
+        self._announcer = Announcer(channels) if params["statustext"] else None
         self._values = bool(params["named_values"])
         self._monitor = _full_name(self.get_namespace(), params["monitor"])
         self._failover = None if params["failover"] == "off" else self._make_failover(params)
@@ -126,16 +126,16 @@ class AutopilotNode(CheckedNode):
             )
         if not 1 <= params["failover_limit"] < units:
             raise ConfigError(f"failover_limit is {params['failover_limit']}, expected 1 to {units - 1}")
-        name = f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
-        home = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
-        path = Path(params["failover_file"] or home / name)
+        path = Path(params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")).expanduser()
         if not params["failover_file"]:
-            home.mkdir(parents=True, exist_ok=True)
+            path.mkdir(parents=True, exist_ok=True)
+            path /= f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
-        kind = message_class(INTEGRITY.topic.type)
-        heard = self.create_subscription(kind, declarations, self._on_integrity, 10, raw=True)
-        self._sole = [heard.topic_name, *(output.topic_name for output in self._outputs)]
-        """Topics that must have one publisher: names as they are after remapping."""
+        heard = self.create_subscription(
+            message_class(INTEGRITY.topic.type), declarations, self._on_integrity, 10, raw=True
+        )
+        self._sole = [heard.topic_name, *self._topics]
+        """Topics that must have one publisher."""
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not params["signing_key"]:
             self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
@@ -203,20 +203,15 @@ class AutopilotNode(CheckedNode):
             self._opened = self.link.opened
             self.vehicle.reopened()
             self.log.info(f"{self.link.url} is open")
-        if self.link.trouble != self._trouble:
-            self._trouble = self.link.trouble
-            if self._trouble:
-                self.log.info(f"{self.link.url} is not open: {self._trouble}")
+        if self.link.trouble not in ("", self._trouble):
+            self.log.info(f"{self.link.url} is not open: {self.link.trouble}")
+        self._trouble = self.link.trouble
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
-                self._publish(sample, self._time.ahead(now))
-
-    def _publish(self, sample: ImuSample, shift: int) -> None:
-        """Publish a sample; shift is to be added to its stamp to have the time of the system, ns."""
-        stamp = sample.stamp + shift
-        if sample.unit < len(self._outputs) and 0 <= stamp <= LAST_STAMP:
-            self._outputs[sample.unit].publish(self._messages[sample.unit].fill(stamp, sample))
+                stamp, unit = sample.stamp + self._time.ahead(now), sample.unit
+                if unit < len(self._outputs) and 0 <= stamp <= LAST_STAMP:
+                    self._outputs[unit].publish(self._messages[unit].fill(stamp, sample))
 
     # The monitor --------------------------------------------------------------------------------------------------
 
@@ -232,16 +227,18 @@ class AutopilotNode(CheckedNode):
             # Not the monitor's: it has no such level.
             return
         whole = next((line for line in lines if line.name == WHOLE), None)
-        if whole is not None:
-            self._send_values(whole, now)
+        if whole is not None and self._values and self.vehicle.in_reach and now - self._valued >= _VALUE_EVERY:
+            self._valued = now
+            for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
+                if not math.isnan(value := whole.number(key)):
+                    self.vehicle.send_value(name, value, now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
         topics = [line.value("topic").removesuffix(INJECTED) for line in lines if line.name.startswith(INPUT)]
         # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
         if self._failover is not None and topics:
             reporting = whole is not None and whole.level != Level.STALE
-            agrees = reporting and topics == [output.topic_name for output in self._outputs]
-            self._failover.reported = now if agrees else 0
+            self._failover.reported = now if reporting and topics == self._topics else 0
             self._failover.errors = {line.name: line.number("estimated error (rad/s)") for line in lines}
 
     def _on_integrity(self, data: bytes) -> None:
@@ -260,14 +257,6 @@ class AutopilotNode(CheckedNode):
         response.success, response.message = self._failover.restore(time.monotonic_ns())
         self.log.warning(f"~/restore: {response.message}")
         return response
-
-    def _send_values(self, whole: StatusLine, now: int) -> None:
-        if not self._values or not self.vehicle.in_reach or now - self._valued < _VALUE_EVERY:
-            return
-        self._valued = now
-        for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
-            if not math.isnan(value := whole.number(key)):
-                self.vehicle.send_value(name, value, now)
 
     # Reports ------------------------------------------------------------------------------------------------------
 
@@ -291,17 +280,15 @@ class ImuMessageBytes:
 
     def __init__(self, frame_id: str) -> None:
         template = ImuTemplate(frame_id)
-        self._data = bytearray(template.bytes.tobytes())
-        self._rate = template.at
-        self._acceleration = template.at + 8 * (3 + 9)
+        self._data, self._at = bytearray(template.bytes.tobytes()), template.at
         # The template says that there is no acceleration; unknown is a covariance of zeros (REP-145).
-        struct.pack_into("<d", self._data, self._acceleration + 8 * 3, 0.0)
+        struct.pack_into("<d", self._data, self._at + 8 * (3 + 9 + 3), 0.0)
 
     def fill(self, stamp: int, sample: ImuSample) -> bytes:
         """Return the message of a sample, stamped in ns."""
         struct.pack_into("<iI", self._data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
-        struct.pack_into("<3d", self._data, self._rate, *sample.rate)
-        struct.pack_into("<3d", self._data, self._acceleration, *sample.acceleration)
+        struct.pack_into("<3d", self._data, self._at, *sample.rate)
+        struct.pack_into("<3d", self._data, self._at + 8 * (3 + 9), *sample.acceleration)
         return bytes(self._data)
 
 
