@@ -141,7 +141,8 @@ def _write_found(arguments: Namespace, outputs: Outputs, found: SetupResult, con
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.pipeline import Pipeline
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
+    from fdi_ros.setup.findings import verdict_of
+    from fdi_ros.setup.report import setup_figures, setup_findings, setup_page, setup_text
 
     def write(path: Path) -> None:
         path.write_text(config, encoding="utf-8")
@@ -150,7 +151,8 @@ def _write_found(arguments: Namespace, outputs: Outputs, found: SetupResult, con
 
     said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
     text, figures = setup_text(found, *said) + more, setup_figures(found, str(arguments.bag))
-    return outputs.finish(text, figures, lambda: setup_page(found, *said), verdict(found).severity, output=write)
+    severity = verdict_of(setup_findings(found)).severity
+    return outputs.finish(text, figures, lambda: setup_page(found, *said), severity, output=write)
 
 
 SETUP = Verb(

@@ -14,7 +14,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -73,8 +72,10 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
 def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> None:
     """Refuse a unit that turns by another factor than most, such as deg/s, or about other axes."""
     units = [list(unit) for unit in nominal.units if len(unit) == 3 and spans_space(nominal.axes[list(unit)])]
+    if len(units) < 2:
+        return
     turning = np.array([np.linalg.norm(means[:, unit], axis=1) for unit in units])
-    moving = np.median(turning, axis=0) >= LEAST_ROTATION if len(units) > 1 else np.zeros(len(means), dtype=bool)
+    moving = np.median(turning, axis=0) >= LEAST_ROTATION
     if moving.sum() < LEAST_WINDOWS:
         return
     turning, means = np.maximum(turning[:, moving], 1e-9), means[moving]
@@ -86,35 +87,33 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
     # Of what is mounted nobody knows how, the axes say nothing.
     known = [not {*unit} & {*unknown} for unit in units]
-    pairs = itertools.product(range(len(units)), repeat=2)
-    turn = [not (known[k] and known[j]) or _in_common(rates[k], rates[j]) > SHARED for k, j in pairs]
-    agree = alike & np.reshape(turn, alike.shape)
+    turn = [
+        [not (known[k] and known[j]) or _in_common(one, other) > SHARED for j, other in enumerate(rates)]
+        for k, one in enumerate(rates)
+    ]
+    agree = alike & np.array(turn)
     most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-    if len(most) == len(units):
+    odd = next((k for k in range(len(units)) if k not in most), None)
+    if odd is None:
         return
     names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in units]
-    odd = next(k for k in range(len(units)) if k not in most)
-    others = " and ".join(names[k] for k in most)
-    mend = "or name its channels in excluded_channels"
-    if not alike[odd, most].all():
-        if 2 * len(most) > len(units):
-            words = f"{names[odd]} shows {np.median(ratio[odd, most]):.3g} times the rotation that {others} show"
-            raise DisagreementError(f"{words}: mend it {mend}")
+    name, others, mend = names[odd], " and ".join(names[k] for k in most), "or name its channels in excluded_channels"
+    if alike[odd, most].all():
+        doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
+        true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
+        shares = [_in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES]
+        words = f"{name} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])}, against {others}{doubt}: mend its driver"
+        words += f" or mount, {mend}"
+        if max(shares) < SAME:
+            words = f"{name} does not turn as {others} do ({max(*shares, 0.0):.0%} in common): its mount in the config"
+            words += f" is wrong, it is not on the same body, or its clock is off by seconds{doubt}"
+    elif 2 * len(most) > len(units):
+        words = f"{name} shows {np.median(ratio[odd, most]):.3g} times the rotation that {others} show: mend it {mend}"
+    else:
         low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
-        raise DisagreementError(
-            f"{' and '.join(names)} do not show one rotation, and nothing decides which is right:"
-            f" {names[high]} shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
-        )
-    doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
-    true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
-    shares = [_in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES]
-    if max(shares) < SAME:
-        raise DisagreementError(
-            f"{names[odd]} does not turn as {others} do ({max(*shares, 0.0):.0%} in common): its mount in the config is"
-            f" wrong, it is not on the same body, or its clock is off by seconds{doubt}"
-        )
-    wrong = _wrong_axes(SIGNED_AXES[int(np.argmax(shares))])
-    raise DisagreementError(f"{names[odd]} {wrong}, against {others}{doubt}: mend its driver or mount, {mend}")
+        words = f"{' and '.join(names)} do not show one rotation, and nothing decides which is right: {names[high]}"
+        words += f" shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
+    raise DisagreementError(words)
 
 
 _REVERSED = (
@@ -150,10 +149,9 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
     """
     square = moving.T @ moving / len(moving)
     for i, name in enumerate(nominal.channel_names):
-        found = _contradicted(square, nominal.axes, i)
-        if found is None:
+        if not (found := _contradictions(square, nominal.axes, i)):
             continue
-        response, seen = found
+        response, seen = np.median(found, axis=0).tolist()
         shows = f"{response:.0%} of" if abs(response) < 1 else f"{response:.3g} times"
         alike = [nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])]
         which = f", and nothing decides which of {', '.join(alike)} is right" if len(alike) > 1 else ""
@@ -163,30 +161,26 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
         )
 
 
-def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | None:
-    """Share of the rotation that channel i shows, and the rotation, rad/s rms, where all others contradict it.
+def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, float]]:
+    """Share of the rotation that channel i shows, and the rotation, rad/s rms, as every three others see it.
 
-    By mean products (n, n) of the channels, (rad/s)^2.
+    By mean products (n, n) of the channels, (rad/s)^2; empty: not all contradict it.
     """
     size, found = float(np.sqrt(square[i, i])), []
-    for chosen in itertools.combinations([j for j in range(len(axes)) if j != i], 3):
-        three = list(chosen)
+    for three in map(list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)):
         if not spans_space(axes[three]):
             continue
         gain = np.linalg.solve(axes[three].T, axes[i])
         seen = float(np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0)))
         if seen < LEAST_ROTATION:
-            return None
+            return []
         response = float(gain @ square[three, i]) / seen**2
         small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
         large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > FOLLOWS * size
         if not small and not large:
-            return None
+            return []
         found.append((response, seen))
-    if not found:
-        return None
-    response, seen = np.median(found, axis=0).tolist()
-    return response, seen
+    return found
 
 
 # How the units are turned against each other --------------------------------------------------------------------------
@@ -206,29 +200,22 @@ SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
 
-class Turn(NamedTuple):
-    """The rotation that takes the rates of one unit best into those of another."""
+def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
+    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976).
 
-    rotation: Array
-    """(3, 3): v_first = R v_unit."""
-    mirrored: Array
-    """(3, 3) the same of all mirrored frames."""
-    uncertainty: float
-    """Variance of the least certain direction, rad^2, over the mean square of what is left, (rad/s)^2; infinite: the
-    two never turn about two axes together."""
-
-
-def find_turn(first: Array, unit: Array) -> Turn:
-    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976)."""
+    Returns the rotation (3, 3) that takes its rates best into those of the first, v_first = R v_unit, and the same of
+    all mirrored frames; and the variance of the least certain direction, rad^2, over the mean square of what is left,
+    (rad/s)^2: infinite where the two never turn about two axes together.
+    """
     left, size, right = np.linalg.svd(first.T @ unit)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation, mirrored = (left * sign) @ right, (left * sign * [1.0, 1.0, -1.0]) @ right
     if size[1] <= ROUNDING * size[0]:
-        return Turn(rotation, mirrored, math.inf)
+        return rotation, mirrored, math.inf
     a, b, c = size * sign
     gram = (left * size**2) @ left.T
     spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / ((a + b) * (b + c) * (c + a))
-    return Turn(rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1]))
+    return rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1])
 
 
 def angle_of(rotation: Array) -> float:
@@ -257,13 +244,7 @@ class Mount:
 
 
 def find_mounts(data: Data) -> tuple[Mount, ...]:
-    """Find the mounts of units of three channels each.
-
-    Parameters
-    ----------
-    data
-        The recording, channels as measured, three by three.
-    """
+    """Find the mounts of units from a recording of their channels as measured, three by three."""
     means = data.slow_rates()
     # What is taken off must turn with the unit: means do, medians do not.
     means = means - means.mean(axis=0) if len(means) else means
@@ -278,14 +259,13 @@ def _against(first: Array, unit: Array) -> Mount:
     most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0))[:0:-1]
     if most < LEAST_RATE:
         return Mount(f"NOT KNOWN: it does not turn ({most:.2g} rad/s rms)")
-    power = max(float((first**2).sum()), 1e-30)
-    found = find_turn(first, unit)
-    if math.isinf(found.uncertainty):
+    rotation, mirrored, uncertainty = find_turn(first, unit)
+    if math.isinf(uncertainty):
         return Mount("NOT KNOWN: it and the first unit never turn about two axes together")
-    residual = first - unit @ found.rotation.T
-    missed = float((residual**2).sum()) / power
-    shared, error = 1.0 - missed, math.sqrt(float(np.mean(residual**2)) * found.uncertainty)
-    if shared < SAME < 1.0 - float(((first - unit @ found.mirrored.T) ** 2).sum()) / power:
+    power, square = max(float((first**2).sum()), 1e-30), (first - unit @ rotation.T) ** 2
+    missed = float(square.sum()) / power
+    shared, error = 1.0 - missed, math.sqrt(float(np.mean(square)) * uncertainty)
+    if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
         return Mount("NOT KNOWN: mirrored against the first unit", shared, contradicts=True, mirrored=True)
     if shared < LEAST_SHARED:
         words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
@@ -296,11 +276,11 @@ def _against(first: Array, unit: Array) -> Mount:
     # Vibration that units see differently looks like a turn between them, however long it lasts.
     doubt = math.sqrt(missed) * min(1.0, math.sqrt(missed) / UNEQUAL)
     # Of all signed axes, a mirrored one is never the nearest.
-    nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - found.rotation)))
-    off = angle_of(nearest.T @ found.rotation)
+    nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
+    off = angle_of(nearest.T @ rotation)
     if off > max(SQUARE, SHOWN * doubt):
-        words = f"turned by {np.degrees(angle_of(found.rotation)):.1f} +- {np.degrees(error):.1f} deg"
-        return Mount(words, shared, np.round(found.rotation, 6), 0.0, error)
+        words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
+        return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)
     along = ", ".join(f"{body} is its {axis}" for body, axis in zip("xyz", _axes_of(nearest), strict=True))
     turn = "as the first" if (nearest == np.eye(3)).all() else f"turned: body {along}"

@@ -9,6 +9,7 @@ findings of ``fdi inspect``, and the refusals that inspection, set-up, calibrati
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
@@ -23,10 +24,9 @@ from fdi_ros.errors import BagError
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
-from fdi_ros.model.samples import Array
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
-from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.report.layout import RADIANS, Unit, first_of
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.agreement import LEAST_ROTATION
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
@@ -142,11 +142,9 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str:
     """Say which units are stamped by clocks so many s and more from the first one's; empty: none is."""
     first = next((report for report in reports if math.isfinite(report.ahead)), None)
-    if first is None:
-        return ""
-    off = [(report.topic.name, report.ahead - first.ahead) for report in reports]
-    words = [f"{shown(name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
-    if not words:
+    off = [] if first is None else [(shown(report.topic.name), report.ahead - first.ahead) for report in reports]
+    words = [f"{name} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
+    if first is None or not words:
         return ""
     return (
         f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
@@ -154,45 +152,38 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str
     )
 
 
-def missing(reports: Sequence[TopicReport]) -> str:
-    """Say what a recording lacks of which no config can be made, and what is wrong with each topic that could do."""
-    why = [
-        f"{shown(report.topic.name)}: {words}"
-        for report in reports
-        if report.kind is not None and (words := _unusable(report))
-    ]
-    more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
-    good = [shown(report.topic.name) for report in reports if not _unusable(report)]
-    usable = [f"usable: only {', '.join(good)}"] if good else []
-    return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
-
-
 def _unusable(report: TopicReport) -> str:
     """Say why a topic cannot be used for gyros; empty: it can."""
+    kind, received = report.kind, report.received
+    if kind is None:
+        return "its type carries no gyros"
     # The first that holds is the reason.
-    few = not report.channels and report.kind is not None and not report.kind.stamped
     reasons = {
-        "its type carries no gyros": report.kind is None,
-        "no messages": not report.received,
+        "no messages": not received,
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
         "no name that ROS allows": not is_plain_name(report.topic.name),
-        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": few,
-        f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
-        == report.received,
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels and not kind.stamped,
+        f"all {received} messages are malformed, or have stamps before 1970": report.malformed == received,
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
-        "a single message": report.received == 1,
+        "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
-        f"it gives the values of {shown(report.copy_of)}: one sensor on two topics is no redundancy": bool(
-            report.copy_of
-        ),
+        f"it {_copied(report)}: {_NO_REDUNDANCY}": bool(report.copy_of),
     }
     return next((words for words, holds in reasons.items() if holds), "")
 
 
 def needs(reports: Sequence[TopicReport]) -> str:
-    """Say what a recording needs before a config can be made of it; empty: nothing."""
-    chosen = candidates(reports)
-    return in_degrees(chosen) if chosen else missing(reports)
+    """Say what a recording needs before a config can be made of it; empty: nothing.
+
+    That is gyros in rad/s, or else what is wrong with each topic that could do.
+    """
+    if chosen := candidates(reports):
+        return in_degrees(chosen)
+    why = {shown(report.topic.name): _unusable(report) for report in reports if report.kind is not None}
+    good = [name for name, words in why.items() if not words]
+    bad = [f"{name}: {words}" for name, words in why.items() if words]
+    usable = [f"usable: only {', '.join(good)}"] if good else []
+    return "; ".join([NEEDED, *usable, *([first_of(bad, _NAMED, "; ", "; and")] if bad else [])])
 
 
 def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Iterator[Finding]:
@@ -216,17 +207,13 @@ def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: 
     if copies := copy_words(reports):
         words = f"{copies}; the copy is left out"
         yield Finding(Role.WARNING, "copy", words, headline="NEEDS A LOOK")
-    names: list[str] = []
-    units: list[list[int]] = []
-    for one in chosen:
-        assert one.kind is not None
-        places = list(range(len(names), len(names) + one.channels))
-        units += [places] if len(chosen) > 1 else [[i] for i in places]
-        names += [f"{shown(one.topic.name)} {place}" for place in one.kind.value_names(one.channels)]
-    words = f"{len(names)} channels in {f'{len(chosen)} units' if len(chosen) > 1 else 'one array'}"
+    units = len(chosen) > 1
+    names = [f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places]
+    groups = np.split(np.arange(len(names)), np.cumsum([one.channels for one in chosen])[:-1] if units else len(names))
+    words = f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
     words += f" at {max(one.rate for one in chosen):.3g} Hz"
     noise = np.concatenate([one.segments.moving_noise() for one in chosen])
-    if noisy := noisier_words(names, noise, units, unit.name, unit.factor):
+    if noisy := noisier_words(names, noise, [group.tolist() for group in groups], unit.name, unit.factor):
         yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)
@@ -242,8 +229,15 @@ def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Itera
 
 def copy_words(reports: Sequence[TopicReport]) -> str:
     """Say which topics give the values of others; empty: none does."""
-    copies = [f"{shown(one.topic.name)} gives the values of {shown(one.copy_of)}" for one in reports if one.copy_of]
-    return f"{' and '.join(copies)}: one sensor on two topics is no redundancy" if copies else ""
+    copies = [f"{shown(one.topic.name)} {_copied(one)}" for one in reports if one.copy_of]
+    return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""
+
+
+_NO_REDUNDANCY = "one sensor on two topics is no redundancy"
+
+
+def _copied(report: TopicReport) -> str:
+    return f"gives the values of {shown(report.copy_of)}"
 
 
 # Degrees a second -----------------------------------------------------------------------------------------------------
@@ -264,53 +258,35 @@ STILL, NOISIEST = 0.3, 0.02
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
-    """Say which topics are in deg/s, and what shows it; empty: nothing does.
+    """Say which topics, of one body, are in deg/s, and what shows it; empty: nothing does.
 
-    Parameters
-    ----------
-    chosen
-        Topics of one body.
-    largest_rate
-        The range that gyros may have, rad/s.
+    Gyros in rad/s have a range of `largest_rate`.
     """
     chosen = [one for one in chosen if one.complete]
-    rates = [_rate_quantiles(one) for one in chosen]
-    for k, fast in enumerate(rates):
-        for j, slow in enumerate(rates):
-            moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
-            factors = fast[moving] / slow[moving]
-            if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
-                factor = float(np.median(factors))
-                fast_name, slow_name = shown(chosen[k].topic.name), shown(chosen[j].topic.name)
-                return f"rad/s: {fast_name} is in deg/s, it shows {factor:.3g} times the rotation of {slow_name}"
-    names = " and ".join(shown(one.topic.name) for one in chosen)
-    verb = "is" if len(chosen) == 1 else "are"
+    # The size of the rate: a bias is no rotation.
+    apart = [one.segments.means - np.median(one.segments.means, axis=0) for one in chosen]
+    rates = [np.quantile(np.linalg.norm(each, axis=1), QUANTILES) for each in apart]
+    for (fast_one, fast), (slow_one, slow) in itertools.product(zip(chosen, rates, strict=True), repeat=2):
+        moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
+        factors = fast[moving] / slow[moving]
+        if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
+            times = f"{float(np.median(factors)):.3g} times the rotation of {shown(slow_one.topic.name)}"
+            return f"rad/s: {shown(fast_one.topic.name)} is in deg/s, it shows {times}"
     if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
         largest = max(one.largest for one in chosen)
-        return (
-            f"rad/s: {names} {verb} in deg/s, {largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
-        )
-    if chosen and all(map(_no_gyro_at_rest, chosen)):
+        why = f"{largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
+    elif chosen and all(map(_no_gyro_at_rest, chosen)):
         noise = max(float(one.segments.quiet_noise().max()) for one in chosen)
-        return f"rad/s: {names} {verb} in deg/s, no gyro at rest has a bias and noise of {noise:.2g} rad/s"
-    return ""
-
-
-def _block_means(report: TopicReport) -> Array:
-    """Means of blocks (B, c), rad/s."""
-    segments = report.segments.all_segments()
-    return np.concatenate([one.means for one in segments]) if segments else np.zeros((1, report.channels))
-
-
-def _rate_quantiles(report: TopicReport) -> Array:
-    """Quantiles of the size of the rate; a bias is no rotation."""
-    means = _block_means(report)
-    return np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), QUANTILES)
+        why = f"no gyro at rest has a bias and noise of {noise:.2g} rad/s"
+    else:
+        return ""
+    names = " and ".join(shown(one.topic.name) for one in chosen)
+    return f"rad/s: {names} {'is' if len(chosen) == 1 else 'are'} in deg/s, {why}"
 
 
 def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     """Whether rates, less than a shock or damage makes, are beyond the range of gyros for long."""
-    largest = np.abs(_block_means(report)).max(axis=1)
+    largest = np.abs(report.segments.means).max(axis=1)
     beyond = largest > largest_rate
     lasting = beyond & (largest < FAST_RANGE * DEGREES * largest_rate)
     seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())

@@ -15,7 +15,7 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.core.copies import copies_among
-from fdi_ros.model.samples import Array, Bytes, Int
+from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
 from fdi_ros.setup.noise import NoiseSegments
@@ -61,21 +61,23 @@ class TopicReport:
     """Values in a message, of what could be gyros; else 0."""
     announced: int = 0
     """Values that a message says it has: whatever its bytes claim."""
-    not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(c,) values that are NaN or infinite."""
-    beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(c,) finite values beyond all rates."""
-    repeats: Repeats = field(default_factory=lambda: Repeats(0))
-    """Of what could be gyros: values that stay exactly the same for long."""
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
-    segments: NoiseSegments = field(default_factory=lambda: NoiseSegments(0))
-    """Of messages in which every value can be a rate."""
-    recent: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """(K, c) values of the last messages, at most `RECENT`."""
     copy_of: str = ""
     """Topic of the same sensor: its values are the same to rounding, turned, scaled or some messages apart."""
+
+    def __post_init__(self) -> None:
+        self.expect(0)
+
+    def expect(self, channels: int) -> None:
+        """Take messages of so many values for gyros."""
+        self.channels, self.segments, self.repeats = channels, NoiseSegments(channels), Repeats(channels)
+        """Of messages in which every value can be a rate; values that stay exactly the same for long."""
+        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)
+        """(c,) values that are NaN or infinite, and finite ones beyond all rates."""
+        self.recent = np.zeros((0, channels))
+        """(K, c) values of the last messages, at most `RECENT`."""
 
     @property
     def rate(self) -> float:
@@ -86,6 +88,11 @@ class TopicReport:
     def repeated(self) -> Int:
         """Values (c,) in long runs of exactly one value."""
         return self.repeats.count
+
+    @property
+    def places(self) -> list[str]:
+        """Names of the values in a message."""
+        return list(self.kind.value_names(self.channels)) if self.kind is not None else []
 
     @property
     def could_be_gyros(self) -> bool:
@@ -104,18 +111,9 @@ class TopicReport:
 
 
 def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], tuple[str, ...]]:
-    """Read a recording through.
+    """Read a recording through: all topics, or those of these names, with or without the first slash.
 
-    Parameters
-    ----------
-    path
-        Of the recording.
-    topics
-        Names of those to be looked at, with or without the first slash; none: all.
-
-    Returns
-    -------
-    What was seen of each topic, and what of the recording is damaged.
+    Returns what was seen of each topic, and what of the recording is damaged.
 
     Raises
     ------
@@ -144,8 +142,7 @@ def _update_copies(reports: Sequence[TopicReport]) -> None:
 
 
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
-    times = batch.log_time[rows]
-    before = [report.last] if report.received else []
+    times, before = batch.log_time[rows], [report.last] if report.received else []
     steps = np.diff(np.concatenate([before, times])) * 1e-9
     report.first = report.first if report.received else int(times[0])
     report.last = int(times[-1])
@@ -156,30 +153,23 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
         report.longest = max(report.longest, float(steps.max()))
         if report.received - len(rows) < _INTERVALS:
             report.intervals.append(steps)
-    if report.kind is not None and report.topic.encoding == "cdr":
-        _update_values(report, report.kind, batch.buffer, batch.offset[rows], batch.length[rows], times)
-
-
-def _update_values(
-    report: TopicReport, kind: type[Source], buffer: Bytes, offset: Int, length: Int, times: Int
-) -> None:
-    """Decode what could be angular rates."""
-    if not report.channels:
-        report.announced = kind.announced(buffer, offset, length)
-        report.channels = report.announced if report.announced in kind.value_counts else 0
-        report.segments, report.repeats = NoiseSegments(report.channels), Repeats(report.channels)
-        report.recent = np.zeros((0, report.channels))
-        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
-    if not report.channels:
+    kind, messages = report.kind, (batch.buffer, batch.offset[rows], batch.length[rows])
+    if kind is None or report.topic.encoding != "cdr":
         return
-    decoded = kind.decode(buffer, offset, length, report.channels)
+    # What could be angular rates.
+    if not report.channels:
+        report.announced = kind.announced(*messages)
+        if report.announced not in kind.value_counts:
+            return
+        report.expect(report.announced)
+    decoded = kind.decode(*messages, report.channels)
     good = decoded.good
     report.malformed += int((~good).sum())
-    stamp, values = decoded.stamp[good], decoded.values[good]
+    stamp, values, times = decoded.stamp[good], decoded.values[good], times[good]
     if kind.stamped:
         report.backward += int((np.diff(stamp) <= 0).sum())
         if math.isnan(report.ahead) and len(stamp):
-            report.ahead = float(np.median((stamp - times[good]) * 1e-9))
+            report.ahead = float(np.median((stamp - times) * 1e-9))
     with np.errstate(invalid="ignore"):
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
     report.repeats.add(values, report.interval)
@@ -187,9 +177,9 @@ def _update_values(
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():
         report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
-    report.recent = values[-RECENT:] if len(values) >= RECENT else np.vstack([report.recent, values])[-RECENT:]
+    report.recent = np.vstack([report.recent, values])[-RECENT:]
     whole = believed.all(axis=1)
-    report.segments.add(values[whole], times[good][whole], report.rate)
+    report.segments.add(values[whole], times[whole], report.rate)
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
@@ -293,11 +283,10 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
 
 def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """Say what is wrong with the values of a topic, by their places in the message."""
-    places = report.kind.value_names(report.channels) if report.kind is not None else []
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words = []
     for why, counts in (("not finite", report.not_finite), (beyond, report.beyond), ("frozen", report.repeated)):
-        counted = zip(places, counts.tolist(), strict=True)
+        counted = zip(report.places, counts.tolist(), strict=True)
         words += [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"] if counts.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []

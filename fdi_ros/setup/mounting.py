@@ -54,30 +54,25 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
     than two samples. White noise averages out in time. What scale and timing errors make of a turn does not while the
     turn lasts: they stay the same from sample to sample and add to the variance of the mean.
     """
-    limits, white = config.integrity, noise.noise_std**2
-    lasting = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
-    conditions = {
-        "at rest": (white, 0.0 * white),
-        f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2": (white, lasting),
-        f"in vibration, noise {VIBRATION:g} times": (VIBRATION**2 * white, 0.0 * white),
-    }
-    return {
-        condition: np.array([_found_within(config, geometry, wait, *variances) for wait in WAITS])
-        for condition, variances in conditions.items()
-    }
+    limits, white, V = config.integrity, noise.noise_std**2, geometry.parity
+    turning = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
 
+    def found_within(wait: float, white: Array, lasting: Array | float) -> Array:
+        samples = wait * config.sample_rate
+        if samples < LEAST_SAMPLES:
+            return np.full(geometry.n, np.nan)
+        inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
+        gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
+        shift = smallest_shift(samples, 1 / alarm_probability(config))
+        with np.errstate(divide="ignore"):
+            return np.where(geometry.detectable, shift / gain, np.inf)
 
-def _found_within(config: Config, geometry: Geometry, wait: float, white: Array, lasting: Array) -> Array:
-    """Error (n,) rad/s of each channel that is found within a time, s, on average."""
-    samples = wait * config.sample_rate
-    if samples < LEAST_SAMPLES:
-        return np.full(geometry.n, np.nan)
-    V = geometry.parity
-    inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
-    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
-    shift = smallest_shift(samples, 1 / alarm_probability(config))
-    with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, shift / gain, np.inf)
+    conditions: dict[str, tuple[Array, Array | float]] = {
+        "at rest": (white, 0.0),
+        f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2": (white, turning),
+        f"in vibration, noise {VIBRATION:g} times": (VIBRATION**2 * white, 0.0),
+    }
+    return {name: np.array([found_within(wait, *each) for wait in WAITS]) for name, each in conditions.items()}
 
 
 def smallest_shift(samples: float, run_length: float) -> float:
@@ -139,19 +134,18 @@ class Mounting:
     losses: tuple[Loss, ...]
     """Of nothing, of each channel in turn, of each pair."""
 
-    def pairs(self, above: float, up_to: float = math.inf) -> list[tuple[int, int]]:
+    def pairs(self, above: float, up_to: float = math.inf) -> list[list[int]]:
         """Pairs of channels whose |rho| is above the one and not above the other."""
         rho = np.abs(self.geometry.rho)
-        found = np.argwhere(np.triu((rho > above) & (rho <= up_to), 1))
-        return [(int(i), int(j)) for i, j in found]
+        return np.argwhere(np.triu((rho > above) & (rho <= up_to), 1)).tolist()
 
     @property
-    def alike(self) -> list[tuple[int, int]]:
+    def alike(self) -> list[list[int]]:
         """Pairs of channels that cannot be told apart."""
         return self.pairs(SAME_DIRECTION)
 
     @property
-    def similar(self) -> list[tuple[int, int]]:
+    def similar(self) -> list[list[int]]:
         """Pairs that can be told apart with effort."""
         return self.pairs(ALIKE, SAME_DIRECTION)
 
@@ -187,19 +181,14 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     axes = geometry.axes[kept]
     if np.linalg.matrix_rank(axes, tol=1e-2) < 3:
         return Loss(lost)
-    unit = np.linalg.inv(axes.T @ axes)
-    weighted = np.linalg.inv((axes.T / noise.noise_std[kept] ** 2) @ axes)
-    detectable: tuple[int, ...] = ()
-    isolable: tuple[int, ...] = ()
+    gdop = float(np.sqrt(np.trace(np.linalg.inv(axes.T @ axes))))
+    std = np.sqrt(np.diag(np.linalg.inv((axes.T / noise.noise_std[kept] ** 2) @ axes)))
     try:
-        rest = geometry.subset(kept)
-        numbers = np.flatnonzero(kept)
-        detectable = tuple(numbers[rest.detectable].tolist())
-        isolable = tuple(numbers[rest.isolable].tolist())
+        rest, numbers = geometry.subset(kept), np.flatnonzero(kept)
     except GeometryError:
         # Three channels still give a rate; nothing checks it.
-        pass
-    return Loss(lost, float(np.sqrt(np.trace(unit))), np.sqrt(np.diag(weighted)), detectable, isolable)
+        return Loss(lost, gdop, std)
+    return Loss(lost, gdop, std, tuple(numbers[rest.detectable].tolist()), tuple(numbers[rest.isolable].tolist()))
 
 
 RHO_TITLE = "|rho| of the normalised residuals: 1 cannot be told apart"
@@ -230,21 +219,23 @@ def _size(value: float) -> str:
 def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[Column]:
     """Figures of losses."""
     names = result.geometry.channel_names
+    lost, seen, isolated = (
+        [[names[i] for i in numbers] for numbers in each]
+        for each in zip(*((one.lost, one.detectable, one.isolable) for one in losses), strict=True)
+    )
 
-    def named(numbers: Sequence[int]) -> list[str]:
-        return [names[i] for i in numbers]
-
-    def words(loss: Loss, numbers: Sequence[int]) -> str:
-        return "all" if len(numbers) == len(names) - len(loss.lost) else _or_none(named(numbers))
+    def words(found: list[list[str]]) -> list[str]:
+        left = [len(names) - len(one.lost) for one in losses]
+        return ["all" if len(one) == most else _or_none(one) for one, most in zip(found, left, strict=True)]
 
     return [
-        Column("lost", [named(one.lost) for one in losses], ("lost",), _or_none),
+        Column("lost", lost, ("lost",), _or_none),
         Column("gdop", [one.gdop for one in losses], ("GDOP",), lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate"),
         Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), lambda v: number(v, ".5f"), unit.factor),
-        Column("detectable", [named(one.detectable) for one in losses]),
-        Column("isolable", [named(one.isolable) for one in losses]),
-        Column("", [words(one, one.detectable) for one in losses], ("still seen",)),
-        Column("", [words(one, one.isolable) for one in losses], ("still isolated",)),
+        Column("detectable", seen),
+        Column("isolable", isolated),
+        Column("", words(seen), ("still seen",)),
+        Column("", words(isolated), ("still isolated",)),
     ]
 
 
@@ -273,39 +264,32 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
 
 def pair_lines(result: Mounting) -> list[str]:
     """Describe pairs of channels that look alike."""
-    g = result.geometry
-    lines = []
+    g, names, lines = result.geometry, result.geometry.channel_names, []
     for i, j in result.alike:
-        a, b = g.channel_names[i], g.channel_names[j]
         cosine = float(g.axes[i] @ g.axes[j] / np.linalg.norm(g.axes[i]) / np.linalg.norm(g.axes[j]))
-        why = (
-            f"{a} and {b} measure the same axis"
-            if abs(cosine) > SAME_DIRECTION
-            else f"faults of {a} and {b} look the same"
-        )
+        why = f"faults of {names[i]} and {names[j]} look the same"
+        if abs(cosine) > SAME_DIRECTION:
+            why = f"{names[i]} and {names[j]} measure the same axis"
         lines.append(f"{why}: a fault in either is seen, which one is not")
-    lines += [
-        f"{g.channel_names[i]} and {g.channel_names[j]} are hard to tell apart (|rho| {abs(g.rho[i, j]):.3f})"
-        for i, j in result.similar
-    ]
+    hard = "{} and {} are hard to tell apart (|rho| {:.3f})"
+    lines += [hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar]
     blind = np.flatnonzero(~g.detectable).tolist()
-    lines += [f"a fault of {g.channel_names[i]} is never seen: no other channel checks it" for i in blind]
+    lines += [f"a fault of {names[i]} is never seen: no other channel checks it" for i in blind]
     return lines or ["every single fault is seen and can be told from all others"]
 
 
 def _double_words(result: Mounting) -> str:
     """Summary of the losses of two channels."""
     double, names = result.lost(2), result.geometry.channel_names
-    spanning = [loss for loss in double if np.isfinite(loss.gdop)]
+    spanning = sorted((loss for loss in double if np.isfinite(loss.gdop)), key=lambda loss: loss.gdop)
     words = f"two lost: {len(spanning)} of {len(double)} pairs leave a rate"
     if not spanning:
         return words
-    worst = max(spanning, key=lambda loss: loss.gdop)
+    best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
     seen, named = sum(bool(loss.detectable) for loss in spanning), sum(bool(loss.isolable) for loss in spanning)
     return (
-        f"{words}, GDOP {min(loss.gdop for loss in spanning):.3f} to {worst.gdop:.3f} (worst without"
-        f" {' and '.join(names[i] for i in worst.lost)}); of these, {seen} still see a third fault in some channel and"
-        f" {named} can isolate it in some"
+        f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
+        f" of these, {seen} still see a third fault in some channel and {named} can isolate it in some"
     )
 
 
@@ -342,36 +326,31 @@ def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
         look = {"x": list(WAITS), "name": condition, "line": {"color": colour_of(k)}}
         data.append({"type": "band", **look, "low": low, "high": high, "showlegend": False})
         data.append({"type": "scatter", "mode": "lines+markers", **look, "y": high})
-    axes = {"xaxis": "time waited, s", "yaxis": f"smallest error, {unit.name}"}
-    return {
-        "data": data,
-        "layout": {"height": 320, **{name: {"type": "log", "title": {"text": words}} for name, words in axes.items()}},
-    }
+    titles = {"xaxis": "time waited, s", "yaxis": f"smallest error, {unit.name}"}
+    axes = {name: {"type": "log", "title": {"text": words}} for name, words in titles.items()}
+    return {"data": data, "layout": {"height": 320, **axes}}
 
 
 def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     """Lay out everything."""
-    g = result.geometry
+    g, names = result.geometry, result.geometry.channel_names
     covariance = g.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
-    rho: Rows = (
-        ("", *g.channel_names),
-        [(n, *(f"{abs(v):.3f}" for v in r)) for n, r in zip(g.channel_names, g.rho, strict=True)],
-    )
+    rho = np.abs(g.rho)
+    heat = {"type": "heatmap", "z": np.round(rho, 4).tolist(), "x": list(names), "y": list(names), "zmin": 0, "zmax": 1}
+    drawn_rho = {"data": [heat], "layout": {"title": RHO_TITLE}}
+    losses = told(_losses(result, result.lost(0, 1), unit), unit)
     return [
         *fault_sections(result, unit),
-        Section(
-            "Covariance of the rate",
-            f"({unit.name})^2, at rest.",
-            (("", *"xyz"), [(axis, *(f"{v:.3e}" for v in row)) for axis, row in zip("xyz", covariance, strict=True)]),
-        ),
-        Section("Look-alikes", RHO_TITLE, rho, [_rho_figure(result)]),
-        Section(
-            "After each possible first fault",
-            _double_words(result),
-            told(_losses(result, result.lost(0, 1), unit), unit),
-        ),
+        Section("Covariance of the rate", f"({unit.name})^2, at rest.", _matrix("xyz", covariance, ".3e")),
+        Section("Look-alikes", RHO_TITLE, _matrix(names, rho, ".3f"), [drawn_rho]),
+        Section("After each possible first fault", _double_words(result), losses),
     ]
+
+
+def _matrix(names: Sequence[str], values: Array, form: str) -> Rows:
+    rows = zip(names, values, strict=True)
+    return ("", *names), [(name, *(f"{value:{form}}" for value in row)) for name, row in rows]
 
 
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
@@ -384,31 +363,19 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
 
 def mounting_page(result: Mounting, title: str, unit: Unit = RADIANS) -> str:
     """Return everything, and the axes in space, as a page."""
-    turned = "In the body frame; drag, or press the arrow keys, to turn."
-    sections = [
-        Section("Axes", turned, "", [_axes_figure(result)]),
-        *mounting_sections(result, unit),
-        Section("After two", "", told(_losses(result, result.lost(2), unit), unit)),
-    ]
-    return page(f"fdi_ros: mounting of {title}", summary_lines(result, unit), sections)
 
-
-def _axes_figure(result: Mounting) -> dict[str, object]:
     def arrow(end: Array, text: str, line: dict[str, str], **named: str) -> dict[str, object]:
         x, y, z = ([0, round(float(v), 4)] for v in end)
         return {"type": "scatter3d", **named, "x": x, "y": y, "z": z, "text": ["", text], "line": line}
 
     g = result.geometry
-    body = [arrow(1.2 * end, f"body {axis}", {"dash": "dash"}) for end, axis in zip(np.eye(3), "xyz", strict=True)]
-    axes = [
-        arrow(g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name)
-        for i, name in enumerate(g.channel_names)
+    arrows = [arrow(1.2 * end, f"body {axis}", {"dash": "dash"}) for end, axis in zip(np.eye(3), "xyz", strict=True)]
+    for i, name in enumerate(g.channel_names):
+        arrows.append(arrow(g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name))
+    turned = "In the body frame; drag, or press the arrow keys, to turn."
+    sections = [
+        Section("Axes", turned, "", [{"data": arrows, "layout": {"height": 560}}]),
+        *mounting_sections(result, unit),
+        Section("After two", "", told(_losses(result, result.lost(2), unit), unit)),
     ]
-    return {"data": body + axes, "layout": {"height": 560}}
-
-
-def _rho_figure(result: Mounting) -> dict[str, object]:
-    names = list(result.geometry.channel_names)
-    z = np.round(np.abs(result.geometry.rho), 4).tolist()
-    heat = {"type": "heatmap", "z": z, "x": names, "y": names, "zmin": 0, "zmax": 1}
-    return {"data": [heat], "layout": {"title": RHO_TITLE}}
+    return page(f"fdi_ros: mounting of {title}", summary_lines(result, unit), sections)

@@ -12,7 +12,8 @@ itself is the lower envelope: the segments or windows that are about as quiet as
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,7 @@ MOST = 4096
 """Segments that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 
 
-@dataclass(frozen=True)
-class NoiseSegment:
+class NoiseSegment(NamedTuple):
     """Values of a segment."""
 
     first: int
@@ -55,62 +55,55 @@ class NoiseSegment:
     """(c,) the same of the blocks, that which is slower included where it is no more than `SLOWER` times as large."""
 
 
-@dataclass
 class NoiseSegments:
-    """Segments of a recording, as they come."""
+    """Segments of a recording, as its values of so many channels come."""
 
-    channels: int
-    """c."""
-    kept: list[NoiseSegment] = field(default_factory=list)
-    every: int = 1
-    """Of so many segments one is kept."""
-    passed: int = 0
-    """Segments so far."""
-    waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
-    """(K, c) values that do not make a segment yet."""
-    since: int = 0
-    """Time of the first of them, ns."""
+    def __init__(self, channels: int) -> None:
+        self.channels, self.every = channels, 1
+        """Of so many segments one is kept."""
+        self._kept: list[NoiseSegment] = []
+        self._passed = 0
+        # Values (K, c) that do not make a segment yet, and their times, ns.
+        self._waiting, self._times = np.empty((0, channels)), np.empty(0, dtype=np.int64)
 
     def add(self, values: Array, times: Int, rate: float) -> None:
         """Take in values (K, c) rad/s of a rate, Hz (0: not known yet), all finite, at times (K,) ns."""
-        if not len(values):
-            return
-        if len(self.waiting):
-            values = np.vstack([self.waiting, values])
-            times = np.concatenate([np.full(len(self.waiting), self.since), times])
+        values, times = np.vstack([self._waiting, values]), np.concatenate([self._times, times])
         size = REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1) if rate else len(values) + 1
         full = len(values) // size * size
         for k in range(0, full, size):
-            if self.passed % self.every == 0:
-                self.kept.append(_segment(values[k : k + size], int(times[k])))
-            self.passed += 1
-            if len(self.kept) > MOST:
-                self.kept, self.every = self.kept[::2], 2 * self.every
-        self.waiting = values[full:]
-        self.since = int(times[full]) if full < len(times) else 0
+            if self._passed % self.every == 0:
+                self._kept.append(_segment(values[k : k + size], int(times[k])))
+            self._passed += 1
+            if len(self._kept) > MOST:
+                self._kept, self.every = self._kept[::2], 2 * self.every
+        self._waiting, self._times = values[full:], times[full:]
 
     @property
     def empty(self) -> bool:
         """Whether there is not a single value."""
-        return not self.kept and not len(self.waiting)
+        return not self._kept and not len(self._waiting)
 
     def all_segments(self) -> list[NoiseSegment]:
         """Segments, with the values at the end if there is no other."""
-        whole = len(self.waiting) // REST_BLOCKS * REST_BLOCKS
-        return self.kept or ([_segment(self.waiting[:whole], self.since)] if whole else [])
+        whole = len(self._waiting) // REST_BLOCKS * REST_BLOCKS
+        return self._kept or ([_segment(self._waiting[:whole], int(self._times[0]))] if whole else [])
+
+    @property
+    def means(self) -> Array:
+        """Means of blocks (B, c), rad/s."""
+        return np.concatenate([one.means for one in self.all_segments()] or [np.zeros((1, self.channels))])
 
     def _quietest(self) -> tuple[Array, Array]:
         """Noise (c,) of a sample and of a block when quietest, rad/s.
 
         The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
         """
-        segments = self.all_segments()
-        noise, block = np.array([one.noise for one in segments]), np.array([one.block_noise for one in segments])
+        noise, block = (np.array(values) for values in list(zip(*self.all_segments(), strict=True))[-2:])
         # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
-        for values in (noise, block):
-            for column in values.T:
-                if column.any():
-                    column[column == 0.0] = np.median(column[column > 0.0])
+        for column in (*noise.T, *block.T):
+            if column.any():
+                column[column == 0.0] = np.median(column[column > 0.0])
         quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
         for _ in range(ROUNDS):
             alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
@@ -140,10 +133,10 @@ class NoiseSegments:
 
     def moving_noise(self) -> Array:
         """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
-        noise = [one.noise for one, rest in zip(self.all_segments(), self.at_rest(), strict=True) if not rest]
-        if not noise:
+        noise = np.array([one.noise for one, rest in zip(self.all_segments(), self.at_rest(), strict=True) if not rest])
+        if not len(noise):
             return np.full(self.channels, np.nan)
-        return np.array([np.median(column[column > 0.0]) if column.any() else 0.0 for column in np.array(noise).T])
+        return np.array([np.median(column[column > 0.0]) if column.any() else 0.0 for column in noise.T])
 
     def moving_share(self) -> float:
         """Share of the recording in motion."""
@@ -153,18 +146,15 @@ class NoiseSegments:
 
 def _segment(values: Array, first: int) -> NoiseSegment:
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
-    least = _noise(means)
-    return NoiseSegment(
-        first, means, values.std(axis=0), _noise(values), np.clip(means.std(axis=0), least, SLOWER * least)
-    )
+    least, std = _noise(means), values.std(axis=0)
+    return NoiseSegment(first, means, std, _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
 
 
 def _noise(values: Array) -> Array:
     inside = len(SMOOTH) // 2
     smooth = np.column_stack([np.convolve(column, SMOOTH, mode="valid") for column in values.T])
-    residual = values[inside:-inside] - smooth
     # Of white noise the parabola takes its share with it.
-    noise = np.sqrt(np.mean(residual**2, axis=0) / (1.0 - SMOOTH[inside]))
+    noise = np.sqrt(np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside]))
     return np.where(noise > LEAST_NOISE, noise, 0.0)
 
 
@@ -240,14 +230,13 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     Of covariances (W, n, n) of the values in each window, (rad/s)^2; of channels that are not there it says nothing.
     """
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
+    near, beside = np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))), np.pad(there, ((MEMORY, MEMORY), (0, 0)))
     total, weight = np.zeros_like(filled), np.zeros(len(filled))
-    for shift in range(-MEMORY, MEMORY + 1):
-        rows_here = slice(max(shift, 0), len(filled) + min(shift, 0))
-        rows_there = slice(max(-shift, 0), len(filled) + min(-shift, 0))
+    for shift in reversed(range(2 * MEMORY + 1)):
         # The mean of covariances of other channels would be none.
-        same = (there[rows_here] == there[rows_there]).all(axis=1)
-        total[rows_here] += np.where(same[:, None, None], filled[rows_there], 0.0)
-        weight[rows_here] += same
+        same = (there == beside[shift : shift + len(there)]).all(axis=1)
+        total += np.where(same[:, None, None], near[shift : shift + len(there)], 0.0)
+        weight += same
     averaged = total / np.maximum(weight, 1)[:, None, None]
     found = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
@@ -256,9 +245,10 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     known = np.isfinite(found)
     if not known.any():
         raise CalibrationError("more than three channels never give values at the same time: none checks another")
-    usual, some = np.full(there.shape[1], np.nan), known.any(axis=0)
+    some = known.any(axis=0)
+    usual = np.full(len(some), np.median(np.nanmedian(found[:, some], axis=0)))
     usual[some] = np.nanmedian(found[:, some], axis=0)
-    return np.where(known, found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
+    return np.where(known, found, usual)
 
 
 def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:

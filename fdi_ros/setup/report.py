@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fdi_ros.model.samples import Array, Mask
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
@@ -27,13 +27,13 @@ from fdi_ros.report.layout import (
     time_layout,
     told,
 )
-from fdi_ros.report.verdict import Severity, Verdict
+from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.findings import Finding, Role, copy_words, findings_figures, lines_of, topic_findings, verdict_of
 from fdi_ros.setup.inspect import topic_columns
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.result import Calibration, calibration_figures, calibration_findings, channel_columns
-from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
+from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, times_words
 from fdi_ros.sources import source_of
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
@@ -76,31 +76,28 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         yield Finding(Role.WARNING, "mounting", "; ".join(limits))
 
 
-def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
-    """Say in one line whether the settings may be used, and why not."""
-    return verdict_of(setup_findings(found, unit))
-
-
 def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     """Say what the settings are worth: what is wrong, the worst first, or what they isolate."""
-    proof = found.proof
+    proof, units = found.proof, source_of(found.config).units
     tried = proof.before if found.kept else proof.after
-    judged = 0.0 if tried.baseline is None else tried.baseline.judged
+    warning = Role.WARNING
     if found.disagree:
-        yield Finding(Role.WARNING, "agreement", found.refused, headline="DO NOT USE")
-    elif found.calibration is None and not source_of(found.config).units:
+        yield Finding(warning, "agreement", found.refused, headline="DO NOT USE")
+    elif found.calibration is None and not units:
         words = f"the axes of the array are not known (a cone is assumed): {found.refused}"
-        yield Finding(Role.WARNING, "axes", words, headline="DO NOT USE")
-    elif judged < LEAST_JUDGED:
-        words = f"only {judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
-        yield Finding(Role.WARNING, "judged", words, (), judged, None, LEAST_JUDGED, "DO NOT USE")
+        yield Finding(warning, "axes", words, headline="DO NOT USE")
+    elif tried.judged < LEAST_JUDGED:
+        words = (
+            f"only {tried.judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
+        )
+        yield Finding(warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE")
     elif tried.declared:
-        words = f"the monitor declares {tried.declared_words} on {proof.source}: a gyro is faulty there, or the"
+        words = f"the monitor declares {times_words(tried.declared)} on {proof.source}: a gyro is faulty there, or the"
         words += " settings do not fit it"
-        yield Finding(Role.WARNING, "declared", words, list(tried.declared), headline="DO NOT USE")
+        yield Finding(warning, "declared", words, list(tried.declared), headline="DO NOT USE")
     elif found.kept:
         words = f"on {proof.source}, {found.kept}; the settings before are written"
-        yield Finding(Role.WARNING, "proof", words, headline="NO BETTER THAN BEFORE")
+        yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
         words, isolated, biases = "nothing is declared without a fault", *tried.isolated_of
         if not found.mounting.losses[0].isolable:
@@ -109,7 +106,7 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
             words += f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
         yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
-    if found.calibration is None and not found.disagree and source_of(found.config).units:
+    if found.calibration is None and not found.disagree and units:
         words = f"{found.refused}: axes, delays and noise in motion are not known"
         yield Finding(Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED")
 
@@ -183,15 +180,14 @@ def _mounts(found: SetupResult) -> list[Column]:
 def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
     """Figures of the settings before and after on the recording of the proof."""
     both = [found.proof.before, found.proof.after]
-    judged = [0.0 if one.baseline is None else one.baseline.judged for one in both]
-    declared = ["-" if one.baseline is None else one.declared_words for one in both]
+    declared = ["-" if one.baseline is None else times_words(one.declared) or "nothing" for one in both]
     shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
     isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
     heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in SIZES]
     return [
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
-        Column("judged", judged, ("judged",), ".0%"),
+        Column("judged", [one.judged for one in both], ("judged",), ".0%"),
         Column("declared", [declared_figures(one.baseline) for one in both]),
         Column("isolated", isolated),
         Column("", shares, heads, lambda share: f"{share[0]} of {share[1]}" if share[1] else "-"),
@@ -200,7 +196,8 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
 
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     """Return everything, for programs, in SI units."""
-    result = found.calibration
+    result, proof = found.calibration, found.proof
+    tried = dict(zip(("before", "after"), figures_of(_tried(found)), strict=True))
     return {
         "bag": bag,
         **findings_figures(list(setup_findings(found))),
@@ -210,12 +207,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
         "no_better": found.kept,
         **({} if result is None else calibration_figures(result)),
         "parameters": found.parameters,
-        "proof": {
-            "source": found.proof.source,
-            "kept_aside": found.proof.apart,
-            "seconds": found.proof.seconds,
-            **dict(zip(("before", "after"), figures_of(_tried(found)), strict=True)),
-        },
+        "proof": {"source": proof.source, "kept_aside": proof.apart, "seconds": proof.seconds, **tried},
     }
 
 
@@ -275,17 +267,31 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
     found, names = result.estimate, result.names
-    times, rests = found.blocks.time, _spans(found.blocks.time, found.rest)
+    times = found.blocks.time
+    half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    rests = [
+        {"type": "rect", "kind": "rest", "x0": float(times[a]) - half, "x1": float(times[b - 1]) + half}
+        for a, b in flag_runs(found.rest)
+    ]
 
     def course(title: str, hint: str, what: str, curves: list[dict[str, object]], **axis: str) -> Section:
         layout = time_layout(280, yaxis={"title": {"text": f"{what}, {unit.name}"}, **axis}, shapes=rests)
         return Section(title, hint, "", [{"data": curves, "layout": layout}])
 
-    def curves(names: Sequence[str], x: Array, y: Array) -> list[dict[str, object]]:
-        return [_curve(name, x, y[:, i] * unit.factor, i) for i, name in enumerate(names)]
+    def curves(names: Sequence[str], x: Array, y: Array, **more: object) -> list[dict[str, object]]:
+        step = max(len(x) // MOST_POINTS, 1)
+        at = np.round(x[::step], 3).tolist()
+        return [
+            {
+                "type": "scatter", "mode": "lines", "name": name,
+                "x": at, "y": list(map(drawn, y[::step, i] * unit.factor)),
+                "line": {"color": colour_of(i), "width": 1.2}, **more,
+            }
+            for i, name in enumerate(names)
+        ]  # fmt: skip
 
-    floors = curves(names, times[:1], found.floor.std[None])
-    noise = curves(names, times, found.moment) + [{**one, "mode": "markers", "showlegend": False} for one in floors]
+    noise = curves(names, times, found.moment)
+    noise += curves(names, times[:1], found.floor.std[None], mode="markers", showlegend=False)
     shaded = f"Shaded: at rest, {found.rest_seconds:.1f} s." if rests else "Nowhere at rest."
     walks = curves(names, found.times, found.curve - found.bias)
     spectrum = result.spectrum.section(unit)
@@ -295,24 +301,3 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
         course("Biases over time", BIAS_HINT, "bias minus its mean", walks),
         *([] if spectrum is None else [spectrum]),
     ]
-
-
-def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
-    """Shade the times at rest."""
-    half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    return [
-        {"type": "rect", "kind": "rest", "x0": float(times[a]) - half, "x1": float(times[b - 1]) + half}
-        for a, b in flag_runs(rest)
-    ]
-
-
-def _curve(name: str, x: Array, y: Array, channel: int) -> dict[str, object]:
-    step = max(len(x) // MOST_POINTS, 1)
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": name,
-        "x": np.round(x[::step], 3).tolist(),
-        "y": list(map(drawn, y[::step])),
-        "line": {"color": colour_of(channel), "width": 1.2},
-    }

@@ -129,20 +129,22 @@ class Calibration:
     @property
     def factor_error(self) -> Array:
         """(n,) its standard error, relative."""
-        n = len(self.names)
-        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
+        each = self._covariances[range(len(self.names)), :, range(len(self.names))]
         return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", self._directions, each, self._directions), 0))
 
     @property
     def _directions(self) -> Array:
         return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
 
+    @property
+    def _covariances(self) -> Array:
+        return self.estimate.axes_covariance.reshape(len(self.axes), 3, len(self.axes), 3)
+
     @cached_property
     def axis_errors(self) -> Array:
         """Uncertainty (3,) of the disagreement of axes along x, y and z of the body."""
-        n = len(self.names)
+        n, each = len(self.names), self._covariances
         apart = np.eye(n) - self.axes @ np.linalg.pinv(self.axes)
-        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)
         square = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
         return np.sqrt(np.maximum(square, 0.0))
 
@@ -222,35 +224,34 @@ def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADI
 def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
     found, name, factor = result.estimate, unit.name, unit.factor
-    rest, walk = found.rest_seconds, found.bias_walk
+    rest, walk, floor, usual = found.rest_seconds, found.bias_walk, found.floor, np.median(found.moment, axis=0)
     words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
     yield Finding(Role.FOUND, "time at rest", words, value=rest)
-    std, usual = found.floor.std * factor, np.median(found.moment, axis=0) * factor
-    words = f"noise_std {std.min():.2g} to {std.max():.2g} {name}, from the quietest {found.floor.share:.0%} of the"
-    words += f" recording; usually {usual.min():.2g} to {usual.max():.2g}"
-    largest = int(std.argmax())
-    yield Finding(Role.FOUND, "noise", words, (), float(found.floor.std[largest]), float(found.floor.error[largest]))
-    words = f"biases walk {walk.value * factor:.2g} {name} per sqrt(s)"
-    if not walk.value:
-        words = f"no walk of the biases shown, below {walk.possible * factor:.2g} {name} per sqrt(s)"
-    words = (
-        f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; {words}"
-    )
+    (least, most), (low, high) = ((std.min() * factor, std.max() * factor) for std in (floor.std, usual))
+    words = f"noise_std {least:.2g} to {most:.2g} {name}, from the quietest {floor.share:.0%} of the recording; usually"
+    words += f" {low:.2g} to {high:.2g}"
+    largest = int(floor.std.argmax())
+    yield Finding(Role.FOUND, "noise", words, (), float(floor.std[largest]), float(floor.error[largest]))
+    words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
+    if walk.value:
+        words += f"biases walk {walk.value * factor:.2g} {name} per sqrt(s)"
+    else:
+        words += f"no walk of the biases shown, below {walk.possible * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
         side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
-        words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
         taken = "taken off" if delay.shown else "not taken off: it may be none"
         if "imus.delays" not in result.settings:
             taken = "not taken off: one message"
+        words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
         words += f" the first unit, {taken}"
         yield Finding(Role.FOUND, "delay", words, names, delay.value, delay.error, SHOWN * delay.error)
 
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
     """List what is not observed, what is taken instead, and how to get it."""
-    found = result.estimate
+    found, share = result.estimate, result.estimate.floor.share
     if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
         words = (
@@ -259,23 +260,22 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
             " stand still for 10 s, motors off"
         )
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
-    elif (share := found.floor.share) <= LEAST_SHARE:
+    elif share <= LEAST_SHARE:
         words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
-    error, rms = result.axis_errors, np.std(found.rate, axis=0)
+    error, rms = result.axis_errors, np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
-        along, about = (
-            "" if len(unmeasured) == 3 else f" {word} {' and '.join(unmeasured)}" for word in ("along", "about")
-        )
+        which = " and ".join(unmeasured)
+        along, about = ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
         words = (
             f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near those"
             " configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
         )
         yield Finding(Role.UNKNOWN, "scale factors", words, unmeasured, None, float(error.max()), UNMEASURED)
     if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
-        turns = [f"{'xyz'[a]} ({rms[a] * unit.factor:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor]
+        turns = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor)
         words = (
-            f"too little rotation about {', '.join(turns)} of {body_frame}: the axes stay near those configured there."
+            f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
             " Turn it back and forth about them, some 1 rad/s"
         )
         yield Finding(Role.UNKNOWN, "axes", words, ["xyz"[a] for a in poor], None, float(error[poor].max()), SHOWN_AXES)
@@ -290,10 +290,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """List what to look at before the settings are trusted: faults, values lost, and channels beyond a bound."""
     found, names = result.estimate, result.names
     if result.faults:
-        spans = [
-            f"{' or '.join(names[i] for i in one.channels)} from {one.start:.1f} s to {one.end:.1f} s"
-            for one in result.faults
-        ]
+        spans = [f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s" for who, a, b in result.faults]
         words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
         struck = sorted({i for span in result.faults for i in span.channels})
         yield Finding(Role.WARNING, "declared", words, [names[i] for i in struck], headline="USABLE, BUT LOOK")

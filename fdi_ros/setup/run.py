@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,6 +50,8 @@ LESS_JUDGED = 0.02
 """Less in the share of samples judged is one at the edge of a gap."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0
 """Part of a recording that is kept aside, and its bounds, s: all biases are to have room."""
+MOST_NAMED = 12
+"""Topics that an error names."""
 LEAST_LEFT = 2 * LEAST_DURATION
 """s that must be left to calibrate on."""
 
@@ -66,6 +67,11 @@ class Tried:
     """By size, rad/s: biases isolated, and all that were tried; empty: it is too short for any."""
 
     @property
+    def judged(self) -> float:
+        """Share of the samples that are judged."""
+        return 0.0 if self.baseline is None else self.baseline.judged
+
+    @property
     def declared(self) -> dict[str, float]:
         """Channels declared, without a fault, and when first, s."""
         first: dict[str, float] = {}
@@ -74,17 +80,12 @@ class Tried:
         return first
 
     @property
-    def declared_words(self) -> str:
-        """The same in words."""
-        return _times_words(self.declared) or "nothing"
-
-    @property
     def isolated_of(self) -> tuple[int, int]:
         """Biases isolated, and tried, of all sizes."""
         return sum(good for good, _ in self.isolated.values()), sum(of for _, of in self.isolated.values())
 
 
-def _times_words(declared: Mapping[str, float]) -> str:
+def times_words(declared: Mapping[str, float]) -> str:
     """List channels and when they were declared, s."""
     return first_of([f"{name} at {at:.1f} s" for name, at in declared.items()], 3)
 
@@ -105,47 +106,24 @@ class Proof:
     def worse(self) -> str:
         """By what the new settings are worse than those before; empty: they are as good, or better."""
         before, after = self.before, self.after
+        (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
+        new = {name: at for name, at in after.declared.items() if name not in before.declared}
         if before.baseline is None:
             return ""
         if after.baseline is None:
             return f"it judges nothing: {after.note}"
-        if new := {name: at for name, at in after.declared.items() if name not in before.declared}:
-            return f"it declares {_times_words(new)}"
-        if before.baseline.judged - after.baseline.judged > LESS_JUDGED:
-            return f"{after.baseline.judged:.0%} of the samples are judged instead of {before.baseline.judged:.0%}"
-        (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
+        if new:
+            return f"it declares {times_words(new)}"
+        if before.judged - after.judged > LESS_JUDGED:
+            return f"{after.judged:.0%} of the samples are judged instead of {before.judged:.0%}"
         if tried_before == tried and was - now > CHANCE:
             return f"{now} of {tried} biases are isolated instead of {was}"
         return ""
 
 
-def kept_from(block: Block) -> tuple[float, float]:
-    """Time from which a recording is kept aside, s from its first sample, and how much that is, gaps not counted.
-
-    Zero: it is too short for that.
-    """
-    if len(block) < 2:
-        return 0.0, 0.0
-    steps = np.diff(block.stamp) * 1e-9
-    lasts = np.cumsum(np.minimum(steps, GAP * np.median(steps)))
-    kept = float(np.clip(KEPT * lasts[-1], LEAST_KEPT, MOST_KEPT))
-    if lasts[-1] - kept < LEAST_LEFT:
-        return 0.0, 0.0
-    return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
-
-
-def prove(path: Path, start: float, end: float, source: str, apart: bool, before: Config, after: Config) -> Proof:
-    """Replay a part of a recording, from and to s, with the settings before and after."""
-    faults = tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}"))
-    plan = Plan(faults, TIMES, WITHIN)
-    tried = [_tried(path, start, end, config, plan) for config in (before, after)]
-    seconds = max((one.baseline.duration for one in tried if one.baseline is not None), default=0.0)
-    return Proof(source, apart, seconds, *tried)
-
-
-def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> Tried:
-    # Delays are taken off as it is read.
-    block = read_block(path, config, start, end)
+def _tried(block: Block, config: Config) -> Tried:
+    """Replay a recording as it is, and with biases of all sizes."""
+    plan = Plan(tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")), TIMES, WITHIN)
     try:
         (one,) = sweep([Subject("settings", config, block)], plan)
     except FdiError as error:
@@ -162,9 +140,6 @@ def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> 
 
 
 Parameters = dict[str, object]
-
-MOST_NAMED = 12
-"""Topics that an error names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,20 +233,29 @@ def set_up(
         If it cannot be read, holds no gyros, or a monitor can be built from nothing that it shows.
     """
     reports, damage = inspect(bag)
-    chosen = _gyros(reports, bag)
+    chosen, lacking = candidates(reports), needs(reports)
+    if not chosen:
+        topics = [
+            f"{shown(one.topic.name)} ({shown(one.topic.type or 'unknown')}, {one.received} messages)"
+            for one in reports
+        ]
+        words = first_of(topics, MOST_NAMED, "; ") or "none"
+        raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {words}")
+    if lacking:
+        raise BagError(f"{bag} needs {lacking}; mend the driver")
     parameters: Parameters = {**starting_config(chosen, bag).parameters}
     begun = LearnedSettings(parameters=parameters, config=Config.from_parameters(parameters))
+    units = source_of(begun.config).units
     reference_channels(begun.config, build_geometry(begun.config), reference)
     block = read_block(bag, begun.config, start, end)
-    together = np.isfinite(block.z).all(axis=1).any()
-    if source_of(begun.config).units and not together and (apart := clocks_apart(chosen, 0.0)):
+    if units and not np.isfinite(block.z).all(axis=1).any() and (apart := clocks_apart(chosen, 0.0)):
         raise BagError(f"{bag}: {apart}")
 
     def learn(part: Block) -> tuple[LearnedSettings, LearnedSettings]:
-        before = _mounted(part, begun)
+        before = _mounted(part, begun) if units else begun
         return before, _with_mounts(part, before, reference)
 
-    found = _proved(_split(block, bag, start, end, proof), learn)
+    found = _proved(block, bag, start, end, proof, learn)
     return replace(found, reports=reports, damage=damage, chosen=chosen)
 
 
@@ -293,69 +277,61 @@ def recalibrate(
         words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
     given = LearnedSettings(parameters=dict(config.parameters()), config=config)
-    part = _split(block, bag, start, end, proof)
-
-    def learn(block: Block) -> tuple[LearnedSettings, LearnedSettings]:
-        found = _calibrated(block, given, reference)
-        if found.why is not None and block is part.learned:
-            raise found.why
-        return given, found
-
-    return _proved(part, learn)
+    return _proved(block, bag, start, end, proof, lambda part: (given, _calibrated(part, given, reference)), True)
 
 
-class _Split(NamedTuple):
-    """What settings are learned from before they are proved, and after; and the proof, as `prove` takes it."""
-
-    learned: Block
-    whole: Block
-    proof: tuple[Path, float, float, str, bool]
+Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]
+"""The settings before, and those that a recording gives."""
 
 
-def _split(block: Block, bag: Path, start: float, end: float, proof: Path | None) -> _Split:
-    """Divide a recording unless another one is for the proof."""
+def _kept_from(block: Block) -> tuple[float, float] | None:
+    """Time from which a recording is kept aside, s from its first sample, and how much that is, gaps not counted.
+
+    None: it is too short for that.
+    """
+    if len(block) < 2:
+        return None
+    steps = np.diff(block.stamp) * 1e-9
+    lasts = np.cumsum(np.minimum(steps, GAP * np.median(steps)))
+    kept = float(np.clip(KEPT * lasts[-1], LEAST_KEPT, MOST_KEPT))
+    if lasts[-1] - kept < LEAST_LEFT:
+        return None
+    return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
+
+
+def _proved(
+    block: Block, bag: Path, start: float, end: float, proof: Path | None, learn: Learn, needed: bool = False
+) -> SetupResult:
+    """Prove what a recording gives on another one, or what a part of it gives on the rest, if it is long enough.
+
+    Then take what all of it gives, or the settings before. If needed, a first part without a calibration is an error.
+    """
+    learned, apart, source = block, proof is not None, "the same recording: too short to keep a part of it aside"
     if proof is not None:
-        return _Split(block, block, (proof, 0.0, math.inf, shown(proof.name), True))
-    since, kept = kept_from(block)
-    if not kept:
-        words = "the same recording: too short to keep a part of it aside"
-        return _Split(block, block, (bag, start, end, words, False))
-    rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
-    return _Split(block[:rows], block, (bag, start + since, end, f"the last {kept:.0f} s, kept aside", True))
-
-
-def _proved(split: _Split, learn: Callable[[Block], tuple[LearnedSettings, LearnedSettings]]) -> SetupResult:
-    """Prove what a part of a recording gives; then take what all of it gives, or the settings before."""
-    before, found = learn(split.learned)
-    proof = prove(*split.proof, before.config, found.config)
-    kept = proof.worse if found.calibration is not None else ""
-    if split.whole is not split.learned:
-        whole_before, whole = learn(split.whole)
+        bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
+    elif (kept := _kept_from(block)) is not None:
+        since, seconds = kept
+        learned = block[: int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))]
+        start, apart, source = start + since, True, f"the last {seconds:.0f} s, kept aside"
+    before, found = learn(learned)
+    if needed and found.why is not None:
+        raise found.why
+    # Delays are taken off as it is read.
+    tried = [_tried(read_block(bag, one.config, start, end), one.config) for one in (before, found)]
+    lasts = max((one.baseline.duration for one in tried if one.baseline is not None), default=0.0)
+    proved = Proof(source, apart, lasts, *tried)
+    worse = proved.worse if found.calibration is not None else ""
+    if learned is not block:
+        whole_before, whole = learn(block)
         if whole.calibration is not None or found.calibration is None:
             before, found = whole_before, whole
-    if kept:
+    if worse:
         found = replace(found, parameters=before.parameters, config=before.config)
-    return SetupResult(**vars(found), kept=kept, mounting=assess(found.config), proof=proof)
-
-
-def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
-    """Return the topics of the gyros, or refuse, with the topics that there are instead."""
-    lacking = needs(reports)
-    if chosen := candidates(reports):
-        if lacking:
-            raise BagError(f"{bag} needs {lacking}; mend the driver")
-        return chosen
-    words = [
-        f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
-        for report in reports[:MOST_NAMED]
-    ]
-    raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {'; '.join(words) or 'none'}")
+    return SetupResult(**vars(found), kept=worse, mounting=assess(found.config), proof=proved)
 
 
 def _mounted(block: Block, start: LearnedSettings) -> LearnedSettings:
     """Find how units are mounted against each other."""
-    if not source_of(start.config).units:
-        return start
     mounts = find_mounts(prepare(block, np.array(start.config.health.max_rate)))
     rotations = [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]
     known = {**start.parameters, "imus.mounts": np.ravel(rotations).tolist()}

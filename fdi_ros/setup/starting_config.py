@@ -102,24 +102,23 @@ def assumed_config(path: Path) -> tuple[Config, str]:
 
 def _turned_units(path: Path, config: Config) -> str:
     """Say which units measure the motion of the first one along other axes; empty: none that the motion shows."""
-    size = max(1, round(WINDOW * config.sample_rate))
-    means = [np.zeros((0, 3 * len(config.imus.topics)))]
+    size, names = max(1, round(WINDOW * config.sample_rate)), config.imus.names
     with Recording(path) as recording:
-        for block in Samples(recording, config, means[0].shape[1]).blocks():
-            rows = len(block) // size
-            means.append(block.z[: rows * size].reshape(rows, size, block.z.shape[1]).mean(axis=1))
-    slow = np.concatenate(means)
+        means = [
+            block.z[: len(block) // size * size].reshape(-1, size, 3 * len(names)).mean(axis=1)
+            for block in Samples(recording, config, 3 * len(names)).blocks()
+        ]
+    slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
     slow = slow[np.isfinite(slow).all(axis=1)]
     if len(slow) < LEAST_WINDOWS:
         return ""
-    first, *others = np.split(slow - np.median(slow, axis=0), len(config.imus.topics), axis=1)
+    first, *others = np.split(slow - np.median(slow, axis=0), len(names), axis=1)
     turned = []
-    for name, rate in zip(config.imus.names[1:], others, strict=True):
-        rotation = find_turn(first, rate).rotation
+    for name, rate in zip(names[1:], others, strict=True):
+        rotation = find_turn(first, rate)[0]
         explained = np.std(rate @ rotation.T - first) < _EXPLAINED * np.std(rate - first)
         if explained and angle_of(rotation) > SQUARE:
-            angle = math.degrees(angle_of(rotation))
-            turned.append(f"{name} is turned by {angle:.0f} deg against {config.imus.names[0]}")
+            turned.append(f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}")
     return ", ".join(turned)
 
 
@@ -148,8 +147,16 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         "detector.name": (PARAMETERS["detector.name"].default, ""),
         "detector.false_alarms_per_hour": (0.001, ""),
         "health.max_rate": ([largest_rate], "NOT KNOWN: put in what the data sheet says"),
-        **(_units(chosen, rate) if kind.stamped else _array(chosen[0])),
     }
+    if kind.stamped:
+        known |= _units(chosen, rate)
+    else:
+        words = (
+            "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
+            " but for those of three reference channels: these must be right"
+        )
+        known["channels.topic"] = chosen[0].topic.name, ""
+        known["geometry.preset"], known["geometry.cone_channels"] = ("cone", words), (chosen[0].channels, "")
     if silent := _longer(chosen, _SILENT, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
     parameters = {name: value for name, (value, _) in known.items()}
@@ -159,18 +166,17 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
     share = min(report.segments.moving_share() for report in chosen)
-    moving = np.concatenate([report.segments.moving_noise() for report in chosen])
-    if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
-        values = [_rounded_up(value) for value in moving.tolist()]
-        return values, f"in motion ({share:.0%} of the recording), vibration included"
-    quiet = np.concatenate([report.segments.quiet_noise() for report in chosen])
-    usable = np.isfinite(quiet) & (quiet > 0)
-    if not usable.any():
-        return [0.0025], "a guess: the recording is too short to tell"
-    # A value that never changes shows no noise: that of the noisiest is taken for it.
-    levels = np.where(usable, quiet, quiet[usable].max())
-    values = [_rounded_up(value) for value in levels.tolist()]
-    return values, "when quietest; in motion vibration, and axes that are not quite as given, add"
+    levels = np.concatenate([report.segments.moving_noise() for report in chosen])
+    words = f"in motion ({share:.0%} of the recording), vibration included"
+    if not (share > _MOSTLY and np.isfinite(levels).all() and (levels > 0).all()):
+        quiet = np.concatenate([report.segments.quiet_noise() for report in chosen])
+        usable = np.isfinite(quiet) & (quiet > 0)
+        if not usable.any():
+            return [0.0025], "a guess: the recording is too short to tell"
+        # A value that never changes shows no noise: that of the noisiest is taken for it.
+        levels = np.where(usable, quiet, quiet[usable].max())
+        words = "when quietest; in motion vibration, and axes that are not quite as given, add"
+    return [_rounded_up(value) for value in levels.tolist()], words
 
 
 def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
@@ -205,26 +211,10 @@ def _units(chosen: Sequence[TopicReport], rate: float) -> Known:
     return known
 
 
-def _array(report: TopicReport) -> Known:
-    """Parameters of an array of channels."""
-    words = (
-        "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes, but"
-        " for those of three reference channels: these must be right"
-    )
-    return {
-        "channels.topic": (report.topic.name, ""),
-        "geometry.preset": ("cone", words),
-        "geometry.cone_channels": (report.channels, ""),
-    }
-
-
 def _starts_at_rest(report: TopicReport) -> bool:
     """Whether nothing moves over the time in which biases could be learned."""
-    begin = [
-        rest
-        for segment, rest in zip(report.segments.all_segments(), report.segments.at_rest(), strict=True)
-        if segment.first - report.first < _REST * 1e9
-    ]
+    segments = zip(report.segments.all_segments(), report.segments.at_rest(), strict=True)
+    begin = [rest for segment, rest in segments if segment.first - report.first < _REST * 1e9]
     return bool(begin) and all(begin)
 
 

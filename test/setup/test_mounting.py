@@ -115,9 +115,9 @@ def test_what_names_rest_on_is_said() -> None:
 
 def test_look_alikes_are_named_in_words() -> None:
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    assert assess(two_imus(quarter)).alike == [(0, 4), (1, 3), (2, 5)]
+    assert assess(two_imus(quarter)).alike == [[0, 4], [1, 3], [2, 5]]
     result = assess(two_imus(np.eye(3)))
-    assert result.alike == [(0, 3), (1, 4), (2, 5)]
+    assert result.alike == [[0, 3], [1, 4], [2, 5]]
     expected = "imu_1.x and imu_2.x measure the same axis: a fault in either is seen, which one is not"
     assert expected in pair_lines(result)
     assert expected in mounting_text(result)
