@@ -35,10 +35,8 @@ def _fleet(arguments: Namespace) -> int:
     from fdi_ros.cli.ahead import compile_for_workers
     from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_target, config_words, versions
     from fdi_ros.config.parameter_file import with_parameters
-    from fdi_ros.fleet.find import find_recordings
-    from fdi_ros.fleet.judge import judge_all
-    from fdi_ros.fleet.page import Fleet
-    from fdi_ros.fleet.tables import Tables
+    from fdi_ros.fleet.judge import find_recordings, judge_all
+    from fdi_ros.fleet.tables import Fleet, Tables
     from fdi_ros.system.jobs import worker_count
     from fdi_ros.system.result_file import write_text
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import INTERMITTENT_SHARE, add_stuck, intermittent_channels, update_stuck
 from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, PathSettings
 from fdi_ros.core.states import NON_FINITE_LASTING
+from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
 SURE_DRIFT = 4.0

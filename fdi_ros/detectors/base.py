@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
 from fdi_ros.compiling.record import Whole, record
-from fdi_ros.core.bank import REFUSED, UNPREPARED, describe_sensors, judge_sample, present_in
 from fdi_ros.core.records import Bank, Circumstances, SampleVerdict
-from fdi_ros.core.subsets import flags_of, whole_set
+from fdi_ros.core.subsets import REFUSED, UNPREPARED, describe_sensors, flags_of, judge_sample, present_in, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
-from fdi_ros.core.bank import describe_sensors
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
 from fdi_ros.core.decision import RETURN_MEAN
 from fdi_ros.core.records import Core
 from fdi_ros.core.states import REASONS, ChannelState, Reason
-from fdi_ros.core.subsets import mask_of, whole_set
+from fdi_ros.core.subsets import describe_sensors, mask_of, whole_set
 from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError

@@ -29,7 +29,7 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
 from fdi_ros.fleet import judge, tables
-from fdi_ros.fleet.find import find_recordings
+from fdi_ros.fleet.judge import find_recordings
 from fdi_ros.fleet.tables import Flight, Tables
 
 Stop = Callable[[pytest.MonkeyPatch], None]

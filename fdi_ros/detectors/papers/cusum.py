@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Square, Whole, record
-from fdi_ros.core.bank import variance_of
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.papers.likelihood_ratio import (
     Hypotheses,

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
-from fdi_ros.core.bank import variance_of
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
