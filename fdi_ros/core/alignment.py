@@ -106,16 +106,17 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
     if not aligner.begun:
         aligner.begun, aligner.common = True, stamp
     goes_on = 0 < stamp - unit.before <= aligner.timeout and not _is_silent(aligner, unit)
+    unit.leapt |= unit.end > 0 and unit.before - stamp > aligner.timeout
     _pass_time(aligner, j, stamp)
     lag = aligner.common - stamp
     if (unit.end > 0 and stamp <= unit.newest) or _is_outside(aligner, j, stamp):
-        unit.parted |= goes_on and unit.end > 0 and lag > aligner.timeout
+        unit.parted |= goes_on and unit.end > 0 and lag > aligner.timeout and not unit.leapt
         if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
         return
     for i in range(aligner.n):
         aligner.units[i].off = False
-    unit.lag, unit.parted = max(lag, 0), False
+    unit.lag, unit.parted, unit.leapt = max(lag, 0), False, False
     _accept(aligner, unit, stamp, aligner.rate)
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
@@ -292,7 +293,7 @@ def _restart(aligner: Aligner) -> None:
         unit.begin = unit.end = unit.used = unit.usual[0] = unit.usual[1] = 0
         for k in range(aligner.n):
             unit.passed[k] = 0
-        unit.parted = False
+        unit.parted = unit.leapt = False
         if _stands_at(aligner, unit, stamp):
             unit.lag = max(stamp - unit.off_last, 0)
             _accept(aligner, unit, unit.off_last, unit.off_rate)

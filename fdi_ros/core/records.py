@@ -102,6 +102,7 @@ class Unit:
     before: Whole  # stamp of the last message, accepted or not, ns
     passed: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # by each other unit since the last accepted, ns
     delay: Whole  # by how much its stamps are late, ns; taken off every one
+    leapt: Flag  # its stamps jumped back by more than the timeout, and none was accepted since
     parted: Flag  # without a jump it has fallen behind the common time by more than the timeout
     off: Flag  # the last messages stood outside the time base
     off_first: Whole  # stamp since which they go on there, ns

@@ -421,9 +421,16 @@ def test_two_clocks_that_come_together_again_are_believed_again():
     assert not aligner.are_parted
 
 
-def test_of_two_units_one_that_jumps_is_left_and_one_that_was_held_up_costs_nothing():
-    jumped, _ = run(at(*rounds(100), *[m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + 5000.0))]))
+@pytest.mark.parametrize("jump", [5000.0, 500.0, -150.0, -500.0, -5000.0])
+def test_of_two_units_one_that_jumps_is_left(jump):
+    later = [m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + jump))]
+    jumped, samples = run(at(*rounds(100), *later))
     assert not jumped.are_parted
+    assert received(samples)[:, 0].all()
+    assert not received(samples)[110:, 1].any()
+
+
+def test_of_two_units_one_that_was_held_up_costs_nothing():
     # The link of the second keeps its messages for a second, and then delivers them one after the other.
     late = [(0, float(t)) for t in range(1000, 2000, 10)]
     late += [m for t in range(2000, 3000, 10) for m in ((0, float(t)), (1, t - 1000.0))]
