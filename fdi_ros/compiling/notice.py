@@ -124,7 +124,10 @@ def announced(view: View | None = None) -> Iterator[None]:
         while not over.wait(TICK):
             with lock:
                 if _watch.depth:
-                    shown.draw(1 - missing() / first[0] if first[0] else 0.0)
+                    left = missing()
+                    # What is to be compiled may become more on the way.
+                    first[0] = max(first[0], left)
+                    shown.draw(1 - left / first[0] if first[0] else 0.0)
 
     def hook(begins: bool) -> None:
         with lock:

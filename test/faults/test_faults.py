@@ -12,6 +12,7 @@ from faults.examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdi_ros.config.settings import REQUIRED
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, load_scenario, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS, Bias
@@ -77,6 +78,13 @@ def test_each_kind_does_what_it_says():
         np.testing.assert_allclose(faulty.z[active, 4], values, rtol=1e-12, atol=1e-12, err_msg=kind)
     for words, value in (("size=0.3", 0.3), ("", block.z[0, 0])):
         assert set(inject(f"channel=imu_1.x kind=stuck {words}", block)[0].z[:, 0]) == {value}
+
+
+def test_studies_know_a_size_of_every_kind_that_needs_one():
+    for kind in FAULT_KINDS.values():
+        size = kind.options().get("size")
+        if size is not None and size.default is REQUIRED:
+            assert kind.study_size is not None, kind.name
 
 
 def test_random_kinds_have_the_stated_strength():
