@@ -38,21 +38,10 @@ PATIENCE = 1200.0
 """The player waits so long for the monitor, which compiles first, on a slow and busy machine, s."""
 
 
-class DemoError(FdiError):
-    """The demo cannot go on."""
-
-
 class Observer(Watcher):
-    """Watches the monitor on a recorded flight, and remembers what it declares.
+    """Watches the monitor on a flight, from one stamp to another, s, and remembers what it declares.
 
-    Parameters
-    ----------
-    begin, end
-        Stamps of the flight, s.
-    fault
-        That is injected.
-    struck
-        Names of the channels that it strikes.
+    The fault is injected into the channels that are named as struck.
     """
 
     def __init__(self, begin: float, end: float, fault: Fault, struck: set[str]) -> None:
@@ -97,32 +86,29 @@ class Observer(Watcher):
 
 @contextlib.contextmanager
 def running(commands: dict[str, list[str]]) -> Iterator[Callable[[], None]]:
-    """Run nodes of ours, stopped at the end; what is yielded raises `DemoError` once one of them has failed."""
-    nodes: dict[str, tuple[subprocess.Popen[bytes], IO[str]]] = {}
+    """Run nodes of ours, stopped at the end; what is yielded raises `FdiError` once one of them has failed."""
 
     def check() -> None:
         for name, (process, output) in nodes.items():
             if process.poll():
                 output.seek(0)
-                said = output.read().strip().splitlines() or ["it said nothing"]
-                raise DemoError(f"{name} has ended: {said[-1]}")
+                raise FdiError(f"{name} has ended: {(output.read().strip() or 'it said nothing').splitlines()[-1]}")
 
-    try:
+    def end(process: subprocess.Popen[bytes]) -> None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+    nodes: dict[str, tuple[subprocess.Popen[bytes], IO[str]]] = {}
+    with contextlib.ExitStack() as stack:
         for name, words in commands.items():
             command = [sys.executable, "-m", "fdi_ros.ros.process", name, "--ros-args", *words]
-            # Held open as long as the process.
-            log: IO[str] = tempfile.TemporaryFile("w+")  # noqa: SIM115
+            log = stack.enter_context(tempfile.TemporaryFile("w+"))
             nodes[name] = subprocess.Popen(command, stdout=log, stderr=log), log
+            stack.callback(end, nodes[name][0])
         yield check
-    finally:
-        for process, _ in nodes.values():
-            process.send_signal(signal.SIGINT)
-        for process, output in nodes.values():
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-            output.close()
 
 
 def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list[str], bool]:
@@ -131,7 +117,7 @@ def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list
     begin, end = flight.stamp[0] / 1e9, flight.stamp[-1] / 1e9
     struck = {names[channel] for channel in fault.channels(names)}
     if not fault.start < end - begin:
-        raise DemoError(f"the fault starts at {fault.start:g} s, expected less than {end - begin:g} s")
+        raise FdiError(f"the fault starts at {fault.start:g} s, expected less than {end - begin:g} s")
     simulated = ["--params-file", str(CONFIG), "-p", "use_sim_time:=true"]
     commands = {
         "injector_node": [*simulated, "-p", "enabled:=true", "-p", f"faults:='{fault}'", "-p", f"suffix:={SUFFIX}"],
@@ -155,13 +141,6 @@ def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list
     return observer.summary()
 
 
-def isolate_environment() -> None:
-    """Keep the demo to this machine and out of other ROS programs' way."""
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_demo_"))
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the demo; 0 if the fault was isolated and nothing else declared."""
     parser = argparse.ArgumentParser(prog="make demo", description="A gyro goes bad in flight; the real node finds it.")
@@ -169,7 +148,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=32.0, help="how much of the minute of flight to play")
     parser.add_argument("--plain", action="store_true", help="line by line, as where the output is no terminal")
     options = parser.parse_args(argv)
-    isolate_environment()
+    # To this machine, and out of the way of other ROS programs.
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_demo_"))
     try:
         fault = parse_fault(options.fault)
         lines, good = fly(Config.from_file(CONFIG), fault, options.seconds, options.plain)

@@ -37,16 +37,12 @@ class InjectorNode(CheckedNode):
     """Republishes the input topics of a monitor with faults in them.
 
     A topic is subscribed to when its output has found its first subscriber: who waits for this node waits for the
-    monitor behind it, and nothing is lost in between.
-
-    Raises
-    ------
-    FdiError
-        If a parameter is wrong, or a fault strikes a channel that is not there.
+    monitor behind it, and nothing is lost in between. `FdiError` if a parameter is wrong, or a fault strikes a channel
+    that is not there.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("injector_node", INJECTOR, **options)
+        super().__init__("injector_node", INJECTOR, subscribes=True, **options)
         self._names = build_geometry(self.config).channel_names
         self._malformed = self._struck = 0
         suffix = self.values()["suffix"]

@@ -104,20 +104,9 @@ class InputQueue:
         return taken
 
     def turn(self, executor: Any, now: float, bounded: bool) -> bool:
-        """Take what waits after a turn of an executor.
+        """Take what waits after a turn of an executor, whose queue may be bounded, at the steady time now, s.
 
-        Parameters
-        ----------
-        executor
-            Of the node.
-        now
-            Steady time, s.
-        bounded
-            Whether its queue is bounded.
-
-        Returns
-        -------
-        Whether a new executor is to take over.
+        Returned is whether a new executor is to take over.
         """
         self.drain()
         if bounded or not self.subscriptions:

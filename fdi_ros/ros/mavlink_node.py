@@ -48,8 +48,8 @@ from fdi_ros.ros.process import Stop, guarded, make_executor
 from fdi_ros.sources.channels import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
-TOPICS = ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw")
-"""Where the settings name no topics of units."""
+NAMES = ("imu_1", "imu_2", "imu_3")
+"""Of units where the settings name none, each on the topic ``NAME/data_raw``."""
 WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
 INJECTED = "_faulty"
@@ -69,37 +69,36 @@ _VALUE_EVERY = 450_000_000
 class AutopilotNode(CheckedNode):
     """Publishes the IMUs of an autopilot, one topic a unit.
 
-    Raises
-    ------
-    FdiError
-        If a parameter is wrong, or what a link needs is not installed.
+    `FdiError` if a parameter is wrong, or what a link needs is not installed.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", MAVLINK, subscribes=False, **options)
-        params = self.values()
+        params, config = self.values(), self.config
         settings = self._settings(params)
-        self.link = open_link(params["url"])
-        self.vehicle = Vehicle(settings, self.link.send, time.time)
-        topics = self.config.topics if self.config.has_units else TOPICS
-        names = self.config.imu_names if self.config.has_units else [topic.partition("/")[0] for topic in TOPICS]
-        self._outputs = [self.create_publisher(message_class(IMU), topic, output_qos()) for topic in topics]
-        self._topics = [output.topic_name for output in self._outputs]
-        """Names as they are after remapping."""
-        self._messages = [ImuMessageBytes(name) for name in names]
-        self._reporter = Reporter(self.link, self.vehicle, names, self._topics)
+        self._link = open_link(params["url"])
+        self._vehicle = Vehicle(settings, self._link.send, time.time)
+        names = config.imu_names if config.has_units else NAMES
+        topics = config.topics if config.has_units else [f"{name}/data_raw" for name in NAMES]
+        outputs = [self.create_publisher(message_class(IMU), topic, output_qos()) for topic in topics]
+        self._topics = [output.topic_name for output in outputs]
+        self._units = list(zip(outputs, map(ImuMessageBytes, names), strict=True))
+        self._reporter = Reporter(self._link, self._vehicle, names, self._topics)
         self._diagnostics = diagnostics_publisher(self)
-        self._opened, self._trouble = 0, self.link.trouble
-        self._valued = self._due = 0
+        self._opened = self._valued = self._due = 0
+        self._trouble = self._link.trouble
         self._time = SystemTime()
         self._called = False
         """Whether the executor has found something to do."""
-        channels = self.config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
+        channels = config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
         self._announcer = Announcer(channels) if params["statustext"] else None
-        self._values = bool(params["named_values"])
-        self._monitor = _full_name(self.get_namespace(), params["monitor"])
+        self._sends_values: bool = params["named_values"]
+        # In full, as it stands in diagnostics: without the first slash.
+        monitor = params["monitor"]
+        namespace = "" if monitor.startswith("/") else self.get_namespace().rstrip("/")
+        self._monitor = f"{namespace}/{monitor}".lstrip("/")
         self._failover = None if params["failover"] == "off" else self._make_failover(params)
-        if self._announcer is not None or self._values or self._failover is not None:
+        if self._announcer is not None or self._sends_values or self._failover is not None:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
         self.every(REPORT_PERIOD, self._report)
@@ -131,15 +130,14 @@ class AutopilotNode(CheckedNode):
             path.mkdir(parents=True, exist_ok=True)
             path /= f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
-        heard = self.create_subscription(
-            message_class(INTEGRITY.topic.type), declarations, self._on_integrity, 10, raw=True
-        )
+        kind = message_class(INTEGRITY.topic.type)
+        heard = self.create_subscription(kind, declarations, self._on_integrity, 10, raw=True)
         self._sole = [heard.topic_name, *self._topics]
-        """Topics that must have one publisher."""
+        """Topics that must have one publisher: names as they are after remapping."""
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not params["signing_key"]:
             self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
-        return Failover(self.vehicle, self.config.channel_names, params["failover_limit"], path)
+        return Failover(self._vehicle, self.config.channel_names, params["failover_limit"], path)
 
     def live(self, stop: Stop) -> None:
         """Wait for the link, pass on what came, and give the executor its turn, until stopped.
@@ -151,9 +149,9 @@ class AutopilotNode(CheckedNode):
         due = time.monotonic()
         try:
             while rclpy.ok() and not stop.asked:
-                self.link.wait(max(0.0, due - time.monotonic()))
+                self._link.wait(max(0.0, due - time.monotonic()))
                 with guarded(self):
-                    self.turn()
+                    self._turn()
                 if (now := time.monotonic()) >= due:
                     due = now + WAIT
                     with guarded(self):
@@ -169,8 +167,8 @@ class AutopilotNode(CheckedNode):
         end = time.monotonic() + PARTING
         while self._failover is not None and not self._failover.is_done and time.monotonic() < end:
             self._failover.turn(time.monotonic_ns(), restore=True)
-            self.link.wait(WAIT)
-            self.turn()
+            self._link.wait(WAIT)
+            self._turn()
 
     def _give_turn(self, executor: Any) -> None:
         for _ in range(MOST_CALLS):
@@ -181,45 +179,48 @@ class AutopilotNode(CheckedNode):
 
     # The link -----------------------------------------------------------------------------------------------------
 
-    def turn(self) -> None:
+    def _turn(self) -> None:
         """Take what has come over the link, and send what is due."""
         self._receive()
         now = time.monotonic_ns()
         if now < self._due:
             return
         self._due = now + _SEND_EVERY
-        if self._announcer is not None and self.vehicle.in_reach:
+        if self._announcer is not None and self._vehicle.in_reach:
             for text in self._announcer.due(now):
-                self.vehicle.send_text(text.severity, text.text)
+                self._vehicle.send_text(text.severity, text.text)
         if self._failover is not None:
             self._failover.turn(now)
-        self.vehicle.tick(now)
-        while self.vehicle.events:
-            self.log.info(self.vehicle.events.popleft())
+        self._vehicle.tick(now)
+        while self._vehicle.events:
+            self.log.info(self._vehicle.events.popleft())
 
     def _receive(self) -> None:
-        received = self.link.receive(time.monotonic_ns())
-        if self.link.opened != self._opened:
-            self._opened = self.link.opened
-            self.vehicle.reopened()
-            self.log.info(f"{self.link.url} is open")
-        if self.link.trouble not in ("", self._trouble):
-            self.log.info(f"{self.link.url} is not open: {self.link.trouble}")
-        self._trouble = self.link.trouble
+        link = self._link
+        received = link.receive(time.monotonic_ns())
+        if link.opened != self._opened:
+            self._opened = link.opened
+            self._vehicle.reopened()
+            self.log.info(f"{link.url} is open")
+        if link.trouble not in ("", self._trouble):
+            self.log.info(f"{link.url} is not open: {link.trouble}")
+        self._trouble = link.trouble
         for one in received:
             now = time.monotonic_ns()
-            for sample in self.vehicle.feed(one, now):
-                stamp, unit = sample.stamp + self._time.ahead(now), sample.unit
-                if unit < len(self._outputs) and 0 <= stamp <= LAST_STAMP:
-                    self._outputs[unit].publish(self._messages[unit].fill(stamp, sample))
+            for sample in self._vehicle.feed(one, now):
+                # By the time of the system.
+                stamp = sample.stamp + self._time.ahead(now)
+                if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:
+                    output, message = self._units[sample.unit]
+                    output.publish(message.fill(stamp, sample))
 
     # The monitor --------------------------------------------------------------------------------------------------
 
     def _on_diagnostics(self, data: bytes) -> None:
         self._called = True
-        now, prefix = time.monotonic_ns(), f"{self._monitor}: "
+        now, failover = time.monotonic_ns(), self._failover
         # All nodes speak there: only what can be the monitor's is taken apart.
-        if len(data) > _LARGEST or prefix.encode() not in data:
+        if len(data) > _LARGEST or f"{self._monitor}: ".encode() not in data:
             return
         try:
             lines = read_diagnostics(deserialize_message(data, DiagnosticArray), self._monitor)
@@ -227,19 +228,20 @@ class AutopilotNode(CheckedNode):
             # Not the monitor's: it has no such level.
             return
         whole = next((line for line in lines if line.name == WHOLE), None)
-        if whole is not None and self._values and self.vehicle.in_reach and now - self._valued >= _VALUE_EVERY:
+        due = self._sends_values and self._vehicle.in_reach and now - self._valued >= _VALUE_EVERY
+        if whole is not None and due:
             self._valued = now
             for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
                 if not math.isnan(value := whole.number(key)):
-                    self.vehicle.send_value(name, value, now)
+                    self._vehicle.send_value(name, value, now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
         topics = [line.value("topic").removesuffix(INJECTED) for line in lines if line.name.startswith(INPUT)]
-        # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
-        if self._failover is not None and topics:
-            reporting = whole is not None and whole.level != Level.STALE
-            self._failover.reported = now if reporting and topics == self._topics else 0
-            self._failover.errors = {line.name: line.number("estimated error (rad/s)") for line in lines}
+        if failover is not None and topics:
+            # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
+            agrees = whole is not None and whole.level != Level.STALE and topics == self._topics
+            failover.reported = now if agrees else 0
+            failover.errors = {line.name: line.number("estimated error (rad/s)") for line in lines}
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
@@ -258,8 +260,6 @@ class AutopilotNode(CheckedNode):
         self.log.warning(f"~/restore: {response.message}")
         return response
 
-    # Reports ------------------------------------------------------------------------------------------------------
-
     def _report(self) -> None:
         self._called = True
         self.log.begin_period()
@@ -271,7 +271,7 @@ class AutopilotNode(CheckedNode):
 
     def destroy_node(self) -> None:
         """Close the link too."""
-        self.link.close()
+        self._link.close()
         super().destroy_node()
 
 
@@ -281,17 +281,11 @@ class ImuMessageBytes:
     def __init__(self, frame_id: str) -> None:
         template = ImuTemplate(frame_id)
         self._data, self._at = bytearray(template.bytes.tobytes()), template.at
-        # The template says that there is no acceleration; unknown is a covariance of zeros (REP-145).
-        struct.pack_into("<d", self._data, self._at + 8 * (3 + 9 + 3), 0.0)
 
     def fill(self, stamp: int, sample: ImuSample) -> bytes:
         """Return the message of a sample, stamped in ns."""
         struct.pack_into("<iI", self._data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
-        struct.pack_into("<3d", self._data, self._at, *sample.rate)
-        struct.pack_into("<3d", self._data, self._at + 8 * (3 + 9), *sample.acceleration)
+        # Unknown is a covariance of zeros (REP-145); the template says that there is no acceleration.
+        values = (*sample.rate, *(0.0,) * 9, *sample.acceleration, 0.0)
+        struct.pack_into("<16d", self._data, self._at, *values)
         return bytes(self._data)
-
-
-def _full_name(namespace: str, name: str) -> str:
-    """Return the full name of a node as it stands in diagnostics: without the first slash."""
-    return (name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}").lstrip("/")

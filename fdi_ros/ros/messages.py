@@ -21,9 +21,6 @@ from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
-# Topics ---------------------------------------------------------------------------------------------------------------
-
-
 DEPTH = 256
 """Messages kept until they are sent: after a moment of waiting many are worked at once, and a writer that keeps fewer
 drops some."""
@@ -47,19 +44,9 @@ def diagnostics_publisher(node: Node) -> Any:
 
 
 def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
-    """Return what one node says in a message of /diagnostics, where all speak; names without that of the node.
+    """Return what a node, by its full name, says in a message of /diagnostics, where all speak.
 
-    Parameters
-    ----------
-    message
-        diagnostic_msgs/DiagnosticArray.
-    node
-        Full name.
-
-    Raises
-    ------
-    ValueError
-        If a level is none.
+    The names are without that of the node. `ValueError` if a level is none.
     """
     prefix = f"{node.strip('/')}: "
     found = []
@@ -75,13 +62,7 @@ def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
 
 
 def message_class(name: str) -> Any:
-    """Return the class of a message type, ``sensor_msgs/msg/Imu``.
-
-    Raises
-    ------
-    FdiError
-        If its package is not installed.
-    """
+    """Return the class of a message type, ``sensor_msgs/msg/Imu``; `FdiError` if its package is not installed."""
     package, _, kind = name.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
@@ -92,9 +73,6 @@ def message_class(name: str) -> Any:
 def prefix_of(node: Node) -> str:
     """Return what the names of a node's statuses begin with: no two nodes of a system have the same."""
     return f"{node.get_fully_qualified_name().lstrip('/')}: "
-
-
-# The log --------------------------------------------------------------------------------------------------------------
 
 
 MOST = 20

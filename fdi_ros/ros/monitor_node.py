@@ -44,16 +44,10 @@ RCLError = rclpy_implementation.RCLError
 
 
 class MonitorNode(CheckedNode, LifecycleNode):
-    """Gyro fault monitor.
-
-    Raises
-    ------
-    FdiError
-        If a parameter is wrong or the settings do not fit each other.
-    """
+    """Gyro fault monitor; `FdiError` if a parameter is wrong or the settings do not fit each other."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("fdi_node", MONITOR, publishes=OVERRIDABLE, **options)
+        super().__init__("fdi_node", MONITOR, subscribes=True, publishes=OVERRIDABLE, **options)
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         file, age = (self.values()[name] for name in ("state_file", "state_max_age"))

@@ -50,34 +50,13 @@ _MAX_DEPTH = 100_000
 class CheckedNode(Node):
     """A node that refuses what it cannot use, at the start and later, and answers every request.
 
-    Nothing that many requests or messages bring about is without bound.
-
-    Parameters
-    ----------
-    name
-        Of the node.
-    fields
-        Its parameters that are none of the settings.
-    subscribes
-        Whether it subscribes to the input topics, with QoS that may be overridden.
-    publishes
-        Topics of its publishers whose QoS may be overridden.
-    options
-        Of the class of rclpy.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter is unknown, of the wrong type or out of its range.
+    Nothing that many requests or messages bring about is without bound. ``fields`` are its parameters that are none of
+    the settings. QoS may be overridden of the input topics, if it subscribes to them, and of topics that it
+    ``publishes``. `ConfigError` if a parameter is unknown, of the wrong type or out of its range.
     """
 
     def __init__(
-        self,
-        name: str,
-        fields: Mapping[str, Field],
-        subscribes: bool = True,
-        publishes: Sequence[str] = (),
-        **options: Any,
+        self, name: str, fields: Mapping[str, Field], *, subscribes: bool, publishes: Sequence[str] = (), **options: Any
     ) -> None:
         self.inputs = InputQueue(self)
         self._fields = fields
@@ -100,24 +79,12 @@ class CheckedNode(Node):
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def values(self, changes: Sequence[Parameter] = ()) -> dict[str, Any]:
-        """Return the parameters that are none of the settings, with changes made to them.
-
-        Raises
-        ------
-        ConfigError
-            If one is of the wrong type or out of its range.
-        """
+        """Return the parameters that are none of the settings, with changes made to them, checked."""
         given = {name: self.get_parameter(name).value for name in self._fields} | {p.name: p.value for p in changes}
         return {name: _checked(name, field, given[name]) for name, field in self._fields.items()}
 
     def change(self, changes: Sequence[Parameter]) -> None:
-        """Take over parameters that are being set.
-
-        Raises
-        ------
-        FdiError
-            If they cannot be: then none of them is set.
-        """
+        """Take over parameters that are being set; `FdiError` if they cannot be: then none of them is set."""
 
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
@@ -144,13 +111,7 @@ class CheckedNode(Node):
         return self.inputs.visible(super().subscriptions)
 
     def resolved(self, topic: str) -> str:
-        """Return the full name of a topic, remapped.
-
-        Raises
-        ------
-        ConfigError
-            If it is no name of a topic.
-        """
+        """Return the full name of a topic, remapped; `ConfigError` if it is no name of a topic."""
         try:
             return str(self.resolve_topic_name(topic))
         except (ValueError, RuntimeError) as error:

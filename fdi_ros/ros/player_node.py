@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -42,23 +43,15 @@ CLOCK_STEP = 1_000_000
 
 
 class PlayerNode(CheckedNode):
-    """Plays the input topics of a monitor's settings.
-
-    Raises
-    ------
-    FdiError
-        If a parameter is wrong, or the recording does not hold the topics.
-    """
+    """Plays the input topics of a monitor's settings; `FdiError` if the recording does not hold them."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("player_node", PLAYER, subscribes=False, **options)
         values = self.values()
         if not values["bag"]:
             raise BagError("no recording given: set the parameter bag")
-        self.rate: float = values["rate"]
-        self.patience: float = values["wait"]
-        self.loop: bool = values["loop"]
-        self.paused = False
+        self._rate, self._patience, self._loop = (values[name] for name in ("rate", "wait", "loop"))
+        self._paused = False
         source = source_of(self.config)
         self.recording = Recording(values["bag"])
         self.recording.require(source.topics, source.type)
@@ -70,9 +63,9 @@ class PlayerNode(CheckedNode):
 
     def _on_pause(self, pause: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = True, "paused" if pause else "playing"
-        if pause != self.paused:
+        if pause != self._paused:
             self.log.info(response.message)
-        self.paused = pause
+        self._paused = pause
         return response
 
     def live(self, stop: Stop) -> None:
@@ -86,7 +79,7 @@ class PlayerNode(CheckedNode):
 
         try:
             self._await_subscribers(stop, spin)
-            while self._play_once(stop, spin) and self.loop:
+            while self._play_once(stop, spin) and self._loop:
                 self.log.info("the recording has ended: from its beginning")
                 spin(0.0)
         except ExternalShutdownException:
@@ -98,8 +91,8 @@ class PlayerNode(CheckedNode):
         """Wait for a subscriber to every topic, as long as the user has patience."""
         start = time.monotonic()
         if lacking := self._without_subscriber():
-            self.log.info(f"waiting for subscribers of {lacking}, at most {self.patience:g} s")
-        while self._without_subscriber() and not stop.asked and time.monotonic() < start + self.patience:
+            self.log.info(f"waiting for subscribers of {lacking}, at most {self._patience:g} s")
+        while self._without_subscriber() and not stop.asked and time.monotonic() < start + self._patience:
             spin(0.05)
         if (lacking := self._without_subscriber()) and not stop.asked:
             self.log.warning(f"no subscriber to {lacking}: playing all the same")
@@ -107,13 +100,7 @@ class PlayerNode(CheckedNode):
         time.sleep(SETTLING if not stop.asked else 0)
 
     def _play_once(self, stop: Stop, spin: Callable[[float], None]) -> bool:
-        """Play the recording; return whether it came to its end.
-
-        Raises
-        ------
-        BagError
-            If it holds no message.
-        """
+        """Play the recording; return whether it came to its end; `BagError` if it holds no message."""
         start = answered = math.nan
         for due in self.messages():
             now = time.monotonic()
@@ -121,7 +108,7 @@ class PlayerNode(CheckedNode):
                 # From when the first message is ready: reading it takes a while.
                 start = answered = now
             while True:
-                ahead, paused = start + due / self.rate - now, self.paused
+                ahead, paused = start + due / self._rate - now, self._paused
                 # What was late, as a chunk was read, is not made up for in a burst that no queue holds.
                 start += max(0.0, -ahead - MOST_BEHIND)
                 if paused or ahead > 0 or now - answered > PATIENCE:
@@ -132,7 +119,7 @@ class PlayerNode(CheckedNode):
                 if stop.asked:
                     return False
                 now = time.monotonic()
-                if not self.paused and start + due / self.rate <= now:
+                if not self._paused and start + due / self._rate <= now:
                     break
         if math.isnan(start):
             raise BagError(f"{self.recording.path} holds no message of {', '.join(self.config.topics)}")
@@ -160,18 +147,14 @@ class PlayerNode(CheckedNode):
                     self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
                 last = now
                 yield due
-                if clock is None or now - clock >= CLOCK_STEP:
+                if self._clock_output is not None and (clock is None or now - clock >= CLOCK_STEP):
                     clock = now
-                    self._publish_clock(now)
+                    if not 0 <= now <= LAST_STAMP:
+                        words = f"a message of {now} ns since 1970 is beyond what /clock can say"
+                        raise BagError(f"{self.recording.path}: {words}")
+                    sec, nanosec = divmod(now, 10**9)
+                    self._clock_output.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
                 self.outputs[int(batch.topic[k])].publish(batch.message(k))
-
-    def _publish_clock(self, now: int) -> None:
-        if self._clock_output is not None:
-            if not 0 <= now <= LAST_STAMP:
-                raise BagError(f"{self.recording.path}: a message of {now} ns since 1970 is beyond what /clock can say")
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
-            self._clock_output.publish(message)
 
     def destroy_node(self) -> None:
         """Close the recording too."""

@@ -37,8 +37,6 @@ NODES = {
     "player_node": "player_node.PlayerNode",
 }
 """Where the class of each node is."""
-
-
 NO_ROS = "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or in a clone pip install '.[ros]'"
 
 
@@ -147,11 +145,10 @@ def _events_executor(node: Any) -> Any:
 
 
 def _make(name: str) -> Any:
-    if name == "player_node":
-        require("reading recordings", BAGS)
-    # Here, so that a signal during these imports, which take most of the start, finds its handler.
     if name not in NODES:
         raise FdiError(f"no such node, expected one of: {', '.join(NODES)}")
+    if name == "player_node":
+        require("reading recordings", BAGS)
     # Numba loads SciPy's linear algebra where it finds it, 17 MB; nothing that a node runs calls it.
     sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
     module, _, kind = NODES[name].partition(".")
@@ -159,20 +156,10 @@ def _make(name: str) -> Any:
 
 
 def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None) -> int:
-    """Make a node, let it live until it is done, a signal or a shutdown, and take it down.
+    """Make one of `NODES`, let it live until it is done, a signal or a shutdown, and take it down.
 
-    Parameters
-    ----------
-    name
-        One of `NODES`.
-    argv
-        Arguments, ROS ones among them; None: those of the process.
-    make
-        Makes the node; None: it is the one of that name.
-
-    Returns
-    -------
-    Exit code: 0, or 2 if the node cannot start.
+    Arguments are those of ROS, by default those of the process. Something else may make the node. Returned is the exit
+    code: 0, or 2 if the node cannot start.
 
     Until the node is up, a signal has its default effect and ends the process: while something is compiled, a handler
     in Python would run only now and then.

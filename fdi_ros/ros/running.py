@@ -79,14 +79,8 @@ class ChangeLog:
     def add(self, events: Sequence[Event], shift: int, pair: ApartStatus | None) -> None:
         """Log the changes that one sample has brought.
 
-        Parameters
-        ----------
-        events
-            The changes.
-        shift
-            To be subtracted from their stamps to have those of the messages, ns.
-        pair
-            Where a set is declared, the pair in it that differs for certain.
+        The shift, ns, subtracted from their stamps gives those of the messages; where a set is declared, the pair in it
+        differs for certain.
         """
         now = self._clock()
         lines: dict[tuple[ChannelState, str], list[int]] = {}

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.ros.watch_node import Watcher
-from fdi_ros.ros.watch_view import REMEMBERED, LineReport, Picture, draw
+from fdi_ros.ros.watch import LineReport
+from fdi_ros.ros.watch_node import REMEMBERED, Picture, Watcher
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
@@ -64,6 +64,8 @@ def picture() -> Picture:
 def drawn(picture: Picture, width: int) -> list[str]:
     """Lines that are shown in a terminal."""
     console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
+    from fdi_ros.ros.watch_view import draw
+
     out = io.StringIO()
     console.Console(file=out, width=width).print(draw(picture, width))
     return out.getvalue().splitlines()
