@@ -23,14 +23,11 @@ from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import WINDOW, Data
 
-LEAST_ROTATION = 0.05
-"""Root mean square rotation about any axis while in motion, rad/s."""
+LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s
 LEAST_RESPONSE = 0.3
 """Share of the rotation that others see which a working channel shows at least, and they of what it shows."""
-FOLLOWS = 0.9
-"""Correlation from which a channel shows the rotation, if on another scale."""
-LEAST_WINDOWS = 20
-"""In motion; with fewer, units are not compared, and no mount is estimated."""
+FOLLOWS = 0.9  # correlation from which a channel shows the rotation, if on another scale
+LEAST_WINDOWS = 20  # in motion; with fewer, units are not compared, and no mount is estimated
 SHARED, SAME = 0.7, 0.9
 """Share of the rotation that units have in common: less contradicts, more shows by which axes it would not."""
 SIGNED_AXES = [
@@ -186,16 +183,11 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 # How the units are turned against each other --------------------------------------------------------------------------
 
 
-LEAST_RATE = 0.01
-"""Rotation about some axis, root mean square, below which the recording is at rest, rad/s."""
-LARGEST_ERROR = np.radians(2.0)
-"""A mount less certain than this, in any direction, is not shown."""
-ROUNDING = 1e-9
-"""Share of a rotation, about the axis that sees least of it, that is none."""
-LEAST_SHARED = 0.5
-"""Share of the rotation of a unit that a mount must explain."""
-SHOWN = 3.0
-"""Standard errors from which what is measured is shown: a delay, or a mount that is not along axes."""
+LEAST_RATE = 0.01  # rotation about some axis, root mean square, below which the recording is at rest, rad/s
+LARGEST_ERROR = np.radians(2.0)  # a mount less certain than this, in any direction, is not shown
+ROUNDING = 1e-9  # share of a rotation, about the axis that sees least of it, that is none
+LEAST_SHARED = 0.5  # share of the rotation of a unit that a mount must explain
+SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
 SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
@@ -227,20 +219,13 @@ def angle_of(rotation: Array) -> float:
 class Mount:
     """How one unit is turned against the first."""
 
-    words: str
-    """What it is, or why it is not known."""
-    shared: float = 0.0
-    """Share of the rotation of the unit that is that of the first one."""
-    rotation: Array | None = None
-    """(3, 3) by rows: v_first = R v_unit; None: it is not shown."""
-    off: float = 0.0
-    """What it was measured to be away from `rotation`, rad."""
-    error: float = math.inf
-    """Standard error in the least certain direction, rad; infinite: not shown at all."""
-    contradicts: bool = False
-    """It turns, and not as the first unit does, however it may be mounted."""
-    mirrored: bool = False
-    """One of the two is no right-handed frame."""
+    words: str  # what it is, or why it is not known
+    shared: float = 0.0  # share of the rotation of the unit that is that of the first one
+    rotation: Array | None = None  # (3, 3) by rows: v_first = R v_unit; None: it is not shown
+    off: float = 0.0  # what it was measured to be away from `rotation`, rad
+    error: float = math.inf  # standard error in the least certain direction, rad; infinite: not shown at all
+    contradicts: bool = False  # it turns, and not as the first unit does, however it may be mounted
+    mirrored: bool = False  # one of the two is no right-handed frame
 
 
 def find_mounts(data: Data) -> tuple[Mount, ...]:

@@ -19,32 +19,23 @@ from numpy.typing import NDArray
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.model.samples import Array, Block, Int, Mask
 
-WINDOW = 0.25
-"""Length of the windows that are at rest or not, faulty or not, s."""
-LEAST_SECONDS = 1.0
-"""Shorter runs of one value are chance, s."""
-LEAST_SAMPLES = 50
-"""So are those of fewer samples."""
+WINDOW = 0.25  # length of the windows that are at rest or not, faulty or not, s
+LEAST_SECONDS = 1.0  # shorter runs of one value are chance, s
+LEAST_SAMPLES = 50  # so are those of fewer samples
 COARSE = 3.0
 """Gyros that show no more values than this in a quiet while are quantised so coarsely that one value is rest."""
-QUIETEST = 10.0
-"""Percentile of the spans that are a quiet while."""
-SPIKE = 25.0
-"""Usual sizes beyond which a value is a spike."""
-SPIKE_PORTION, RARE = 256, 0.1
-"""Samples looked at at once, and share of them that may be spikes or beside one."""
-MEDIAN_TO_RMS = 1.4826
-"""Of normal errors: standard deviation over median absolute deviation."""
+QUIETEST = 10.0  # percentile of the spans that are a quiet while
+SPIKE = 25.0  # usual sizes beyond which a value is a spike
+SPIKE_PORTION, RARE = 256, 0.1  # samples looked at at once, and share of them that may be spikes or beside one
+MEDIAN_TO_RMS = 1.4826  # of normal errors: standard deviation over median absolute deviation
 
 
 @dataclass(frozen=True)
 class Data:
     """A recording made ready."""
 
-    stamp: NDArray[np.int64]
-    """(N,) ns."""
-    z: Array
-    """(N, n) rad/s, NaN where not usable."""
+    stamp: NDArray[np.int64]  # (N,) ns
+    z: Array  # (N, n) rad/s, NaN where not usable
     unusable: dict[str, Int]
     """(n,) samples of each channel that are not usable, by the reason: missing, not_finite, out_of_range, repeated."""
 
@@ -154,8 +145,7 @@ class Repeats:
     """Counts values in long runs of one value, of messages that come bit by bit."""
 
     def __init__(self, channels: int) -> None:
-        self.count = np.zeros(channels, dtype=np.int64)
-        """(c,) values in long runs."""
+        self.count = np.zeros(channels, dtype=np.int64)  # (c,) values in long runs
         self._last = np.full(channels, np.nan)
         self._run = np.zeros(channels, dtype=np.int64)
 
@@ -171,34 +161,24 @@ class Repeats:
             self._last[k], self._run[k] = column[-1], lengths[-1]
 
 
-POINTS = 6
-"""Of the interpolation."""
-HOLE = 1.5
-"""Neighbours farther apart than so many of their usual intervals are not interpolated between."""
-PRESENT = 0.8
-"""Share of a window that a channel gives to count in it."""
-PORTION = 100_000
-"""Samples worked on at once, about."""
-NOT_SHIFTED = 1e-6
-"""s; smaller delays are none."""
+POINTS = 6  # of the interpolation
+HOLE = 1.5  # neighbours farther apart than so many of their usual intervals are not interpolated between
+PRESENT = 0.8  # share of a window that a channel gives to count in it
+PORTION = 100_000  # samples worked on at once, about
+NOT_SHIFTED = 1e-6  # s; smaller delays are none
 
 
 @dataclass(frozen=True)
 class Blocks:
     """Means of blocks, and windows of blocks."""
 
-    seconds: Array
-    """(B,) middle of each block, s from the first sample."""
-    mean: Array
-    """(B, n) rad/s; NaN where a channel lacks a sample."""
-    start: Int
-    """(W,) first block of each window."""
+    seconds: Array  # (B,) middle of each block, s from the first sample
+    mean: Array  # (B, n) rad/s; NaN where a channel lacks a sample
+    start: Int  # (W,) first block of each window
     samples: Array
     """(W, n, n) covariance of single samples about their mean in each window, (rad/s)^2; NaN: a channel is missing."""
-    white: Array
-    """(n,) what interpolation has left of the variance of white noise in them."""
-    count: Int
-    """(W,) samples that it is of."""
+    white: Array  # (n,) what interpolation has left of the variance of white noise in them
+    count: Int  # (W,) samples that it is of
 
     @property
     def windows(self) -> int:

@@ -32,33 +32,23 @@ from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.result import Calibration, Span, StampDelay
 from fdi_ros.sources import source_of
 
-UNKNOWN_MOUNT = 0.58
-"""Of each component of an axis that may point anywhere."""
+UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere
 UNKNOWN_AXES = 0.1
 """The same of an array whose axes are found from the motion alone; those configured are not if they are off by more."""
-REFERENCE_STD = 1e-6
-"""Of channels that are taken for as configured."""
-LEAST_DURATION = 10.0
-"""s."""
-LEAST_SAMPLES, LONGEST_STEP = 100, 1.0
-"""Samples, and s from one to the next."""
-LEAST_USABLE = 0.3
-"""Share of its samples that a channel must give."""
+REFERENCE_STD = 1e-6  # of channels that are taken for as configured
+LEAST_DURATION = 10.0  # s
+LEAST_SAMPLES, LONGEST_STEP = 100, 1.0  # samples, and s from one to the next
+LEAST_USABLE = 0.3  # share of its samples that a channel must give
 MOST_FAULTY = 0.35
 """Share of the recording in which a channel may be faulty; with more, it cannot be said which channel is right."""
-MOST_LEFT_OUT = 1 / 3
-"""Share of the channels of a set that is left out: of a larger one nobody knows which are right."""
+MOST_LEFT_OUT = 1 / 3  # share of the channels of a set that is left out: of a larger one nobody knows which are right
 LOUDER = 4.0
 """A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
 would not believe, as the motion begins, that it is vibration."""
-LEAD = 1.0
-"""s before a declaration that a fault may have begun."""
-LEAST_SKEW = 5e-5
-"""What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
-WAITS = 2.5
-"""What imus.timeout is at least, in differences of the delays of units."""
-REPLACED = ("imus.mounts", "geometry.cone_channels")
-"""Parameters that say nothing any more beside geometry.axes."""
+LEAD = 1.0  # s before a declaration that a fault may have begun
+LEAST_SKEW = 5e-5  # what imus.max_skew is at least where delays smaller than it are to be taken off, s
+WAITS = 2.5  # what imus.timeout is at least, in differences of the delays of units
+REPLACED = ("imus.mounts", "geometry.cone_channels")  # parameters that say nothing any more beside geometry.axes
 
 
 def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:

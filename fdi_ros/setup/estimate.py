@@ -38,37 +38,24 @@ from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
 from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.setup.smoother import NormalEquations, RandomWalk, Smoothed, find_random_walk, smooth
 
-SCALE_STD = 0.008
-"""Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""
+SCALE_STD = 0.008  # of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
-SETTLED = 2e-5
-"""s of delays, and share of the rate of axes: what changes less has settled."""
-NEAR_DELAY = 50 * SETTLED
-"""s; delays that move by less are no reason to look for the walk of the biases again."""
-LARGEST_DELAY = PARAMETERS["imus.delays"].high
-"""s."""
-STEP_DELAY = 0.03
-"""By how much a delay changes in one pass at most, s: a slope is that of the motion only so far."""
-MOST_STEPS = 400
-"""Windows are joined until there are no more than this."""
-ABSENT = 1e12
-"""Variance of a channel that is not there, (rad/s)^2."""
-QUIET = 3.0
-"""At rest the variance of single samples is at most so many times that of the quietest windows."""
-ALIKE = 5.0
-"""Means of the windows at rest are at most so many of their standard deviations apart."""
-LEAST_REST = 2.0
-"""s; less is chance."""
-USUAL_WALK = 2e-5
-"""rad/s/sqrt(s); of biases that show none."""
-WIDER = 1.5
-"""Axes that are farther off than expected by so much are known less beforehand."""
+SETTLED = 2e-5  # s of delays, and share of the rate of axes: what changes less has settled
+NEAR_DELAY = 50 * SETTLED  # s; delays that move by less are no reason to look for the walk of the biases again
+LARGEST_DELAY = PARAMETERS["imus.delays"].high  # s
+STEP_DELAY = 0.03  # by how much a delay changes in one pass at most, s: a slope is that of the motion only so far
+MOST_STEPS = 400  # windows are joined until there are no more than this
+ABSENT = 1e12  # variance of a channel that is not there, (rad/s)^2
+QUIET = 3.0  # at rest the variance of single samples is at most so many times that of the quietest windows
+ALIKE = 5.0  # means of the windows at rest are at most so many of their standard deviations apart
+LEAST_REST = 2.0  # s; less is chance
+USUAL_WALK = 2e-5  # rad/s/sqrt(s); of biases that show none
+WIDER = 1.5  # axes that are farther off than expected by so much are known less beforehand
 LEAST_BLOCKS = SUBS = 5
 """Of a window that tells its noise, and windows that tell whether it is coloured; blocks of the means that show it."""
-BASE = 7
-"""One, the rate, the angular acceleration."""
+BASE = 7  # one, the rate, the angular acceleration
 ESTIMATED = ("bias", "scale", "delay")
 (BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")
 """Kinds of error states, whose signals are linear in these."""
@@ -78,52 +65,32 @@ ESTIMATED = ("bias", "scale", "delay")
 class Priors:
     """What is estimated, and what is known of it before."""
 
-    axes: Array
-    """(n, 3) as configured."""
-    unit: Int
-    """(n,) number of the unit of each channel."""
-    units: int
-    """Number of units."""
-    scale_std: Array
-    """(n,) of scale error and misalignment."""
-    bias_std: float
-    """rad/s."""
-    delay_std: float
-    """s."""
+    axes: Array  # (n, 3) as configured
+    unit: Int  # (n,) number of the unit of each channel
+    units: int  # number of units
+    scale_std: Array  # (n,) of scale error and misalignment
+    bias_std: float  # rad/s
+    delay_std: float  # s
 
 
 @dataclass(frozen=True)
 class StateEstimate:
     """All states, estimated."""
 
-    axes: Array
-    """(n, 3)."""
-    axes_covariance: Array
-    """(3 n, 3 n) of all of them."""
-    delay: Array
-    """(n,) by how much the stamps of each channel's unit are late against those of the first, s."""
-    delay_std: Array
-    """(n,) s."""
-    bias: Array
-    """(n,) mean over the recording, rad/s."""
-    bias_covariance: Array
-    """(n, n) (rad/s)^2."""
-    curve: Array
-    """(K, n) biases over time, rad/s."""
-    times: Array
-    """(K,) s."""
-    bias_walk: RandomWalk
-    """Of the biases."""
-    floor: Floor
-    """Noise that channels have by themselves."""
-    moment: Array
-    """(W, n) standard deviation of a sample in every window, vibration included, rad/s."""
-    blocks: Blocks
-    """What it is from."""
-    rest: Mask
-    """(W,) windows at rest."""
-    rate: Array
-    """(B, 3) of the body, rad/s."""
+    axes: Array  # (n, 3)
+    axes_covariance: Array  # (3 n, 3 n) of all of them
+    delay: Array  # (n,) by how much the stamps of each channel's unit are late against those of the first, s
+    delay_std: Array  # (n,) s
+    bias: Array  # (n,) mean over the recording, rad/s
+    bias_covariance: Array  # (n, n) (rad/s)^2
+    curve: Array  # (K, n) biases over time, rad/s
+    times: Array  # (K,) s
+    bias_walk: RandomWalk  # of the biases
+    floor: Floor  # noise that channels have by themselves
+    moment: Array  # (W, n) standard deviation of a sample in every window, vibration included, rad/s
+    blocks: Blocks  # what it is from
+    rest: Mask  # (W,) windows at rest
+    rate: Array  # (B, 3) of the body, rad/s
 
     @property
     def rest_seconds(self) -> float:

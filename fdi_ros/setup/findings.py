@@ -39,34 +39,23 @@ from fdi_ros.system.text import shown
 class Role(str, Enum):
     """What a finding is to the reader; the value is its list in JSON."""
 
-    FOUND = "found"
-    """What the settings are from."""
-    UNKNOWN = "not_found"
-    """What the recording does not show, what is taken instead, and how to get it."""
-    WARNING = "warnings"
-    """What to look at before the settings are trusted."""
-    WORTH = "worth"
-    """What it is good for: the verdict where nothing is wrong."""
+    FOUND = "found"  # what the settings are from
+    UNKNOWN = "not_found"  # what the recording does not show, what is taken instead, and how to get it
+    WARNING = "warnings"  # what to look at before the settings are trusted
+    WORTH = "worth"  # what it is good for: the verdict where nothing is wrong
 
 
 class Finding(NamedTuple):
     """One thing that was found."""
 
     role: Role
-    what: str
-    """The quantity or the trouble, in a word or two."""
-    words: str
-    """The whole of it in one line."""
-    who: Sequence[str] = ()
-    """Channels, units or topics it is about; none: all."""
-    value: float | None = None
-    """Of the quantity, SI; of several channels the worst."""
-    error: float | None = None
-    """Standard error of the value."""
-    bound: float | None = None
-    """That the value keeps or breaks."""
-    headline: str = ""
-    """How the verdict begins where this decides it, one of `HEADLINES`; empty: it does not."""
+    what: str  # the quantity or the trouble, in a word or two
+    words: str  # the whole of it in one line
+    who: Sequence[str] = ()  # channels, units or topics it is about; none: all
+    value: float | None = None  # of the quantity, SI; of several channels the worst
+    error: float | None = None  # standard error of the value
+    bound: float | None = None  # that the value keeps or breaks
+    headline: str = ""  # how the verdict begins where this decides it, one of `HEADLINES`; empty: it does not
 
 
 HEADLINES = {
@@ -111,19 +100,16 @@ def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
 # What a recording is fit for ------------------------------------------------------------------------------------------
 
 
-_CLOCKS = 1.0
-"""s by which clocks differ: less may be the time that messages take."""
+_CLOCKS = 1.0  # s by which clocks differ: less may be the time that messages take
 _OF_A_MONITOR = {topic.name.rpartition("/")[2] for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)}
-_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
-"""Kinds of input, first those with stamps."""
+_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)  # kinds of input, first those with stamps
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
     else f"one array of {kind.value_counts.start} to {kind.value_counts.stop - 1} values"
     for kind in _PREFERRED
 )
-_NAMED = 8
-"""Topics that are named with what is wrong with them."""
+_NAMED = 8  # topics that are named with what is wrong with them
 
 
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
@@ -244,12 +230,9 @@ def _copied(report: TopicReport) -> str:
 
 
 DEGREES = math.degrees(1.0)
-NEAR = 0.2
-"""A factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less."""
-QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)
-"""Of the rates of a unit, that are compared with those of another."""
-FEWEST_QUANTILES = 2
-"""That must show motion."""
+NEAR = 0.2  # a factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less
+QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)  # of the rates of a unit, that are compared with those of another
+FEWEST_QUANTILES = 2  # that must show motion
 FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
 """Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
 than so many times the factor of a degree."""

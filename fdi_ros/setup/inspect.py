@@ -22,18 +22,12 @@ from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.sources import Source, source_of_type
 from fdi_ros.system.text import date_of, shown
 
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
-_INTERVALS = 1_000_000
-"""Intervals of a topic that are kept at most."""
-_USUAL = 0.999
-"""Share of the intervals that a timeout must bear."""
-FASTEST = 36.0
-"""rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s."""
-RECENT = 256
-"""Messages in a row in which copies are looked for."""
-BELIEVED = 1e6
-"""Values beyond are no rates but damage, rad/s; their squares must not overflow."""
+GAP = 3.0  # intervals longer than this many usual ones are gaps
+_INTERVALS = 1_000_000  # intervals of a topic that are kept at most
+_USUAL = 0.999  # share of the intervals that a timeout must bear
+FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
+RECENT = 256  # messages in a row in which copies are looked for
+BELIEVED = 1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
 
 
 @dataclass
@@ -41,28 +35,19 @@ class TopicReport:
     """What was seen of one topic."""
 
     topic: Topic
-    kind: type[Source] | None
-    """How gyros are read from messages of its type; None: they are not."""
+    kind: type[Source] | None  # how gyros are read from messages of its type; None: they are not
     received: int = 0
     malformed: int = 0
     first: int = 0
-    last: int = 0
-    """Time of recording of the first and last message, ns."""
-    interval: float = 0.0
-    """Usual interval, s; 0 before it is known."""
+    last: int = 0  # time of recording of the first and last message, ns
+    interval: float = 0.0  # usual interval, s; 0 before it is known
     gaps: int = 0
-    longest: float = 0.0
-    """Longest interval, s."""
-    backward: int = 0
-    """Stamps that do not increase."""
-    ahead: float = math.nan
-    """How far the first stamps are ahead of their times of recording, s; NaN: there are none."""
-    channels: int = 0
-    """Values in a message, of what could be gyros; else 0."""
-    announced: int = 0
-    """Values that a message says it has: whatever its bytes claim."""
-    largest: float = math.nan
-    """Largest value that can be a rate, rad/s; NaN: there is none."""
+    longest: float = 0.0  # longest interval, s
+    backward: int = 0  # stamps that do not increase
+    ahead: float = math.nan  # how far the first stamps are ahead of their times of recording, s; NaN: there are none
+    channels: int = 0  # values in a message, of what could be gyros; else 0
+    announced: int = 0  # values that a message says it has: whatever its bytes claim
+    largest: float = math.nan  # largest value that can be a rate, rad/s; NaN: there is none
     intervals: list[Array] = field(default_factory=list)
     copy_of: str = ""
     """Topic of the same sensor: its values are the same to rounding, turned, scaled or some messages apart."""
@@ -76,8 +61,7 @@ class TopicReport:
         """Of messages in which every value can be a rate; values that stay exactly the same for long."""
         self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)
         """(c,) values that are NaN or infinite, and finite ones beyond all rates."""
-        self.recent = np.zeros((0, channels))
-        """(K, c) values of the last messages, at most `RECENT`."""
+        self.recent = np.zeros((0, channels))  # (K, c) values of the last messages, at most `RECENT`
 
     @property
     def rate(self) -> float:

@@ -39,12 +39,9 @@ from fdi_ros.report.layout import (
 # Found by waiting ----------------------------------------------------------------------------------------------------
 
 
-WAITS = (0.02, 0.1, 0.5, 2.0)
-"""Times within which a fault may be found, s."""
-VIBRATION = 5.0
-"""Times by which vibration raises the noise, where noise_std is that at rest."""
-LEAST_SAMPLES = 1.5
-"""Below so many samples a mean delay is not computed: it depends on single samples."""
+WAITS = (0.02, 0.1, 0.5, 2.0)  # times within which a fault may be found, s
+VIBRATION = 5.0  # times by which vibration raises the noise, where noise_std is that at rest
+LEAST_SAMPLES = 1.5  # below so many samples a mean delay is not computed: it depends on single samples
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
@@ -102,8 +99,7 @@ def smallest_shift(samples: float, run_length: float) -> float:
 # The whole mounting --------------------------------------------------------------------------------------------------
 
 
-ALIKE = 0.9
-"""Above this |rho| telling two channels apart takes an error twice as large as seeing it."""
+ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it
 
 
 @dataclass(frozen=True)
@@ -111,8 +107,7 @@ class Loss:
     """What is left after some channels are lost."""
 
     lost: tuple[int, ...]
-    gdop: float = math.inf
-    """Infinite where the rest does not span space."""
+    gdop: float = math.inf  # infinite where the rest does not span space
     std: Array = field(default_factory=lambda: np.full(3, np.inf))
     """(3,) of the rate about each body axis at rest, rad/s."""
     detectable: tuple[int, ...] = ()
@@ -125,14 +120,12 @@ class Mounting:
 
     geometry: Geometry
     noise: NoiseModel
-    false_alarm_probability: float
-    """Per sample."""
+    false_alarm_probability: float  # per sample
     smallest: Array
     """(n,) error of each channel that is seen in one sample with probability DETECTION, rad/s; infinite: never."""
     waiting: dict[str, Array]
     """The errors (waits, n), rad/s, that an optimal sequential test finds, on average, within WAITS, by condition."""
-    losses: tuple[Loss, ...]
-    """Of nothing, of each channel in turn, of each pair."""
+    losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
 
     def pairs(self, above: float, up_to: float = math.inf) -> list[list[int]]:
         """Pairs of channels whose |rho| is above the one and not above the other."""

@@ -24,8 +24,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.noise import THREE_SIGMA
 from fdi_ros.model.samples import Array, Int, Mask
 
-LENGTH = 1.0
-"""Of a segment, s; longer where so few samples are in it that it could not be cut into blocks."""
+LENGTH = 1.0  # of a segment, s; longer where so few samples are in it that it could not be cut into blocks
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
 FEWEST, PART = 3, 100
@@ -34,8 +33,7 @@ AS_QUIET, ROUNDS = 1.5, 10
 """Noise this many times that of the quietest is as quiet; rounds in which the quiet ones are found."""
 QUIET = SLOWER = 2.0
 """More noise is that of motion: vibration; noise that is slower than a block may be so many times the other."""
-LARGEST_BIAS = 0.1
-"""rad/s, that a gyro at rest has."""
+LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
 MOST = 4096
 """Segments that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 
@@ -43,10 +41,8 @@ MOST = 4096
 class NoiseSegment(NamedTuple):
     """Values of a segment."""
 
-    first: int
-    """Time of its first sample, ns."""
-    means: Array
-    """(`REST_BLOCKS`, c) of blocks, rad/s."""
+    first: int  # time of its first sample, ns
+    means: Array  # (`REST_BLOCKS`, c) of blocks, rad/s
     std: Array
     """(c,) of the samples about their mean, rad/s: at rest that is their noise, also where a filter has smoothed it."""
     noise: Array
@@ -59,8 +55,7 @@ class NoiseSegments:
     """Segments of a recording, as its values of so many channels come."""
 
     def __init__(self, channels: int) -> None:
-        self.channels, self.every = channels, 1
-        """Of so many segments one is kept."""
+        self.channels, self.every = channels, 1  # of so many segments one is kept
         self._kept: list[NoiseSegment] = []
         self._passed = 0
         # Values (K, c) that do not make a segment yet, and their times, ns.
@@ -162,27 +157,21 @@ def _noise(values: Array) -> Array:
 
 
 STEPS = 25
-LEAST_VARIANCE = 1e-18
-"""(rad/s)^2; of what shows no noise at all."""
+LEAST_VARIANCE = 1e-18  # (rad/s)^2; of what shows no noise at all
 LEAST_SHARE = 0.1
 """Of the usual variance of the channels of a window: less for one of them is a split that nothing decides."""
-QUIETEST = 0.05
-"""Quantile of the windows that is about the quietest."""
+QUIETEST = 0.05  # quantile of the windows that is about the quietest
 LEAST_WINDOWS = 4
-MEMORY = 2
-"""Windows on both sides that the noise of the moment is averaged over."""
+MEMORY = 2  # windows on both sides that the noise of the moment is averaged over
 
 
 @dataclass(frozen=True)
 class Floor:
     """Noise that channels have by themselves, as far as the recording shows it."""
 
-    std: Array
-    """(n,) of one sample, rad/s."""
-    error: Array
-    """(n,) its standard error, rad/s."""
-    windows: Mask
-    """(W,) that it is from."""
+    std: Array  # (n,) of one sample, rad/s
+    error: Array  # (n,) its standard error, rad/s
+    windows: Mask  # (W,) that it is from
 
     @property
     def share(self) -> float:

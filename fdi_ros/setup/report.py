@@ -38,10 +38,8 @@ from fdi_ros.sources import source_of
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
-LEAST_JUDGED = 0.5
-"""Share of the samples that a monitor should judge."""
-MOST_POINTS = 2000
-"""Of a curve on the page."""
+LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
+MOST_POINTS = 2000  # of a curve on the page
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"

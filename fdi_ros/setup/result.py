@@ -20,22 +20,14 @@ from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.estimate import SCALE_STD, StateEstimate
 from fdi_ros.setup.findings import Finding, Role
 
-UNMEASURED = SCALE_STD / 2
-"""Uncertainty of the axes along a direction of the body from which they are not measured."""
-SHOWN_AXES = SCALE_STD / 4
-"""The same from which they are not well shown."""
-SHOWN_DELAY = 0.001
-"""The same of delays, s."""
-LEAST_SHARE = 0.2
-"""Part of a recording that supports its noise."""
-LARGE_SWING = float(np.radians(0.03))
-"""Change of a bias within a recording that is worth a look, rad/s."""
-LARGE_BIAS = 0.2
-"""rad/s."""
-LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05
-"""Axes that far from nominal are worth a look."""
-MANY = 0.01
-"""Share of the samples that are missing or spikes, which is worth a look."""
+UNMEASURED = SCALE_STD / 2  # uncertainty of the axes along a direction of the body from which they are not measured
+SHOWN_AXES = SCALE_STD / 4  # the same from which they are not well shown
+SHOWN_DELAY = 0.001  # the same of delays, s
+LEAST_SHARE = 0.2  # part of a recording that supports its noise
+LARGE_SWING = float(np.radians(0.03))  # change of a bias within a recording that is worth a look, rad/s
+LARGE_BIAS = 0.2  # rad/s
+LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05  # axes that far from nominal are worth a look
+MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
 
 
 class StampDelay(NamedTuple):
@@ -44,8 +36,7 @@ class StampDelay(NamedTuple):
     channels: tuple[int, ...]
     value: float
     """s; positive: their stamps are late, what they stand for was measured that much earlier. As imus.delays has it."""
-    error: float
-    """s."""
+    error: float  # s
 
     @property
     def shown(self) -> bool:
@@ -66,22 +57,15 @@ class Calibration:
     """Result for the channels in use; all that is per channel is in their order."""
 
     names: tuple[str, ...]
-    nominal: Array
-    """(n, 3) as configured."""
+    nominal: Array  # (n, 3) as configured
     estimate: StateEstimate
-    timing: float
-    """What is not known of the sampling instants, s, as written."""
-    delays: tuple[StampDelay, ...]
-    """Of all units but the first."""
+    timing: float  # what is not known of the sampling instants, s, as written
+    delays: tuple[StampDelay, ...]  # of all units but the first
     faults: tuple[Span, ...]
-    unusable: dict[str, Int]
-    """(n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes."""
-    duration: float
-    """Of the recording, s."""
-    settings: dict[str, object]
-    """Parameters to be changed, ``{"section.field": value}``."""
-    spectrum: Spectrum
-    """Of what channels differ by from the fused rate with these settings."""
+    unusable: dict[str, Int]  # (n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes
+    duration: float  # of the recording, s
+    settings: dict[str, object]  # parameters to be changed, ``{"section.field": value}``
+    spectrum: Spectrum  # of what channels differ by from the fused rate with these settings
 
     @property
     def units(self) -> tuple[tuple[int, ...], ...]:

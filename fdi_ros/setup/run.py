@@ -40,28 +40,21 @@ from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.sources import source_of
 from fdi_ros.system.text import shown
 
-SIZES = (0.03, 0.1, 0.3)
-"""Biases tried, rad/s."""
-WITHIN, TIMES = 4.0, 2
-"""s in which they are to be isolated, and how often each is tried."""
-CHANCE = 1
-"""Biases fewer isolated are chance."""
-LESS_JUDGED = 0.02
-"""Less in the share of samples judged is one at the edge of a gap."""
+SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
+WITHIN, TIMES = 4.0, 2  # s in which they are to be isolated, and how often each is tried
+CHANCE = 1  # biases fewer isolated are chance
+LESS_JUDGED = 0.02  # less in the share of samples judged is one at the edge of a gap
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0
 """Part of a recording that is kept aside, and its bounds, s: all biases are to have room."""
-MOST_NAMED = 12
-"""Topics that an error names."""
-LEAST_LEFT = 2 * LEAST_DURATION
-"""s that must be left to calibrate on."""
+MOST_NAMED = 12  # topics that an error names
+LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
 
 
 @dataclass(frozen=True)
 class Tried:
     """One config on the recording of a proof."""
 
-    baseline: Baseline | None
-    """As it is; None: the monitor judges nothing."""
+    baseline: Baseline | None  # as it is; None: the monitor judges nothing
     note: str
     isolated: dict[float, tuple[int, int]]
     """By size, rad/s: biases isolated, and all that were tried; empty: it is too short for any."""
@@ -94,10 +87,8 @@ def times_words(declared: Mapping[str, float]) -> str:
 class Proof:
     """What a recording, or a part of one, says of the settings."""
 
-    source: str
-    """Which, in words."""
-    apart: bool
-    """Whether it was not used for the settings."""
+    source: str  # which, in words
+    apart: bool  # whether it was not used for the settings
     seconds: float
     before: Tried
     after: Tried
@@ -146,14 +137,11 @@ Parameters = dict[str, object]
 class LearnedSettings:
     """A config, and the calibration that it is from; without one as it was before it."""
 
-    parameters: Parameters
-    """``{"section.field": value}`` of the config."""
+    parameters: Parameters  # ``{"section.field": value}`` of the config
     config: Config
     calibration: Calibration | None = None
-    why: FdiError | None = None
-    """For which there is no calibration."""
-    mounts: tuple[Mount, ...] = ()
-    """Of each unit; empty: channels in one array, or mounts that were given."""
+    why: FdiError | None = None  # for which there is no calibration
+    mounts: tuple[Mount, ...] = ()  # of each unit; empty: channels in one array, or mounts that were given
 
     @property
     def refused(self) -> str:
@@ -170,16 +158,12 @@ class LearnedSettings:
 class SetupResult(LearnedSettings):
     """The config that a recording gives, and what it is from."""
 
-    kept: str
-    """By what the calibration is no better than the settings before, which are kept then; empty: it is taken."""
+    kept: str  # by what the calibration is no better than the settings before, which are kept then; empty: it is taken
     mounting: Mounting
-    proof: Proof
-    """What it is worth."""
-    reports: Sequence[TopicReport] = ()
-    """Of all topics."""
+    proof: Proof  # what it is worth
+    reports: Sequence[TopicReport] = ()  # of all topics
     damage: tuple[str, ...] = ()
-    chosen: Sequence[TopicReport] = ()
-    """The topics of the gyros."""
+    chosen: Sequence[TopicReport] = ()  # the topics of the gyros
 
     @property
     def remarks(self) -> dict[str, str]:

@@ -18,14 +18,11 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from fdi_ros.model.samples import Array
 
-WALKS = np.geomspace(1e-6, 4e-3, 13)
-"""Tried, rad/s/sqrt(s)."""
+WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
 NO_WALK = 1e-7
 """rad/s/sqrt(s); moves no bias within a recording, and leaves the system one that rounding does not spoil."""
-SHOWN_GAIN = 4.0
-"""Log-likelihood that a walk must gain over none to be shown."""
-POSSIBLE = 2.0
-"""What one may lose against the best and be possible."""
+SHOWN_GAIN = 4.0  # Log-likelihood that a walk must gain over none to be shown
+POSSIBLE = 2.0  # what one may lose against the best and be possible
 
 
 class NormalEquations:
@@ -54,25 +51,18 @@ class NormalEquations:
 class Smoothed:
     """Estimate of all states."""
 
-    constant: Array
-    """(m,) the states that stay."""
-    constant_covariance: Array
-    """(m, m) of them."""
-    curve: Array
-    """(K, n) biases over time, rad/s."""
-    mean: Array
-    """(n,) their mean over the recording."""
-    mean_covariance: Array
-    """(n, n) of it."""
+    constant: Array  # (m,) the states that stay
+    constant_covariance: Array  # (m, m) of them
+    curve: Array  # (K, n) biases over time, rad/s
+    mean: Array  # (n,) their mean over the recording
+    mean_covariance: Array  # (n, n) of it
 
 
 class RandomWalk(NamedTuple):
     """How the biases walk, rad/s/sqrt(s)."""
 
-    value: float
-    """0: none shown."""
-    possible: float
-    """The largest that the recording does not rule out."""
+    value: float  # 0: none shown
+    possible: float  # the largest that the recording does not rule out
 
 
 def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:

@@ -28,32 +28,23 @@ from fdi_ros.system.text import shown
 
 _NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
 """Topics that name units as a config does: those of flight logs, counted as there."""
-_REST = 3.0
-"""Time at the start over which the bias could be learned, s."""
-_MOSTLY = 0.5
-"""Share of a recording in motion from which its noise is that in motion."""
-_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
-"""s; that of health.stale_timeout is the same."""
-_BRIDGED = 4.4
-"""Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
+_REST = 3.0  # time at the start over which the bias could be learned, s
+_MOSTLY = 0.5  # share of a recording in motion from which its noise is that in motion
+_TIMEOUT = float(PARAMETERS["imus.timeout"].default)  # s; that of health.stale_timeout is the same
+_BRIDGED = 4.4  # message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across
 _EXPLAINED = 0.3
 """A rotation must bring the difference between two units down to this share: what a fault makes of it stays."""
-_SILENT = 3.0
-"""Message intervals without a value after which a channel may be called silent."""
+_SILENT = 3.0  # message intervals without a value after which a channel may be called silent
 
 
 @dataclass(frozen=True)
 class StartingConfig:
     """A config to start from."""
 
-    bag: str
-    """Name of the recording."""
-    parameters: dict[str, Any]
-    """``{"section.field": value}``."""
-    remarks: dict[str, str]
-    """How they were found, by parameter."""
-    look: str = ""
-    """What a person is to look at before they are used; empty: nothing."""
+    bag: str  # name of the recording
+    parameters: dict[str, Any]  # ``{"section.field": value}``
+    remarks: dict[str, str]  # how they were found, by parameter
+    look: str = ""  # what a person is to look at before they are used; empty: nothing
 
     @property
     def text(self) -> str:
@@ -122,8 +113,7 @@ def _turned_units(path: Path, config: Config) -> str:
     return ", ".join(turned)
 
 
-Known = dict[str, tuple[Any, str]]
-"""Values of parameters, and remarks on them, by ``section.field``."""
+Known = dict[str, tuple[Any, str]]  # values of parameters, and remarks on them, by ``section.field``
 
 
 def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
