@@ -41,14 +41,7 @@ SIGNED_AXES = [
 def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) -> None:
     """Refuse units and channels that do not show one rotation, whatever the fit would make of them.
 
-    Parameters
-    ----------
-    data
-        The recording.
-    nominal
-        Axes as configured: good enough to tell a dead channel from a live one.
-    unknown
-        Channels of which nobody knows how they are mounted.
+    Axes as configured are good enough to tell a dead channel from a live one, but for those of unknown mount.
 
     Raises
     ------

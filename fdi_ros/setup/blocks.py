@@ -125,20 +125,15 @@ def repeated(z: Array, step: float) -> Mask:
     found, least = np.zeros(z.shape, dtype=bool), least_run(step)
     for k, values in enumerate(z.T):
         lengths = run_lengths(values)
-        long = lengths >= least
-        if long.any() and not _coarse(values, np.repeat(long, lengths), least):
-            found[:, k] = np.repeat(long, lengths)
+        long = np.repeat(lengths >= least, lengths)
+        if long.any():
+            others = values[np.isfinite(values) & ~long]
+            spans = np.sort(others[: len(others) // least * least].reshape(-1, least), axis=1)
+            different = (np.diff(spans, axis=1) > 0).sum(axis=1) + 1
+            # Where all values hardly change when it is quiet, one that stays is rest.
+            coarse = len(spans) > 0 and np.percentile(different, QUIETEST) <= COARSE
+            found[:, k] = long & (not coarse)
     return found
-
-
-def _coarse(values: Array, long: Mask, size: int) -> bool:
-    """Whether values (N,) outside the long runs (N,), too, hardly change when it is quiet, in spans of a size."""
-    others = values[np.isfinite(values) & ~long]
-    spans = others[: len(others) // size * size].reshape(-1, size)
-    if not len(spans):
-        return False
-    different = (np.diff(np.sort(spans, axis=1), axis=1) > 0).sum(axis=1) + 1
-    return bool(np.percentile(different, QUIETEST) <= COARSE)
 
 
 class Repeats:

@@ -150,12 +150,9 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
         If these are no three channels in use that span space.
     """
     names, units = geometry.channel_names, source_of(config).units
-    if not name and units:
-        return []
     if not name:
-        return next(
-            list(one) for one in itertools.combinations(range(geometry.n), 3) if spans_space(geometry.axes[list(one)])
-        )
+        threes = map(list, itertools.combinations(range(geometry.n), 3))
+        return [] if units else next(three for three in threes if spans_space(geometry.axes[three]))
     wanted = [f"{name}.{axis}" for axis in "xyz"] if name in units else [part.strip() for part in name.split(",")]
     chosen = [names.index(part) for part in wanted if part in names]
     if len(wanted) != 3 or len(set(chosen)) != 3 or not spans_space(geometry.axes[chosen]):

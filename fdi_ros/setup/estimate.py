@@ -56,9 +56,8 @@ WIDER = 1.5  # axes that are farther off than expected by so much are known less
 LEAST_BLOCKS = SUBS = 5
 """Of a window that tells its noise, and windows that tell whether it is coloured; blocks of the means that show it."""
 BASE = 7  # one, the rate, the angular acceleration
-ESTIMATED = ("bias", "scale", "delay")
+ESTIMATED = ("bias", "scale", "delay")  # kinds of error states, whose signals are linear in these
 (BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")
-"""Kinds of error states, whose signals are linear in these."""
 
 
 @dataclass(frozen=True)
@@ -113,14 +112,11 @@ class StateEstimate:
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
-    # Of the constants, the first are those that motion shows.
-    motion = 3 * n + units - 1
-    delay, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
-    # Delays that are taken off the blocks, and by how much they were to be others.
-    taken, moved = delay, np.inf
+    motion = 3 * n + units - 1  # of the constants, the first are those that motion shows
+    axes, biases, colour, prior_scale = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n)), sensors.scale_std
+    taken, moved = np.zeros(units), np.inf  # delays that are off the blocks, and by how much they were to be others
+    blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
-    colour = np.ones((2, n))
-    blocks, prior_scale = make_blocks(data, taken[sensors.unit]), sensors.scale_std
     for number in range(PASSES):
         one = _Pass(blocks, sensors, axes, taken, biases, number > 1, colour, prior_scale)
         if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
@@ -359,20 +355,18 @@ def coefficients_of(sensors: Priors, axes: Array, scale: Array) -> tuple[Array, 
     layouts = allocate(Layout)
     priors: dict[str, float | Array] = {"bias": sensors.bias_std, "scale": scale, "delay": sensors.delay_std}
     prepare_layout(layouts[0], sensors.unit, units, priors, {"bias": 0.0})
+    # Each of the base alone: rates, and accelerations along the channels.
     signals = np.zeros((BASE, n, SIGNALS))
-    zero = np.zeros(3)
+    rates, accelerations = np.eye(BASE, 3, -1), np.hstack([np.zeros((n, 4)), axes]).T.copy()
     for k in range(BASE):
-        rate = np.eye(3)[k - 1] if 1 <= k < 4 else zero
-        acceleration = axes[:, k - 4] if k >= 4 else np.zeros(n)
-        fill_signals(layouts[0], rate, np.ascontiguousarray(acceleration), signals[k])
+        fill_signals(layouts[0], rates[k], accelerations[k], signals[k])
     signals[1:, :, layouts[0]["by"] == ONE] = 0.0
     shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}
     coefficients = np.zeros((len(shown), n, BASE))
-    for i in range(n):
-        for k in range(SIGNALS):
-            if (place := int(layouts[0]["place"][i, k])) in order:
-                coefficients[order[place], i] += signals[:, i, k]
+    for i, k in np.ndindex(n, SIGNALS):
+        if (place := int(layouts[0]["place"][i, k])) in order:
+            coefficients[order[place], i] += signals[:, i, k]
     return coefficients, np.asarray(layouts[0]["prior"][shown])
 
 

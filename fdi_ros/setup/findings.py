@@ -173,17 +173,7 @@ def needs(reports: Sequence[TopicReport]) -> str:
 
 
 def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Iterator[Finding]:
-    """Say what a recording is fit for.
-
-    Parameters
-    ----------
-    reports
-        What was seen of each topic.
-    refused
-        Why no config can be made of it, where it needs nothing; empty: one can.
-    unit
-        Of rates.
-    """
+    """Say what a recording is fit for; refused: why no config can be made of it, where it needs nothing."""
     chosen = candidates(reports)
     lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
     if lacking or clocks:

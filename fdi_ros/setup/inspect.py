@@ -38,8 +38,8 @@ class TopicReport:
     kind: type[Source] | None  # how gyros are read from messages of its type; None: they are not
     received: int = 0
     malformed: int = 0
-    first: int = 0
-    last: int = 0  # time of recording of the first and last message, ns
+    first: int = 0  # time of recording of the first message, ns
+    last: int = 0  # the same of the last one
     interval: float = 0.0  # usual interval, s; 0 before it is known
     gaps: int = 0
     longest: float = 0.0  # longest interval, s
@@ -57,10 +57,9 @@ class TopicReport:
 
     def expect(self, channels: int) -> None:
         """Take messages of so many values for gyros."""
-        self.channels, self.segments, self.repeats = channels, NoiseSegments(channels), Repeats(channels)
-        """Of messages in which every value can be a rate; values that stay exactly the same for long."""
-        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)
-        """(c,) values that are NaN or infinite, and finite ones beyond all rates."""
+        self.channels, self.repeats = channels, Repeats(channels)
+        self.segments = NoiseSegments(channels)  # of messages in which every value can be a rate
+        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)  # (c,) values; and beyond all rates
         self.recent = np.zeros((0, channels))  # (K, c) values of the last messages, at most `RECENT`
 
     @property

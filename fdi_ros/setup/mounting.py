@@ -81,15 +81,10 @@ def smallest_shift(samples: float, run_length: float) -> float:
 
         A = 2 (exp(x) - x - 1) / s^2,    delay = 2 (exp(-x) + x - 1) / s^2
 
-    Parameters
-    ----------
-    samples
-        Mean delay, samples, > 1.
-    run_length
-        Mean number A of samples to a false alarm.
+    The delay is `samples` > 1, A is `run_length`, the mean number of samples to a false alarm.
     """
-    shift = math.sqrt(2 * math.log(run_length) / samples)
     level = math.log(run_length)
+    shift = math.sqrt(2 * level / samples)
     for _ in range(50):
         level = math.log(run_length * shift**2 / 2 + level + 1)
         shift = math.sqrt(2 * (math.exp(-level) + level - 1) / samples)

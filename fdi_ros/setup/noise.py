@@ -55,7 +55,8 @@ class NoiseSegments:
     """Segments of a recording, as its values of so many channels come."""
 
     def __init__(self, channels: int) -> None:
-        self.channels, self.every = channels, 1  # of so many segments one is kept
+        self.channels = channels
+        self.every = 1  # of so many segments one is kept
         self._kept: list[NoiseSegment] = []
         self._passed = 0
         # Values (K, c) that do not make a segment yet, and their times, ns.

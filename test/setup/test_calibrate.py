@@ -19,7 +19,6 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError, ConfigError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.setup import estimate
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.findings import Role, lines_of
@@ -166,36 +165,37 @@ def test_a_channel_that_fails_is_named_with_its_times_and_left_out() -> None:
 
 def test_contradictions_are_refused_and_named() -> None:
     one = hand()
-    wide = Config.from_parameters({**one.config.parameters(), "health.max_rate": [2000.0]})
+    z, stamp = one.block.z, one.block.stamp
+    wide = one.config.replaced({"health.max_rate": [2000.0]})
 
-    def refused(change: np.ndarray, said: str, stamp: np.ndarray = one.block.stamp, config: Config = wide) -> None:
-        with pytest.raises(CalibrationError, match=said):
+    def refused(words: str, columns: object, values: object, config: Config = wide, rows: slice = np.s_[:]) -> None:
+        change = z.copy()
+        change[rows, columns] = values
+        with pytest.raises(CalibrationError, match=words):
             calibrate(Block(stamp, change), config)
 
-    degrees, mirrored, swapped, dead = (one.block.z.copy() for _ in range(4))
-    degrees[:, 3:6] *= 57.3
-    refused(degrees, r"imu_2 shows 5\d.\d times the rotation that imu_1 and imu_3 show")
-    mirrored[:, 3] *= -1
-    refused(mirrored, r"imu_2 shows a roll to the right as one to the left, against imu_1 and imu_3: mend")
-    swapped[:, [6, 7, 8]] = swapped[:, [7, 8, 6]]
-    refused(
-        swapped,
-        r"imu_3 has swapped axes: its channels x, y, z are y, z, x of its mount as configured, against imu_1 and imu_2",
-    )
-    dead[:, 5] = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(dead))
-    refused(dead, r"imu_2", config=one.config)
-    off = one.block.z.copy()
-    off[len(off) // 4 :, 4] += 0.1
-    refused(off, r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; mend it")
-    z, stamp = one.block.z, one.block.stamp
-    refused(z[:100], r"1\.0 s long, a calibration needs at least 10 s", stamp[:100])
-    refused(z[::100], r"^the recording has \d\d samples, a calibration needs at least 100$", stamp[::100])
-    slow = stamp[0] + 100 * (stamp[::10] - stamp[0])
-    refused(z[::10], r"^the recording has a sample every 10 s, a calibration needs one every 1 s$", slow)
-    result = calibrate(
-        Block(one.block.stamp, dead),
-        Config.from_parameters({**one.config.parameters(), "excluded_channels": ["imu_2.z"]}),
-    )
+    refused(r"imu_2 shows 5\d.\d times the rotation that imu_1 and imu_3 show", np.s_[3:6], 57.3 * z[:, 3:6])
+    refused(r"imu_2 shows a roll to the right as one to the left, against imu_1 and imu_3: mend", 3, -z[:, 3])
+    swapped = "imu_3 has swapped axes: its channels x, y, z are y, z, x of its mount as configured, against imu_1 and"
+    refused(swapped, [6, 7, 8], z[:, [7, 8, 6]])
+    noise = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(z))
+    refused("imu_2", 5, noise, one.config)
+    off = r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; mend it"
+    late = np.s_[len(z) // 4 :]
+    refused(off, 4, z[late, 4] + 0.1, rows=late)
+    for words, block in (
+        (r"1\.0 s long, a calibration needs at least 10 s", Block(stamp[:100], z[:100])),
+        (r"^the recording has \d\d samples, a calibration needs at least 100$", Block(stamp[::100], z[::100])),
+        (
+            r"^the recording has a sample every 10 s, a calibration needs one every 1 s$",
+            Block(stamp[0] + 100 * (stamp[::10] - stamp[0]), z[::10]),
+        ),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            calibrate(block, wide)
+    dead = z.copy()
+    dead[:, 5] = noise
+    result = calibrate(Block(stamp, dead), one.config.replaced({"excluded_channels": ["imu_2.z"]}))
     assert len(result.names) == 8
     assert len(result.settings["geometry.axes"]) == 27
 
@@ -222,18 +222,6 @@ def test_a_noisy_channel_hides_no_rest() -> None:
     assert result.estimate.rest_seconds > 10.0
 
 
-def test_an_error_state_that_calibration_does_not_estimate_is_taken_to_be_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    axes, unit = hand().axes, np.repeat(np.arange(3), 3)
-    sensors = estimate.Priors(axes, unit, 3, np.full(9, 0.01), 0.02, 0.005)
-    whole, prior = estimate.coefficients_of(sensors, axes, sensors.scale_std)
-    # As if scale errors were a kind that only the monitor knows.
-    monkeypatch.setattr(estimate, "ESTIMATED", ("bias", "delay"))
-    part, part_prior = estimate.coefficients_of(sensors, axes, sensors.scale_std)
-    there = [*range(9), *range(len(whole) - 2, len(whole))]
-    np.testing.assert_array_equal(part, whole[there])
-    np.testing.assert_array_equal(part_prior, prior[there])
-
-
 def test_a_reference_is_believed() -> None:
     one = hand()
     result = calibrate(one.block, one.config, "imu_2")
@@ -253,14 +241,13 @@ def test_axes_of_an_array_are_found_from_those_of_its_first_three() -> None:
 
 
 def test_exact_repeats_are_not_data() -> None:
-    z = hand().block.z.copy()
+    stamp, z, coarse = hand().block.stamp, hand().block.z.copy(), np.round(hand().block.z, 2)
     z[-600:] = 0.0
-    assert (prepare(Block(hand().block.stamp, z), np.full(9, 35.0)).unusable["repeated"] == 600).all()
     # So coarse that at rest hardly any value changes: that is rest.
-    coarse = np.round(hand().block.z, 2)
     coarse[:1000] = coarse[0]
     coarse[np.arange(0, 1000, 60), 2] += 0.01
-    assert not prepare(Block(hand().block.stamp, coarse), np.full(9, 35.0)).unusable["repeated"].any()
+    for values, repeated in ((z, 600), (coarse, 0)):
+        assert (prepare(Block(stamp, values), np.full(9, 35.0)).unusable["repeated"] == repeated).all()
 
 
 def test_units_20_to_40_ms_apart_in_a_real_flight(root: Path) -> None:
