@@ -24,12 +24,10 @@ from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import WINDOW, Data
 
 LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s
-LEAST_RESPONSE = 0.3
-"""Share of the rotation that others see which a working channel shows at least, and they of what it shows."""
+LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
 FOLLOWS = 0.9  # correlation from which a channel shows the rotation, if on another scale
 LEAST_WINDOWS = 20  # in motion; with fewer, units are not compared, and no mount is estimated
-SHARED, SAME = 0.7, 0.9
-"""Share of the rotation that units have in common: less contradicts, more shows by which axes it would not."""
+SHARED, SAME = 0.7, 0.9  # share of rotation in common: less contradicts, more shows by which axes it would not
 SIGNED_AXES = [
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
@@ -181,8 +179,7 @@ LARGEST_ERROR = np.radians(2.0)  # a mount less certain than this, in any direct
 ROUNDING = 1e-9  # share of a rotation, about the axis that sees least of it, that is none
 LEAST_SHARED = 0.5  # share of the rotation of a unit that a mount must explain
 SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
-SQUARE = np.radians(10.0)
-"""A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
+SQUARE = np.radians(10.0)  # a mount this close to axes along axes is taken for that: the rest is misalignment
 
 
 def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:

@@ -22,8 +22,7 @@ from fdi_ros.model.samples import Array, Block, Int, Mask
 WINDOW = 0.25  # length of the windows that are at rest or not, faulty or not, s
 LEAST_SECONDS = 1.0  # shorter runs of one value are chance, s
 LEAST_SAMPLES = 50  # so are those of fewer samples
-COARSE = 3.0
-"""Gyros that show no more values than this in a quiet while are quantised so coarsely that one value is rest."""
+COARSE = 3.0  # gyros that show no more values in a quiet while are so coarse that one value is rest
 QUIETEST = 10.0  # percentile of the spans that are a quiet while
 SPIKE = 25.0  # usual sizes beyond which a value is a spike
 SPIKE_PORTION, RARE = 256, 0.1  # samples looked at at once, and share of them that may be spikes or beside one
@@ -36,8 +35,7 @@ class Data:
 
     stamp: NDArray[np.int64]  # (N,) ns
     z: Array  # (N, n) rad/s, NaN where not usable
-    unusable: dict[str, Int]
-    """(n,) samples of each channel that are not usable, by the reason: missing, not_finite, out_of_range, repeated."""
+    unusable: dict[str, Int]  # (n,) samples not usable, by the reason: missing, not_finite, out_of_range, repeated
 
     @property
     def seconds(self) -> Array:
@@ -170,8 +168,7 @@ class Blocks:
     seconds: Array  # (B,) middle of each block, s from the first sample
     mean: Array  # (B, n) rad/s; NaN where a channel lacks a sample
     start: Int  # (W,) first block of each window
-    samples: Array
-    """(W, n, n) covariance of single samples about their mean in each window, (rad/s)^2; NaN: a channel is missing."""
+    samples: Array  # (W, n, n) covariance of single samples in each window, (rad/s)^2; NaN: a channel is missing
     white: Array  # (n,) what interpolation has left of the variance of white noise in them
     count: Int  # (W,) samples that it is of
 

@@ -33,14 +33,12 @@ from fdi_ros.setup.result import Calibration, Span, StampDelay
 from fdi_ros.sources import source_of
 
 UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere
-UNKNOWN_AXES = 0.1
-"""The same of an array whose axes are found from the motion alone; those configured are not if they are off by more."""
+UNKNOWN_AXES = 0.1  # the same of an array; axes from the motion alone are taken if they are off by more
 REFERENCE_STD = 1e-6  # of channels that are taken for as configured
 LEAST_DURATION = 10.0  # s
 LEAST_SAMPLES, LONGEST_STEP = 100, 1.0  # samples, and s from one to the next
 LEAST_USABLE = 0.3  # share of its samples that a channel must give
-MOST_FAULTY = 0.35
-"""Share of the recording in which a channel may be faulty; with more, it cannot be said which channel is right."""
+MOST_FAULTY = 0.35  # share of the recording; of a channel faulty for longer it cannot be said which is right
 MOST_LEFT_OUT = 1 / 3  # share of the channels of a set that is left out: of a larger one nobody knows which are right
 LOUDER = 4.0
 """A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor

@@ -53,8 +53,7 @@ ALIKE = 5.0  # means of the windows at rest are at most so many of their standar
 LEAST_REST = 2.0  # s; less is chance
 USUAL_WALK = 2e-5  # rad/s/sqrt(s); of biases that show none
 WIDER = 1.5  # axes that are farther off than expected by so much are known less beforehand
-LEAST_BLOCKS = SUBS = 5
-"""Of a window that tells its noise, and windows that tell whether it is coloured; blocks of the means that show it."""
+LEAST_BLOCKS = SUBS = 5  # of a window that tells its noise, and of windows that tell its colour by longer means
 BASE = 7  # one, the rate, the angular acceleration
 ESTIMATED = ("bias", "scale", "delay")  # kinds of error states, whose signals are linear in these
 (BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")

@@ -226,8 +226,7 @@ FEWEST_QUANTILES = 2  # that must show motion
 FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
 """Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
 than so many times the factor of a degree."""
-STILL, NOISIEST = 0.3, 0.02
-"""Share of a recording that lies still; noise of a sample there, rad/s, that no gyro at rest has."""
+STILL, NOISIEST = 0.3, 0.02  # share of a recording that lies still; noise there, rad/s, that no gyro at rest has
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:

@@ -49,8 +49,7 @@ class TopicReport:
     announced: int = 0  # values that a message says it has: whatever its bytes claim
     largest: float = math.nan  # largest value that can be a rate, rad/s; NaN: there is none
     intervals: list[Array] = field(default_factory=list)
-    copy_of: str = ""
-    """Topic of the same sensor: its values are the same to rounding, turned, scaled or some messages apart."""
+    copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
 
     def __post_init__(self) -> None:
         self.expect(0)

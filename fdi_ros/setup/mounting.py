@@ -118,8 +118,7 @@ class Mounting:
     false_alarm_probability: float  # per sample
     smallest: Array
     """(n,) error of each channel that is seen in one sample with probability DETECTION, rad/s; infinite: never."""
-    waiting: dict[str, Array]
-    """The errors (waits, n), rad/s, that an optimal sequential test finds, on average, within WAITS, by condition."""
+    waiting: dict[str, Array]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
     losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
 
     def pairs(self, above: float, up_to: float = math.inf) -> list[list[int]]:

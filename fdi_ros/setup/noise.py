@@ -27,15 +27,11 @@ from fdi_ros.model.samples import Array, Int, Mask
 LENGTH = 1.0  # of a segment, s; longer where so few samples are in it that it could not be cut into blocks
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-FEWEST, PART = 3, 100
-"""So many of the quietest segments, or one in so many, tell the noise at rest: of a long flight few are."""
-AS_QUIET, ROUNDS = 1.5, 10
-"""Noise this many times that of the quietest is as quiet; rounds in which the quiet ones are found."""
-QUIET = SLOWER = 2.0
-"""More noise is that of motion: vibration; noise that is slower than a block may be so many times the other."""
+FEWEST, PART = 3, 100  # of the quietest segments so many, or one in so many, tell the noise at rest
+AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest is as quiet; rounds in which these are found
+QUIET = SLOWER = 2.0  # more noise is vibration; what is slower than a block may be so many times the other
 LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
-MOST = 4096
-"""Segments that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
+MOST = 4096  # segments kept; of a longer recording every second one, and so on: memory does not grow with its length
 
 
 class NoiseSegment(NamedTuple):
@@ -43,12 +39,9 @@ class NoiseSegment(NamedTuple):
 
     first: int  # time of its first sample, ns
     means: Array  # (`REST_BLOCKS`, c) of blocks, rad/s
-    std: Array
-    """(c,) of the samples about their mean, rad/s: at rest that is their noise, also where a filter has smoothed it."""
-    noise: Array
-    """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included; 0: the values never change."""
-    block_noise: Array
-    """(c,) the same of the blocks, that which is slower included where it is no more than `SLOWER` times as large."""
+    std: Array  # (c,) of the samples about their mean, rad/s: at rest their noise, also where a filter has smoothed it
+    noise: Array  # (c,) of a sample, rad/s: what no smooth motion reaches; 0: the values never change
+    block_noise: Array  # (c,) of the blocks, with slower noise that is no more than `SLOWER` times as large
 
 
 class NoiseSegments:
@@ -159,8 +152,7 @@ def _noise(values: Array) -> Array:
 
 STEPS = 25
 LEAST_VARIANCE = 1e-18  # (rad/s)^2; of what shows no noise at all
-LEAST_SHARE = 0.1
-"""Of the usual variance of the channels of a window: less for one of them is a split that nothing decides."""
+LEAST_SHARE = 0.1  # of the usual variance in a window: less for one channel is a split that nothing decides
 QUIETEST = 0.05  # quantile of the windows that is about the quietest
 LEAST_WINDOWS = 4
 MEMORY = 2  # windows on both sides that the noise of the moment is averaged over

@@ -34,8 +34,7 @@ class StampDelay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
-    value: float
-    """s; positive: their stamps are late, what they stand for was measured that much earlier. As imus.delays has it."""
+    value: float  # s; positive: their stamps are late, what they stand for was measured earlier; as imus.delays has it
     error: float  # s
 
     @property

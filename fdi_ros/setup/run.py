@@ -44,8 +44,7 @@ SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
 WITHIN, TIMES = 4.0, 2  # s in which they are to be isolated, and how often each is tried
 CHANCE = 1  # biases fewer isolated are chance
 LESS_JUDGED = 0.02  # less in the share of samples judged is one at the edge of a gap
-KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0
-"""Part of a recording that is kept aside, and its bounds, s: all biases are to have room."""
+KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0  # part kept aside, and its bounds, s: all biases have room
 MOST_NAMED = 12  # topics that an error names
 LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
 
@@ -56,8 +55,7 @@ class Tried:
 
     baseline: Baseline | None  # as it is; None: the monitor judges nothing
     note: str
-    isolated: dict[float, tuple[int, int]]
-    """By size, rad/s: biases isolated, and all that were tried; empty: it is too short for any."""
+    isolated: dict[float, tuple[int, int]]  # by size, rad/s: biases isolated, and tried; empty: too short
 
     @property
     def judged(self) -> float:

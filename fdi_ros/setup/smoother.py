@@ -19,8 +19,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from fdi_ros.model.samples import Array
 
 WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
-NO_WALK = 1e-7
-"""rad/s/sqrt(s); moves no bias within a recording, and leaves the system one that rounding does not spoil."""
+NO_WALK = 1e-7  # rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
 SHOWN_GAIN = 4.0  # Log-likelihood that a walk must gain over none to be shown
 POSSIBLE = 2.0  # what one may lose against the best and be possible
 

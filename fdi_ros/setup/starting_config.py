@@ -26,14 +26,12 @@ from fdi_ros.setup.inspect import TopicReport, inspect
 from fdi_ros.sources import input_of
 from fdi_ros.system.text import shown
 
-_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
-"""Topics that name units as a config does: those of flight logs, counted as there."""
+_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")  # topics of flight logs, which name units as a config does
 _REST = 3.0  # time at the start over which the bias could be learned, s
 _MOSTLY = 0.5  # share of a recording in motion from which its noise is that in motion
 _TIMEOUT = float(PARAMETERS["imus.timeout"].default)  # s; that of health.stale_timeout is the same
 _BRIDGED = 4.4  # message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across
-_EXPLAINED = 0.3
-"""A rotation must bring the difference between two units down to this share: what a fault makes of it stays."""
+_EXPLAINED = 0.3  # a rotation must bring the difference between two units down to this share: a fault stays
 _SILENT = 3.0  # message intervals without a value after which a channel may be called silent
 
 
