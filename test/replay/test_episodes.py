@@ -36,31 +36,20 @@ STEP = 2.0**-6
 """s; times and residuals of the tests are sums of powers of two, so that sums are exact in any order."""
 
 
-def outputs(geometry, states, errors=None, time=None, rate=0.0):
+def outputs(geometry, states, errors=None, time=None):
     """Samples with these states (N, n) and errors (N, n) of the channels, fused from the channels that are OK."""
     states = np.asarray(states, dtype=np.uint8)
     count, n = states.shape
     time = STEP * np.arange(count) if time is None else np.asarray(time)
-    z = np.zeros((count, n)) if errors is None else np.asarray(errors, dtype=float)
     stamp = np.round(time * 1e9).astype(np.int64)
     before = np.vstack([np.zeros(n, dtype=np.uint8), states[:-1]])
     events = [
         Event(int(stamp[k]), int(i), S(before[k, i]), S(states[k, i]), Reason.DISAGREES, (int(i),), 0.0, int(k))
         for k, i in np.argwhere(states != before)
     ]
-    return time, output_of(
-        n,
-        events,
-        stamp=stamp,
-        rate=np.full((count, 3), rate),
-        residual=z,
-        covariance=np.broadcast_to(1e-6 * np.eye(3), (count, 3, 3)),
-        state=states,
-        valid=np.ones(count, dtype=np.uint8),
-        statistic=np.ones(count),
-        threshold=np.full(count, 2.0),
-        level=np.full((count, 3), 0.01),
-    )
+    figures = {"rate": 0.0, "statistic": 1.0, "threshold": 2.0, "level": 0.01, "valid": True}
+    figures |= {"residual": 0.0 if errors is None else errors, "covariance": 1e-6 * np.eye(3), "state": states}
+    return time, output_of(n, events, stamp=stamp, **figures)
 
 
 def cut(output, rows):
@@ -74,10 +63,9 @@ def told(geometry, *parts, pieces=1):
     for number, (time, output) in enumerate(parts):
         if number:
             recorder.begin_stretch()
-        for rows in np.array_split(np.arange(len(time)), pieces):
-            if len(rows):
-                span = slice(int(rows[0]), int(rows[-1]) + 1)
-                recorder.add(time[span], cut(output, span))
+        for rows in filter(len, np.array_split(np.arange(len(time)), pieces)):
+            span = slice(int(rows[0]), int(rows[-1]) + 1)
+            recorder.add(time[span], cut(output, span))
     return recorder.story()
 
 
@@ -94,16 +82,12 @@ def course(n, count, *changes):
 def histories(draw):
     """States that change now and then, in an order no monitor would give, and holes in the time."""
     count, n = draw(st.integers(2, 80)), THREE.n
-    states = np.zeros((count, n), dtype=np.uint8)
-    for row, channel, state in draw(
-        st.lists(st.tuples(st.integers(0, count - 1), st.integers(0, n - 1), st.sampled_from(S)), max_size=25)
-    ):
-        states[row:, channel] = state
+    change = st.tuples(st.integers(0, count - 1), st.integers(0, n - 1), st.sampled_from(S))
+    changes = draw(st.lists(change, max_size=25))
     steps = np.full(count, STEP)
-    for row in draw(st.lists(st.integers(1, count - 1), max_size=2)):
-        steps[row] = 0.5
+    steps[draw(st.lists(st.integers(1, count - 1), max_size=2))] = 0.5
     errors = draw(st.integers(0, 2**16)) * 2.0**-12 * np.ones((count, n)) * np.arange(n)
-    return outputs(THREE, states, errors, np.cumsum(steps))
+    return outputs(THREE, course(n, count, *((row, {i: s}) for row, i, s in changes)), errors, np.cumsum(steps))
 
 
 @given(histories(), st.integers(1, 40))
@@ -151,23 +135,18 @@ def test_the_size_is_the_error_whatever_was_fused(seed, channel, error, left_out
 
 def test_a_fault_that_comes_to_a_name_is_one_episode():
     pair, whole = {4: S.AMBIGUOUS, 0: S.AMBIGUOUS}, dict.fromkeys(range(9), S.AMBIGUOUS)
-    narrowed = {**dict.fromkeys(range(9), S.OK), **pair}
-    named = {0: S.OK, 4: S.FAULTY}
-    time = 60.0 + np.arange(4000) * 0.008
-    errors = np.zeros((4000, 9))
+    time, errors = 60.0 + np.arange(4000) * 0.008, np.zeros((4000, 9))
     errors[:, 4] = 0.042 + 0.01 * np.maximum(0, time - 65.668) + np.random.default_rng(1).normal(0, 0.004, 4000)
     rows = [int(np.searchsorted(time, at)) for at in (63.072, 63.080, 65.668)]
-    states = course(9, 4000, *zip(rows, (whole, narrowed, named), strict=True))
+    steps = (whole, {**dict.fromkeys(range(9), S.OK), **pair}, {0: S.OK, 4: S.FAULTY})
+    states = course(9, 4000, *zip(rows, steps, strict=True))
     (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
     assert one.words == (
         "imu_2.y FAULTY from 65.672 s (+0.0466 +- 0.0013 rad/s, growing to +0.304 rad/s); any of the 9 channels"
         " from 63.072 s, it or imu_1.x from 63.080 s"
     )
-    assert [(step.state, len(step.channels)) for step in one.steps] == [
-        ("AMBIGUOUS", 9),
-        ("AMBIGUOUS", 2),
-        ("FAULTY", 1),
-    ]
+    counts = [(step.state, len(step.channels)) for step in one.steps]
+    assert counts == [("AMBIGUOUS", 9), ("AMBIGUOUS", 2), ("FAULTY", 1)]
     assert dict(detail_words(one))["what else explains it"] == "no other channel by itself"
     assert one.rate.published == 1.0
 
@@ -175,15 +154,16 @@ def test_a_fault_that_comes_to_a_name_is_one_episode():
 def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart():
     errors = np.zeros((1000, 6))
     errors[:, 0] = np.random.default_rng(2).normal(0.1, 0.15, 1000)
-    (one,) = told(TWO, outputs(TWO, course(6, 1000, (100, {0: S.AMBIGUOUS, 3: S.AMBIGUOUS})), errors)).episodes
-    assert one.words == "the x axis of imu_0 or imu_1 AMBIGUOUS from 1.562 s, 0.096 +- 0.005 rad/s apart"
-    assert dict(detail_words(one))["axis"] == "x of the body"
-    # Before the evidence has come to the pair, the sizes show it.
-    everything = course(6, 1000, (100, dict.fromkeys(range(6), S.AMBIGUOUS)))
-    (one,) = told(TWO, outputs(TWO, everything, errors)).episodes
-    assert one.words == (
-        "any of the 6 channels AMBIGUOUS from 1.562 s, seen on the x axis of imu_0 or imu_1: 0.096 +- 0.005 rad/s apart"
-    )
+    axis, apart = "the x axis of imu_0 or imu_1", "0.096 +- 0.005 rad/s apart"
+    for channels, measured, words in (
+        ((0, 3), "x of the body", f"{axis} AMBIGUOUS from 1.562 s, {apart}"),
+        # Before the evidence has come to the pair, the sizes show it.
+        (range(6), "x, y, z of the body", f"any of the 6 channels AMBIGUOUS from 1.562 s, seen on {axis}: {apart}"),
+    ):
+        states = course(6, 1000, (100, dict.fromkeys(channels, S.AMBIGUOUS)))
+        (one,) = told(TWO, outputs(TWO, states, errors)).episodes
+        assert one.words == words
+        assert dict(detail_words(one))["axis"] == measured
     turned = Geometry.from_triads([np.eye(3), [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]])
     assert one_of_words(turned, [0, 4]) == "imu_1.x or imu_2.y, which measure one axis,"
     assert one_of_words(turned, [3, 4, 5]) == "any axis of imu_2"
@@ -213,10 +193,10 @@ def test_what_hides_for_a_while_is_no_new_declaration_and_a_hole_is_no_silence()
 
 
 def test_units_that_begin_one_after_the_other_were_not_silent():
-    late = course(9, 500, (0, dict.fromkeys((3, 4, 5), S.STALE)), (3, dict.fromkeys((3, 4, 5), S.OK)))
+    silent = (0, dict.fromkeys((3, 4, 5), S.STALE))
+    late = course(9, 500, silent, (3, dict.fromkeys((3, 4, 5), S.OK)))
     assert told(THREE, outputs(THREE, late)).episodes == ()
-    never = course(9, 500, (0, dict.fromkeys((3, 4, 5), S.STALE)))
-    (one,) = told(THREE, outputs(THREE, never)).episodes
+    (one,) = told(THREE, outputs(THREE, course(9, 500, silent))).episodes
     assert (one.who, one.state, one.stands) == ("imu_2", "STALE", True)
 
 
@@ -259,14 +239,13 @@ def test_a_new_stretch_is_told_of_for_itself():
 @given(st.lists(st.floats(0.001, 30.0), min_size=1, max_size=60), st.integers(1, 20))
 def test_stretches_are_cut_at_gaps_and_nowhere_else(steps, count):
     stamp = np.cumsum(np.round(np.array(steps) * 1e9)).astype(np.int64)
-    stretches, found = Stretches(), []
+    stretches, found = Stretches(), [[]]
     for part in np.array_split(stamp, count):
         for anew, block in stretches.cut(Block(part, np.zeros((len(part), 1)))):
-            if anew or not found:
-                found.append([])
-            found[-1] += block.stamp.tolist()
-    assert [at for part in found for at in part] == stamp.tolist()
+            found += [[]] * (anew and found != [[]])
+            found[-1] = found[-1] + block.stamp.tolist()
     assert found == [stamp[rows].tolist() for rows in pieces(stamp, GAP)]
+    assert [at for part in found for at in part] == stamp.tolist()
 
 
 TIME = np.arange(2000) * 0.01

@@ -16,7 +16,7 @@ from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event
-from fdi_ros.replay.evaluate import Evaluation, Rms
+from fdi_ros.replay.evaluate import Evaluation
 from fdi_ros.replay.outcomes import score
 from fdi_ros.replay.words import fault_sections, sentences, verdict
 from fdi_ros.report.verdict import Severity
@@ -54,9 +54,8 @@ def test_how_the_stream_is_cut_into_outputs_changes_nothing(drawn, step):
 
 def test_the_error_counts_as_undetected_up_to_the_sample_of_the_declaration():
     rms = scored([FAULT], event(12, 1, S.FAULTY)).fault_effect_rad_s
-    assert rms.before_detection == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in (10, 11, 12)])))
-    after = range(13, 20)
-    assert rms.after_detection == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in after])))
+    for value, seconds in ((rms.before_detection, range(10, 13)), (rms.after_detection, range(13, 20))):
+        assert value == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in seconds])))
 
 
 def test_an_error_that_no_method_can_give_is_not_there():
@@ -151,12 +150,10 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     named = [event(14, i, S.FAULTY, before=S.AMBIGUOUS) for i in (0, 5)]
     told = summary_of(replace(scored(faults, *both, *named), samples_judged=40))
     assert verdict(told) == (Severity.GOOD, "2 of 2 injected faults detected, 2 isolated.")
-    assert sentences(told) == [
-        "bias on g1: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
-        "bias on g6: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
-        "No other channel was declared faulty by itself; under doubt with them: g4.",
-    ]
-    table = fault_sections(scored(faults, *both, *named))[0].content
+    words = "detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms."
+    last = "No other channel was declared faulty by itself; under doubt with them: g4."
+    assert sentences(told) == [f"bias on g1: {words}", f"bias on g6: {words}", last]
+    table = fault_sections(told.scores)[0].content
     assert [row[-4:] for row in table[1]] == [("2000.0 ms", "AMBIGUOUS", "4000.0 ms", "g1, g4, g6")] * 2
     unnamed = summary_of(replace(scored(faults, *both), samples_judged=40))
     assert verdict(unnamed).severity is Severity.UNKNOWN
@@ -164,16 +161,7 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
 
 
 def test_a_fault_on_what_is_declared_already_is_not_called_missed():
-    summary = scored(["channel=g2 kind=bias size=1 start=30"], event(5, 1, S.FAULTY))
-    (found,) = summary.faults
-    assert found.declared_before
-    assert found.detected_at_s is None
+    (found,) = scored(["channel=g2 kind=bias size=1 start=30"], event(5, 1, S.FAULTY)).faults
+    assert (found.declared_before, found.detected_at_s) == (True, None)
     (of_a_unit,) = scored(["channel=g1,g2,g3 kind=triad_loss start=30"], event(5, 1, S.FAULTY)).faults
     assert not of_a_unit.declared_before
-
-
-def test_rms_of_vectors():
-    rms = Rms()
-    assert rms.value is None
-    rms.add(np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-    assert rms.value == pytest.approx(np.sqrt(25 / 2))

@@ -45,18 +45,18 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
     code, out, _ = fdi(*words, "--report", page, "--json", told)
     assert code == 3
-    first = out.splitlines()[0]
-    assert re.match(
-        r"FAULTY: imu_2\.y from 5\d\.\d{3} s \([+]0\.0\d+ \+- 0\.0\d+ rad/s, growing to [+]0\.0\d+ rad/s\)", first
-    )
-    assert "\n       axis: -x of the body\n" in out
-    assert re.search(
-        r"\n       size: imu_2\.y growing: [+]0\.0035\d* rad/s a second, from [+]0\.0\d+ to [+]0\.0[789]", out
-    )
-    assert "\n       what else explains it: no other channel by itself\n" in out
-    assert "\n       fused rate meanwhile: published throughout, its standard deviation 0.0" in out
+    size = r"[+]0\.0\d+"
+    for line in (
+        rf"\AFAULTY: imu_2\.y from 5\d\.\d{{3}} s \({size} \+- 0\.0\d+ rad/s, growing to {size} rad/s\)",
+        r"\n       axis: -x of the body\n",
+        rf"\n       size: imu_2\.y growing: [+]0\.0035\d* rad/s a second, from {size} to [+]0\.0[789]",
+        r"\n       what else explains it: no other channel by itself\n",
+        r"\n       fused rate meanwhile: published throughout, its standard deviation 0\.0",
+    ):
+        assert re.search(line, out), line
     for text in (out, visible(page)):
         assert not JUDGEMENT.search(text), JUDGEMENT.search(text)
+    first = out.splitlines()[0]
     assert first[:-1] in html.unescape(visible(page))
     summary = json.loads(told.read_text())
     (episode,) = summary["episodes"]
@@ -95,13 +95,11 @@ def test_a_check_works_without_an_injected_fault(check, unmet, told):
 
 def two_armings(path, write, *, faulty=True):
     """Three units, disarmed for 70 s in between; 5 s into the second arming imu_2.y is off by 0.08 rad/s."""
-    parts = [logs.units(3, seconds=ARMINGS[0], start=10.0), logs.units(3, seconds=ARMINGS[0], start=110.0, seed=1)]
-    units = [
-        logs.Unit(*(np.concatenate([getattr(part[k], name) for part in parts]) for name in logs.Unit.__annotations__))
-        for k in range(3)
-    ]
-    if faulty:
-        units[2].rate[3500:, 1] += np.float32(0.08)
+    units = logs.units(3, seconds=ARMINGS[0], start=10.0)
+    for unit, later in zip(units, logs.units(3, seconds=ARMINGS[0], start=110.0, seed=1), strict=True):
+        for name, values in vars(later).items():
+            setattr(unit, name, np.concatenate([getattr(unit, name), values]))
+    units[2].rate[3500:, 1] += np.float32(0.08 * faulty)
     return write(path, units)
 
 
@@ -121,25 +119,17 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     assert (one.stretch, one.state, one.channels) == (2, "FAULTY", ("imu_2.y",))
     assert one.start_s == pytest.approx(105.0, abs=0.5)
     assert verdict(summary).words == f"FAULTY: {one.words.replace(' FAULTY', '')}."
-    text = summary_text(summary)
     assert "\nnote: stretch 1: 0.000 s to 29.990 s, 90 % judged, nothing declared\n" in text
     assert "\nnote: stretch 2: 100.000 s to 129.990 s, 100 % judged, 1 episode\n" in text
     assert [round(one["start_s"]) for one in as_json(summary)["stretches"]] == [0, 100]
     # What stood at the end of the first is no evidence in the second.
-    log, config = armings
     early = parse_fault("channel=imu_0.x kind=bias size=0.1 start=20 stop=50")
-    scored = replay(Request(log, config, (early,))).story
-    assert [(one.stretch, one.channels, one.injected) for one in scored.episodes] == [
-        (1, ("imu_0.x",), ("bias on imu_0.x",)),
-        (2, ("imu_2.y",), ()),
-    ]
-
-
-def test_a_fault_is_not_injected_where_nothing_is_recorded(armings):
-    log, config = armings
-    fault = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
+    first, second = replay(Request(*armings, (early,))).story.episodes
+    assert (first.stretch, first.channels, first.injected) == (1, ("imu_0.x",), ("bias on imu_0.x",))
+    assert (second.stretch, second.channels, second.injected) == (2, ("imu_2.y",), ())
+    late = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
     with pytest.raises(FaultError, match=r"starts at 60 s, expected at most 29\.99 s or at least"):
-        replay(Request(log, config, (fault,)))
+        replay(Request(*armings, (late,)))
 
 
 def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
@@ -150,25 +140,20 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
     assert len(tried.times) == 9
     assert tried.skipped == ()
     first, second = ([at for at in tried.times if (at > 50) == late] for late in (False, True))
-    assert len(first) >= 3
-    assert len(second) >= 3
-    assert max(first) + 5 <= ARMINGS[0]
-    assert min(second) >= ARMINGS[1]
+    assert min(len(first), len(second)) >= 3
+    assert max(first) + 5 <= ARMINGS[0] < ARMINGS[1] <= min(second)
     assert {trial.scored.outcome.value for trial in tried.trials} == {"named"}
     with pytest.raises(FaultError, match="in no piece of it without a gap long enough to watch a fault for 40 s"):
         sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
 
 
 def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
-    pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
-    import pyarrow.parquet as parquet
-
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed (extra: fleet)")
     folder, out = tmp_path / "kite", tmp_path / "out"
     folder.mkdir()
     two_armings(folder / "log.bin", logs.write_dataflash)
     assert fdi("fleet", folder, "--output", out, "--workers", 1, "--quiet")[::2] == (3, "")
-    (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
-    (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
+    (flight,), (one,) = (parquet.read_table(out / f"{name}.parquet").to_pylist() for name in ("flights", "episodes"))
     assert (flight["error"], flight["episodes"], one["channels"]) == ("", 1, ["imu_2.y"])
     assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
     assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)

@@ -133,30 +133,29 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
 def test_figures_of_a_vehicle_at_rest_are_called_that():
     # The flight rests for its first 8 s.
     at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
+    text = sweep_text([at_rest], plan, "bag")
     # Of a dozen faults the share is not 95 %, whatever came of them.
-    told = "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76% to 100%)"
-    assert told in sweep_text([at_rest], plan, "bag")
-    assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in sweep_text([at_rest], plan, "bag")
+    assert "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%" in text
+    assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in text
     moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
     assert "AT REST" not in sweep_page([moving], plan, "bag", {})
 
 
 def test_a_monitor_that_judges_nothing_is_no_result():
     config = Config.from_file(FILE, {"bias.startup_bias_duration": 500.0})
-    with pytest.raises(
-        FaultError, match="it judges nothing of this recording: it ends after 6001 samples, before the biases"
-    ):
-        sweep([Subject("own", config, flown())], Plan(parse_swept("kind=stuck")))
+    slow, own = Subject("slow", config, flown()), Subject("own", Config.from_file(FILE), flown())
+    words = "it judges nothing of this recording: it ends after 6001 samples, before the biases"
+    with pytest.raises(FaultError, match=words):
+        sweep([slow], Plan(parse_swept("kind=stuck")))
     with pytest.raises(FaultError, match="no fault can be tried: its topics have no time in common"):
         swept(flown()[:0])
     with pytest.raises(FaultError, match="too short to watch a fault for 70 s"):
         swept(flown(), within=70.0)
-    both = [Subject("slow", config, flown()), Subject("own", Config.from_file(FILE), flown())]
     plan = Plan(parse_swept("kind=dropout"), times=1, within=1.0)
-    slow, own = sweep(both, plan)
-    assert not slow.trials
-    assert [trial.scored.outcome for trial in own.trials] == ["named"] * 6
-    assert "judges nothing" in sweep_text([slow, own], plan, "bag")
+    nothing, six = sweep([slow, own], plan)
+    assert not nothing.trials
+    assert [trial.scored.outcome for trial in six.trials] == ["named"] * 6
+    assert "judges nothing" in sweep_text([nothing, six], plan, "bag")
 
 
 def test_excluded_channels_are_not_tried(fdi, tmp_path):
