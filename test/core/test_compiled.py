@@ -36,9 +36,10 @@ print("says", core["decision"]["faulty"][0], core["decision"]["ambiguous"][0])
 """
 
 
-def place(folder, package, *left_out):
-    """A copy of the package, beside a home and a folder for temporary files."""
-    shutil.copytree(package / "fdi_ros", folder / "copy" / "fdi_ros", ignore=shutil.ignore_patterns(*left_out))
+def place(folder, package):
+    """A copy of the package that nothing was compiled in, beside a home and a folder for temporary files."""
+    leave_out = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(package / "fdi_ros", folder / "copy" / "fdi_ros", ignore=leave_out)
     (folder / "home").mkdir()
     (folder / "temporary").mkdir()
     return folder / "copy"
@@ -46,19 +47,18 @@ def place(folder, package, *left_out):
 
 @pytest.fixture
 def copy(tmp_path, root):
-    """A copy of the package that nothing was compiled in."""
-    return place(tmp_path, root, "__pycache__")
+    return place(tmp_path, root)
 
 
 @pytest.fixture(scope="module")
-def started(tmp_path_factory):
-    """A copy in which it was started once, where that has kept what it compiled, and a copy of both."""
+def started(tmp_path_factory, root):
+    """A copy in which it was started once, where that has kept what it compiled, and a copy of all."""
     folder = tmp_path_factory.mktemp("started")
-    package = place(folder / "at", Path(__file__).parents[2], "__pycache__")
+    package = place(folder / "at", root)
     kept, says, output = outcome(start(package))
     assert says == "0 0"
     assert "compiled it in" in output
-    place(folder / "kept", package)
+    shutil.copytree(folder / "at", folder / "kept")
     return package, kept, folder / "kept"
 
 
@@ -74,15 +74,8 @@ def warm(started):
 def start(copy, **environment):
     place = {"PYTHONPATH": str(copy), "HOME": str(copy.parent / "home"), "TMPDIR": str(copy.parent / "temporary")}
     inherited = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
-    command = [sys.executable, "-B", "-c", SCRIPT]
-    return subprocess.Popen(
-        command,
-        env={**inherited, **place, **environment},
-        cwd=copy,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
+    env, out = {**inherited, **place, **environment}, {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    return subprocess.Popen([sys.executable, "-B", "-c", SCRIPT], env=env, cwd=copy, text=True, **out)
 
 
 def outcome(process):
@@ -94,9 +87,11 @@ def outcome(process):
     return Path(lines["kept"].removeprefix("in ")), lines["says"], output
 
 
-def cannot_be_written(folder):
-    """Put a file where a folder would have to be made: which fails for every user, root too."""
-    folder.write_text("")
+@pytest.fixture
+def closed(copy):
+    """A copy in which nothing can be kept: a file is where a folder would be, which fails for every user, root too."""
+    (copy / "fdi_ros" / "__pycache__").write_text("")
+    return copy
 
 
 def test_first_starts_at_once_then_a_load(copy):
@@ -112,12 +107,11 @@ def test_first_starts_at_once_then_a_load(copy):
     assert "compiled it in" not in warm[2]
 
 
-def test_installation_that_cannot_be_written(copy):
-    cannot_be_written(copy / "fdi_ros" / "__pycache__")
-    kept, _, output = outcome(start(copy))
-    assert kept.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
+def test_installation_that_cannot_be_written(closed):
+    kept, _, output = outcome(start(closed))
+    assert kept.is_relative_to(closed.parent / "home" / ".cache" / "fdi_ros")
     assert "compiled it in" in output
-    assert "compiled it in" not in outcome(start(copy))[2]
+    assert "compiled it in" not in outcome(start(closed))[2]
 
 
 def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
@@ -137,22 +131,21 @@ def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_writte
     assert "compiled it in" not in output
 
 
-def test_user_without_a_home_whatever_the_umask(copy):
-    cannot_be_written(copy / "fdi_ros" / "__pycache__")
+def test_user_without_a_home_whatever_the_umask(closed):
     before = os.umask(0)
     try:
-        kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
-        assert "compiled it in" not in outcome(start(copy, HOME="/proc/nothing"))[2]
+        kept, _, output = outcome(start(closed, HOME="/proc/nothing"))
+        assert "compiled it in" not in outcome(start(closed, HOME="/proc/nothing"))[2]
     finally:
         os.umask(before)
-    assert kept.is_relative_to(copy.parent / "temporary")
+    assert kept.is_relative_to(closed.parent / "temporary")
     assert stat.S_IMODE(kept.parent.stat().st_mode) == 0o700
     assert f"compiled code is kept in {kept}" in output
     for one in (kept, *kept.rglob("*.nb?")):
         assert not one.stat().st_mode & 0o022, one
     # A folder that others can write may hold what they like: it is not used.
     kept.parent.chmod(0o777)
-    assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
+    assert outcome(start(closed, HOME="/proc/nothing"))[0].parent != kept.parent
 
 
 class Planted:
@@ -176,8 +169,7 @@ def test_code_that_somebody_else_may_have_put_there_is_not_run(warm, what):
         if what == "open to all":
             index.chmod(0o666)
         if what == "a link":
-            index.rename(copy.parent / index.name)
-            index.symlink_to(copy.parent / index.name)
+            index.symlink_to(index.rename(copy.parent / index.name))
         if what == "a stranger's":
             os.chown(index, 54321, 0)
     if what == "a stranger's folder":

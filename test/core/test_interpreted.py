@@ -68,15 +68,9 @@ def digests():
 
 
 def test_plain_python_gives_the_same_bits(root):
-    path = {"PYTHONPATH": os.pathsep.join([str(root / "test"), str(root)])}
-    done = subprocess.run(
-        [sys.executable, "-m", "core.test_interpreted"],
-        env=os.environ | {"NUMBA_DISABLE_JIT": "1"} | path,
-        cwd=root,
-        text=True,
-        capture_output=True,
-        check=False,
-    )
+    path = {"PYTHONPATH": os.pathsep.join([str(root / "test"), str(root)]), "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-m", "core.test_interpreted"]
+    done = subprocess.run(command, env=os.environ | path, cwd=root, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     plain = json.loads(done.stdout)
     assert plain["interpreted"]
