@@ -79,7 +79,7 @@ def test_a_slow_turn_is_refused_and_told(rate, axis):
     assert (output.state[-1] == ChannelState.UNCHECKED).all()
     # One that biases hide is refused for what it varies.
     bias = 0.02 * np.random.default_rng(6).standard_normal(6)
-    sway = rate * np.sin(np.arange(LENGTH + 20) / 100)[:, None]
+    sway = 0.02 * np.sin(np.arange(LENGTH + 20) / 100)[:, None]
     _, words, _ = learned(turned(noise(6) + bias, sway, axis))
     assert words.startswith("refused, not at rest: a motion that the channels agree on")
 

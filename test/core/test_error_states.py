@@ -49,29 +49,6 @@ def padded(matrix):
     return full
 
 
-@settings(max_examples=40)
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12), absent=st.integers(0, 4))
-def test_information_is_that_of_the_parity_vector(seed, n, absent):
-    """A = V' (V M V')^-1 V with any basis V of the null space, of the channels that are there; G is least squares."""
-    rng, axes, covariance = random_channels(seed, n)
-    gone = rng.choice(n, min(absent, n - 4), replace=False)
-    kept = np.setdiff1d(np.arange(n), gone)
-    if np.linalg.svd(axes[kept], compute_uv=False)[-1] < 0.1:
-        return
-    parity = allocate(Parity)[0]
-    compute_joint_weights(parity, n, int((1 << kept).sum()), padded(covariance))
-    eliminate_rate(parity, n, axes, 1e-9)
-    null = np.linalg.svd(axes[kept])[0][:, 3:].T
-    inner = covariance[np.ix_(kept, kept)]
-    expected = null.T @ np.linalg.solve(null @ inner @ null.T, null)
-    found = parity["information"][:n, :n]
-    np.testing.assert_allclose(found[np.ix_(kept, kept)], expected, atol=1e-6 * np.abs(expected).max())
-    assert not found[gone].any()
-    weight = np.linalg.inv(inner)
-    gain = np.linalg.solve(axes[kept].T @ weight @ axes[kept], axes[kept].T @ weight)
-    np.testing.assert_allclose(parity["gain"][:, kept], gain, atol=1e-6 * np.abs(gain).max())
-
-
 def estimator(n, units):
     layout, states, unit = allocate(Layout), allocate(ErrorStates), np.arange(n) * units // n
     prepare_layout(layout[0], unit, units, PRIORS, WALKS)
@@ -79,67 +56,67 @@ def estimator(n, units):
     return layout[0], states[0], unit
 
 
+class Measured:
+    """States of n channels, three a unit, 3 s after their start and before a sample in motion."""
+
+    def __init__(self, seed, n):
+        self.rng, self.axes, self.noise = random_channels(seed, n)
+        self.layout, self.states, _ = estimator(n, n // 3)
+        predict(self.layout, self.states, 3.0)
+        self.n, self.count = n, int(self.layout["count"])
+        self.x, self.p = self.x_and_p()
+        self.at, self.parity = allocate(Projection)[0], allocate(Parity)[0]
+        self.rate = self.rng.normal(0, 1, 3)
+        fill_signals(self.layout, self.rate, self.rng.normal(0, 5, MAX_CHANNELS), self.at["signals"])
+        project(self.layout, self.states, self.at)
+        known = self.noise + self.at["covariance"][:n, :n]
+        compute_joint_weights(self.parity, n, (1 << n) - 1, padded(known))
+        eliminate_rate(self.parity, n, self.axes, 1e-6)
+        self.columns = self.at["columns"][:n, : self.count].copy()
+        self.information = self.parity["information"][:n, :n].copy()
+
+    def x_and_p(self):
+        return self.states["x"][: self.count].copy(), self.states["p"][: self.count, : self.count].copy()
+
+    def after(self, innovation, least):
+        innovation = np.pad(innovation, (0, MAX_CHANNELS - len(innovation)))
+        update(self.layout, self.states, self.at, self.parity["information"], innovation, 1.0, least)
+        return self.x_and_p()
+
+
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9]))
 def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed, n):
     """The joint filter of states and rate, with a prior of the rate as wide as that of the elimination."""
-    rng, axes, noise = random_channels(seed, n)
-    layout, states, _ = estimator(n, n // 3)
-    predict(layout, states, 3.0)
-    count = int(layout["count"])
-    before, prior = states["x"][:count].copy(), states["p"][:count, :count].copy()
-    rate, turn, at = rng.normal(0, 1, 3), rng.normal(0, 5, MAX_CHANNELS), allocate(Projection)[0]
-    fill_signals(layout, rate, turn, at["signals"])
-    project(layout, states, at)
-    matrix = np.zeros((n, count))
-    for i in range(n):
-        for k, place in enumerate(layout["place"][i]):
-            if place >= 0:
-                matrix[i, place] = at["signals"][i, k]
-    np.testing.assert_allclose(at["covariance"][:n, :n], matrix @ prior @ matrix.T, rtol=1e-9, atol=1e-15)
-    y = axes @ rate + rng.normal(0, 0.01, n)
-    innovation = np.zeros(MAX_CHANNELS)
-    values = np.concatenate([y, np.zeros(MAX_CHANNELS - n)])
-    subtract_errors(layout, states, at["signals"], values, innovation)
-    parity = allocate(Parity)[0]
-    compute_joint_weights(parity, n, (1 << n) - 1, padded(noise + at["covariance"][:n, :n]))
-    eliminate_rate(parity, n, axes, 1e-6)
-    update(layout, states, at, parity["information"], innovation, 1.0, np.zeros(MAX_STATES))
-    joint = np.block([[prior, np.zeros((count, 3))], [np.zeros((3, count)), 1e6 * np.eye(3)]])
-    both = np.hstack([matrix, axes])
-    gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + noise)
-    after = np.concatenate([before, np.zeros(3)]) + gain @ (y - matrix @ before)
-    left = joint - gain @ both @ joint
-    np.testing.assert_allclose(states["x"][:count], after[:count], atol=1e-7)
-    np.testing.assert_allclose(states["p"][:count, :count], left[:count, :count], atol=1e-9)
+    one = Measured(seed, n)
+    matrix = np.zeros((n, one.count))
+    for i, k in np.argwhere(one.layout["place"][:n] >= 0):
+        matrix[i, one.layout["place"][i, k]] = one.at["signals"][i, k]
+    np.testing.assert_allclose(one.at["covariance"][:n, :n], matrix @ one.p @ matrix.T, rtol=1e-9, atol=1e-15)
+    y, innovation = one.axes @ one.rate + one.rng.normal(0, 0.01, n), np.zeros(MAX_CHANNELS)
+    subtract_errors(one.layout, one.states, one.at["signals"], np.pad(y, (0, MAX_CHANNELS - n)), innovation)
+    joint = np.block([[one.p, np.zeros((one.count, 3))], [np.zeros((3, one.count)), 1e6 * np.eye(3)]])
+    both = np.hstack([matrix, one.axes])
+    gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + one.noise)
+    x, p = one.after(innovation[:n], np.zeros(MAX_STATES))
+    np.testing.assert_allclose(x, (np.pad(one.x, (0, 3)) + gain @ (y - matrix @ one.x))[: one.count], atol=1e-7)
+    np.testing.assert_allclose(p, (joint - gain @ both @ joint)[: one.count, : one.count], atol=1e-9)
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.2))
 def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
     """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
-    rng, axes, noise = random_channels(seed, 6)
-    layout, states, _ = estimator(6, 2)
-    predict(layout, states, 3.0)
-    count = int(layout["count"])
-    x, p = states["x"][:count].copy(), states["p"][:count, :count].copy()
-    at, parity = allocate(Projection)[0], allocate(Parity)[0]
-    fill_signals(layout, rng.normal(0, 1, 3), np.pad(rng.normal(0, 5, 6), (0, MAX_CHANNELS - 6)), at["signals"])
-    project(layout, states, at)
-    compute_joint_weights(parity, 6, ALL, padded(noise + at["covariance"][:6, :6]))
-    eliminate_rate(parity, 6, axes, 1e-6)
-    columns, information = at["columns"][:6, :count].copy(), parity["information"][:6, :6].copy()
-    gained = np.diag(columns.T @ information @ columns)
-    least, innovation = np.zeros(MAX_STATES), rng.normal(0, 0.01, 6)
-    motion = slice(6, 6 + 18)
-    least[motion] = (np.diag(p) - share * gained)[motion]
-    update(layout, states, at, parity["information"], np.pad(innovation, (0, MAX_CHANNELS - 6)), 1.0, least)
-    after = states["p"][:count, :count]
-    assert (np.diag(after)[motion] >= (np.diag(p) - min(share, 1.0) * gained)[motion] * (1 - 1e-9)).all()
-    taught, whole = np.diag(least[:count]), columns.T @ information @ columns
-    np.testing.assert_allclose(after, p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12)
-    np.testing.assert_allclose(states["x"][:count], x + taught @ columns.T @ information @ innovation, atol=1e-12)
-    assert np.linalg.eigvalsh(after).min() > -1e-12
+    one = Measured(seed, 6)
+    whole = one.columns.T @ one.information @ one.columns
+    least, innovation, motion = np.zeros(MAX_STATES), one.rng.normal(0, 0.01, 6), slice(6, 6 + 18)
+    least[motion] = (np.diag(one.p) - share * np.diag(whole))[motion]
+    x, p = one.after(innovation, least)
+    assert (np.diag(p)[motion] >= (np.diag(one.p - min(share, 1.0) * whole))[motion] * (1 - 1e-9)).all()
+    taught = np.diag(least[: one.count])
+    np.testing.assert_allclose(p, one.p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12)
+    np.testing.assert_allclose(x, one.x + taught @ one.columns.T @ one.information @ innovation, atol=1e-12)
+    assert np.linalg.eigvalsh(p).min() > -1e-12
 
 
 @settings(max_examples=20)

@@ -29,7 +29,6 @@ FIVE = np.array(
     ]
 ).T
 """The five axes of the paper on identification of faults."""
-FIVE_RATE = np.array([1.0, 2.0, 3.0])
 
 
 def usual_geometry(name):
@@ -81,40 +80,3 @@ def alarms(detector, noise, rows, seed):
 def within_standard_errors(count, rows, probability, errors=3.0):
     """Whether a number of alarms fits a probability."""
     return abs(count - rows * probability) <= errors * math.sqrt(rows * probability * (1 - probability))
-
-
-def paper_trials(rng, trials, amplitude=0.1):
-    """Samples (trials, 5, 5) of the five-channel example, [k, i] with a fault of 1 in channel i, and their noise."""
-    noise = rng.uniform(-amplitude, amplitude, (trials, 5))
-    return FIVE @ FIVE_RATE + noise[:, None, :] + np.eye(5), noise
-
-
-TABLE_2 = np.array(
-    [
-        [0.0814, 0.6730, 1.0075, 0.9572, 0.5413],
-        [0.4245, 0.1671, 0.6949, 0.9572, 0.8539],
-        [0.7371, 0.3388, 0.1890, 0.6446, 0.8539],
-        [0.8999, 0.9857, 0.6949, 0.1387, 0.4705],
-        [0.5873, 0.9857, 1.0075, 0.6446, 0.0354],
-    ]
-)
-"""Table 2 of the paper: [i, j] is d_j with a fault of 1 in channel i."""
-
-
-def table_noise():
-    """Noise (5,) of least size behind Table 2: it is not printed, but its parity follows from the entries.
-
-    Off the diagonal the fault outweighs the noise, so its sign is that of the determinant: the entries are linear in
-    the noise there. The diagonal, where the sign is not known, is left for the test.
-    """
-    struck = np.array([[signed_determinant(channel, j) for channel in np.eye(5)] for j in range(5)])
-    clean = struck.T
-    off = ~np.eye(5, dtype=bool)
-    rows = np.broadcast_to(struck, (5, 5, 5))[off]
-    left = (np.sign(clean) * TABLE_2 - clean)[off]
-    return np.linalg.lstsq(rows, left, rcond=None)[0]
-
-
-def signed_determinant(z, j):
-    """Determinant of [A z] without row j."""
-    return float(np.linalg.det(np.delete(np.column_stack([FIVE, z]), j, axis=0)))

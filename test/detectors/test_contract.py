@@ -84,70 +84,68 @@ def assert_same_bits(one, other):
         assert a.tobytes() == b.tobytes(), f"{field} differs"
 
 
-class TestVerdict:
-    @each
-    @pytest.mark.parametrize("rows", [0, 1, 2, 33])
-    def test_shapes_and_types(self, name, rows):
-        detector = detector_of(name)
-        z, _ = stream(np.random.default_rng(rows), detector.geometry, rows)
-        before = z.copy()
-        verdict = detector.detect(z)
-        for field, array in zip(Verdict._fields, verdict, strict=True):
-            per_channel = field in ("suspects", "error", "scores")
-            assert array.shape == (z.shape if per_channel else (rows,)), field
-            assert array.dtype == (np.bool_ if field in ("alarm", "suspects", "isolated") else np.float64), field
-        assert np.array_equal(z, before), "detect must not write to its argument"
-        for layout in (np.asfortranarray(z), np.repeat(z, 2, axis=0)[::2]):
-            assert_same_bits(verdict, detector_of(name).detect(layout))
-
-    @each_variant
-    @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_fields_agree_with_each_other(self, name, options, noise):
-        detector = detector_of(name, noise, lopsided=True, **options)
-        if name == "sequential" and not noise.constant:
-            pytest.skip("a motion that changes from sample to sample explains more than the fault")
-        z, acceleration = stream(np.random.default_rng(11), detector.geometry, 2000)
-        z[1000:1100, 1] += LASTING.get(name, 20 * SIGMA)
-        lose(np.random.default_rng(12), z, 0.02)
-        verdict = detector.detect(z, acceleration)
-        assert 10 < verdict.alarm.sum() < 1990
-        assert np.array_equal(verdict.alarm, verdict.statistic >= verdict.threshold)
-        assert np.array_equal(np.isnan(verdict.statistic), np.isnan(verdict.threshold))
-        assert np.array_equal(verdict.suspects.any(axis=1), verdict.alarm)
-        assert not (verdict.isolated & ~verdict.alarm).any()
-        assert not verdict.error[~verdict.suspects].any()
-        assert np.isfinite(verdict.error).all()
-        assert not verdict.suspects[~np.isfinite(z)].any()
-        assert np.isnan(verdict.scores[~np.isfinite(z)]).all()
-
-    @each
-    @pytest.mark.parametrize("shape", [(3,), (3, 4), (2, 3, 6)])
-    def test_wrong_shape_is_refused(self, name, shape):
-        with pytest.raises(DetectorError, match="expected"):
-            detector_of(name).detect(np.zeros(shape))
+@each
+@pytest.mark.parametrize("rows", [0, 1, 2, 33])
+def test_shapes_and_types(name, rows):
+    detector = detector_of(name)
+    z, _ = stream(np.random.default_rng(rows), detector.geometry, rows)
+    before = z.copy()
+    verdict = detector.detect(z)
+    for field, array in zip(Verdict._fields, verdict, strict=True):
+        per_channel = field in ("suspects", "error", "scores")
+        assert array.shape == (z.shape if per_channel else (rows,)), field
+        assert array.dtype == (np.bool_ if field in ("alarm", "suspects", "isolated") else np.float64), field
+    assert np.array_equal(z, before), "detect must not write to its argument"
+    for layout in (np.asfortranarray(z), np.repeat(z, 2, axis=0)[::2]):
+        assert_same_bits(verdict, detector_of(name).detect(layout))
 
 
-class TestStream:
-    """Verdicts follow from the samples since the last reset and their order, and from nothing else."""
+@each_variant
+@pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
+def test_fields_agree_with_each_other(name, options, noise):
+    detector = detector_of(name, noise, lopsided=True, **options)
+    if name == "sequential" and not noise.constant:
+        pytest.skip("a motion that changes from sample to sample explains more than the fault")
+    z, acceleration = stream(np.random.default_rng(11), detector.geometry, 2000)
+    z[1000:1100, 1] += LASTING.get(name, 20 * SIGMA)
+    lose(np.random.default_rng(12), z, 0.02)
+    verdict = detector.detect(z, acceleration)
+    assert 10 < verdict.alarm.sum() < 1990
+    assert np.array_equal(verdict.alarm, verdict.statistic >= verdict.threshold)
+    assert np.array_equal(np.isnan(verdict.statistic), np.isnan(verdict.threshold))
+    assert np.array_equal(verdict.suspects.any(axis=1), verdict.alarm)
+    assert not (verdict.isolated & ~verdict.alarm).any()
+    assert not verdict.error[~verdict.suspects].any()
+    assert np.isfinite(verdict.error).all()
+    assert not verdict.suspects[~np.isfinite(z)].any()
+    assert np.isnan(verdict.scores[~np.isfinite(z)]).all()
 
-    @each_variant
-    @settings(max_examples=25)
-    @given(
-        seed=st.integers(0, 2**32 - 1),
-        cuts=st.lists(st.integers(0, 60), max_size=8),
-        lost=st.sampled_from([0.0, 0.03, 0.3]),
-        noise=st.sampled_from([CONSTANT, MOVING]),
-        lopsided=st.booleans(),
-    )
-    def test_cut_anywhere(self, name, options, seed, cuts, lost, noise, lopsided):
-        rng = np.random.default_rng(seed)
-        detector = detector_of(name, noise, lopsided, **options)
-        z, turning = stream(rng, detector.geometry, 60)
-        lose(rng, z, lost)
-        acceleration = None if noise is CONSTANT else turning
-        whole = detector.detect(z, acceleration)
-        detector.reset()
-        assert_same_bits(whole, in_pieces(detector, z, acceleration, cuts))
+
+@each
+@pytest.mark.parametrize("shape", [(3,), (3, 4), (2, 3, 6)])
+def test_wrong_shape_is_refused(name, shape):
+    with pytest.raises(DetectorError, match="expected"):
+        detector_of(name).detect(np.zeros(shape))
+
+
+@each_variant
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    cuts=st.lists(st.integers(0, 60), max_size=8),
+    lost=st.sampled_from([0.0, 0.03, 0.3]),
+    noise=st.sampled_from([CONSTANT, MOVING]),
+    lopsided=st.booleans(),
+)
+def test_how_a_stream_is_cut_changes_nothing(name, options, seed, cuts, lost, noise, lopsided):
+    rng = np.random.default_rng(seed)
+    detector = detector_of(name, noise, lopsided, **options)
+    z, turning = stream(rng, detector.geometry, 60)
+    lose(rng, z, lost)
+    acceleration = None if noise is CONSTANT else turning
+    whole = detector.detect(z, acceleration)
+    detector.reset()
+    assert_same_bits(whole, in_pieces(detector, z, acceleration, cuts))
 
 
 def on_channels(detector, kept):
@@ -159,145 +157,149 @@ def on_channels(detector, kept):
         return str(refusal)
 
 
-class TestAbsentChannels:
-    @pytest.mark.parametrize(("name", "options"), BY_SETS, ids=str)
-    @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_the_others_judge_as_if_built_alone(self, name, options, noise):
-        detector = detector_of(name, noise, lopsided=True, **options)
-        rng, judged = np.random.default_rng(13), 0
-        z, acceleration = stream(rng, detector.geometry, 300)
-        lose(rng, z, 0.15)
-        verdict = detector.detect(z, acceleration)
-        present = np.isfinite(z)
-        for kept in np.unique(present, axis=0):
-            rows = np.flatnonzero((present == kept).all(axis=1))
-            part = Verdict(*(field[rows] for field in verdict))
-            alone = on_channels(detector, kept)
-            if isinstance(alone, str):
-                assert detector.refusals[int(kept @ (1 << np.arange(len(kept))))] == alone
-                assert np.isnan(part.statistic).all()
-                assert np.isnan(part.scores).all()
-                assert not part.alarm.any()
-                continue
-            expected = alone.detect(np.ascontiguousarray(z[rows][:, kept]), acceleration[rows])
-            of_channels = {f: getattr(part, f)[:, kept] for f in ("suspects", "error", "scores")}
-            assert_same_bits(part._replace(**of_channels), expected)
-            judged += len(rows)
-        assert judged > 100
-
-    @pytest.mark.parametrize("gone", [(0,), (4,), (1, 5)])
-    def test_without_some_throughout_it_is_as_if_built_without_them(self, gone):
-        detector = detector_of("sequential", MOVING, lopsided=True)
-        z, _ = stream(np.random.default_rng(23), detector.geometry, 1000)
-        z[700:, 2] += LASTING["sequential"]
-        kept = np.array([i not in gone for i in range(z.shape[1])])
+@pytest.mark.parametrize(("name", "options"), BY_SETS, ids=str)
+@pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
+def test_channels_present_judge_as_if_built_alone(name, options, noise):
+    detector = detector_of(name, noise, lopsided=True, **options)
+    rng, judged = np.random.default_rng(13), 0
+    z, acceleration = stream(rng, detector.geometry, 300)
+    lose(rng, z, 0.15)
+    verdict = detector.detect(z, acceleration)
+    present = np.isfinite(z)
+    for kept in np.unique(present, axis=0):
+        rows = np.flatnonzero((present == kept).all(axis=1))
+        part = Verdict(*(field[rows] for field in verdict))
         alone = on_channels(detector, kept)
-        assert isinstance(alone, Detector)
-        expected = alone.detect(np.ascontiguousarray(z[:, kept]))
-        z[:, ~kept] = np.nan
-        verdict = detector.detect(z)
-        np.testing.assert_allclose(verdict.statistic, expected.statistic, rtol=1e-6)
-        assert np.array_equal(verdict.suspects[:, kept], expected.suspects)
-        assert verdict.alarm.any()
-
-    @each
-    @pytest.mark.parametrize("left", [0, 1, 3])
-    def test_too_few_channels_is_not_healthy_but_unknown(self, name, left):
-        detector = detector_of(name)
-        z, _ = stream(np.random.default_rng(14), detector.geometry, 5)
-        z[:, left:] = np.nan
-        verdict = detector.detect(z)
-        assert np.isnan(verdict.statistic).all()
-        assert np.isnan(verdict.threshold).all()
-        assert not verdict.alarm.any()
-
-    def test_more_sets_of_channels_than_are_kept(self):
-        detector = create_detector("max_residual", Geometry.cone(10), CONSTANT, tolerance="paper")
-        rng = np.random.default_rng(15)
-        z, _ = stream(rng, detector.geometry, 1 << 10)
-        lost = np.arange(1 << 10)[:, None] >> np.arange(10) & 1
-        z[lost == 1] = np.nan
-        first, again = detector.detect(z), detector.detect(z[::-1])
-        assert np.isfinite(first.statistic).sum() > MOST_ROWS
-        assert_same_bits(first, Verdict(*(field[::-1] for field in again)))
+        if isinstance(alone, str):
+            assert detector.refusals[int(kept @ (1 << np.arange(len(kept))))] == alone
+            assert np.isnan([part.statistic, *part.scores.T]).all()
+            assert not part.alarm.any()
+            continue
+        expected = alone.detect(np.ascontiguousarray(z[rows][:, kept]), acceleration[rows])
+        of_channels = {f: getattr(part, f)[:, kept] for f in ("suspects", "error", "scores")}
+        assert_same_bits(part._replace(**of_channels), expected)
+        judged += len(rows)
+    assert judged > 100
 
 
-class TestWhatIsMeasured:
-    @each_variant
-    @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_fault_of_50_sigma_is_named_on_every_isolable_channel(self, name, options, sign):
-        geometry = usual_geometry(name)
-        assert geometry.isolable.all()
-        for channel in range(geometry.n):
-            # By evidence a name has to stand for a while.
-            verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 120))
-            assert verdict.alarm[-1]
-            assert verdict.isolated[-1]
-            assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]
-            assert verdict.error[-1, channel] == pytest.approx(sign * 50 * SIGMA, rel=1e-6)
+@pytest.mark.parametrize("gone", [(0,), (4,), (1, 5)])
+def test_without_some_throughout_it_is_as_if_built_without_them(gone):
+    detector = detector_of("sequential", MOVING, lopsided=True)
+    z, _ = stream(np.random.default_rng(23), detector.geometry, 1000)
+    z[700:, 2] += LASTING["sequential"]
+    kept = np.array([i not in gone for i in range(z.shape[1])])
+    alone = on_channels(detector, kept)
+    assert isinstance(alone, Detector)
+    expected = alone.detect(np.ascontiguousarray(z[:, kept]))
+    z[:, ~kept] = np.nan
+    verdict = detector.detect(z)
+    np.testing.assert_allclose(verdict.statistic, expected.statistic, rtol=1e-6)
+    assert np.array_equal(verdict.suspects[:, kept], expected.suspects)
+    assert verdict.alarm.any()
 
-    @each_variant
-    @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_value_no_gyro_can_measure(self, name, options, noise):
-        """The squares of such values would overflow, and a NaN statistic is no alarm."""
-        acceleration = np.ones((40, 3))
-        for channel in range(usual_geometry(name).n):
-            wild = faulty(usual_geometry(name), channel, 0.0)
-            wild += np.random.default_rng(17).normal(0, SIGMA, wild.shape)
-            wild[5:, channel] = LARGEST_RATE
-            verdict = detector_of(name, noise, **options).detect(wild, acceleration)
-            assert verdict.alarm[-1]
-            # At rest, or nearly, the condition number is documented to name wrongly.
-            assert verdict.suspects[-1, channel] or options.get("criterion") == "condition_number"
-            assert np.isfinite(verdict.error).all()
-            for size in (1e7, 1e160, 1e308):
-                wild[5:, channel] = size
-                assert_same_bits(verdict, detector_of(name, noise, **options).detect(wild, acceleration))
 
-    @each
-    def test_no_alarm_without_noise(self, name):
-        rate = np.random.default_rng(15).uniform(-5, 5, (500, 3))
-        rate[:20] = 0
-        verdict = detector_of(name).detect(rate @ usual_geometry(name).axes.T)
-        assert not verdict.alarm.any()
-        # The sums of `sequential` stay below the number of samples, not at zero.
-        assert (verdict.statistic < (math.log(501) if name == "sequential" else 1e-6)).all()
+@each
+@pytest.mark.parametrize("left", [0, 1, 3])
+def test_too_few_channels_is_not_healthy_but_unknown(name, left):
+    detector = detector_of(name)
+    z, _ = stream(np.random.default_rng(14), detector.geometry, 5)
+    z[:, left:] = np.nan
+    verdict = detector.detect(z)
+    assert np.isnan(verdict.statistic).all()
+    assert np.isnan(verdict.threshold).all()
+    assert not verdict.alarm.any()
 
-    @pytest.mark.parametrize("name", sorted(set(NAMES) - {"sequential"}))
-    def test_verdict_does_not_depend_on_the_body_rate(self, name):
-        """Of `sequential` it does: scale errors, which are never known to be zero, show in motion alone."""
-        rng = np.random.default_rng(16)
-        z, _ = stream(rng, usual_geometry(name), 500)
+
+def test_more_sets_of_channels_than_are_kept():
+    detector = create_detector("max_residual", Geometry.cone(10), CONSTANT, tolerance="paper")
+    rng = np.random.default_rng(15)
+    z, _ = stream(rng, detector.geometry, 1 << 10)
+    lost = np.arange(1 << 10)[:, None] >> np.arange(10) & 1
+    z[lost == 1] = np.nan
+    first, again = detector.detect(z), detector.detect(z[::-1])
+    assert np.isfinite(first.statistic).sum() > MOST_ROWS
+    assert_same_bits(first, Verdict(*(field[::-1] for field in again)))
+
+
+@each_variant
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_fault_of_50_sigma_is_named_on_every_isolable_channel(name, options, sign):
+    geometry = usual_geometry(name)
+    assert geometry.isolable.all()
+    for channel in range(geometry.n):
+        # By evidence a name has to stand for a while.
+        verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 120))
+        assert verdict.alarm[-1]
+        assert verdict.isolated[-1]
+        assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]
+        assert verdict.error[-1, channel] == pytest.approx(sign * 50 * SIGMA, rel=1e-6)
+
+
+@each_variant
+@pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
+def test_value_no_gyro_can_measure(name, options, noise):
+    """The squares of such values would overflow, and a NaN statistic is no alarm."""
+    acceleration = np.ones((40, 3))
+    for channel in range(usual_geometry(name).n):
+        wild = faulty(usual_geometry(name), channel, 0.0)
+        wild += np.random.default_rng(17).normal(0, SIGMA, wild.shape)
+        wild[5:, channel] = LARGEST_RATE
+        verdict = detector_of(name, noise, **options).detect(wild, acceleration)
+        assert verdict.alarm[-1]
+        # At rest, or nearly, the condition number is documented to name wrongly.
+        assert verdict.suspects[-1, channel] or options.get("criterion") == "condition_number"
+        assert np.isfinite(verdict.error).all()
+        for size in (1e7, 1e160, 1e308):
+            wild[5:, channel] = size
+            assert_same_bits(verdict, detector_of(name, noise, **options).detect(wild, acceleration))
+
+
+@each
+def test_no_alarm_without_noise(name):
+    rate = np.random.default_rng(15).uniform(-5, 5, (500, 3))
+    rate[:20] = 0
+    verdict = detector_of(name).detect(rate @ usual_geometry(name).axes.T)
+    assert not verdict.alarm.any()
+    # The sums of `sequential` stay below the number of samples, not at zero.
+    assert (verdict.statistic < (math.log(501) if name == "sequential" else 1e-6)).all()
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"sequential"}))
+def test_verdict_does_not_depend_on_the_body_rate(name):
+    """Of `sequential` it does: scale errors, which are never known to be zero, show in motion alone."""
+    rng = np.random.default_rng(16)
+    z, _ = stream(rng, usual_geometry(name), 500)
+    z[200:, 1] += LASTING.get(name, 0.0)
+    turned = z + rng.uniform(-3, 3, (500, 3)) @ usual_geometry(name).axes.T
+    still, moved = detector_of(name).detect(z), detector_of(name).detect(turned)
+    np.testing.assert_allclose(moved.statistic, still.statistic, rtol=1e-7, atol=1e-7)
+    clear = np.abs(still.statistic / still.threshold - 1) > 1e-6
+    assert np.array_equal(moved.alarm[clear], still.alarm[clear])
+    assert still.alarm.any()
+    assert (moved.suspects == still.suspects).all(axis=1)[clear].mean() > 0.999
+    np.testing.assert_allclose(moved.error[clear], still.error[clear], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"recursive"}))
+def test_verdict_does_not_depend_on_the_order_of_channels(name):
+    """`recursive` takes its equations in their order."""
+    rng = np.random.default_rng(19)
+    n = usual_geometry(name).n
+    for geometry in (usual_geometry(name), random_axes(rng, n)):
+        order = rng.permutation(n)
+        z, _ = stream(rng, geometry, 500)
         z[200:, 1] += LASTING.get(name, 0.0)
-        turned = z + rng.uniform(-3, 3, (500, 3)) @ usual_geometry(name).axes.T
-        still, moved = detector_of(name).detect(z), detector_of(name).detect(turned)
-        np.testing.assert_allclose(moved.statistic, still.statistic, rtol=1e-7, atol=1e-7)
-        clear = np.abs(still.statistic / still.threshold - 1) > 1e-6
-        assert np.array_equal(moved.alarm[clear], still.alarm[clear])
-        assert still.alarm.any()
-        assert (moved.suspects == still.suspects).all(axis=1)[clear].mean() > 0.999
-        np.testing.assert_allclose(moved.error[clear], still.error[clear], atol=1e-9)
-
-    @pytest.mark.parametrize("name", sorted(set(NAMES) - {"recursive"}))
-    def test_verdict_does_not_depend_on_the_order_of_channels(self, name):
-        """`recursive` takes its equations in their order."""
-        rng = np.random.default_rng(19)
-        n = usual_geometry(name).n
-        for geometry in (usual_geometry(name), random_axes(rng, n)):
-            order = rng.permutation(n)
-            z, _ = stream(rng, geometry, 500)
-            z[200:, 1] += LASTING.get(name, 0.0)
-            one = create_detector(name, geometry, CONSTANT).detect(z)
-            units = [geometry.unit_of[i] for i in order]
-            other = create_detector(name, Geometry(geometry.axes[order], units=units), CONSTANT).detect(z[:, order])
-            np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-7, atol=1e-9)
-            assert np.array_equal(other.alarm, one.alarm)
-            assert one.alarm.any()
-            # On lopsided axes suspects may rest on trials; of several sums at their limit `cusum` takes the first.
-            if geometry.isolable.all() and name != "cusum":
-                assert np.array_equal(other.suspects, one.suspects[:, order])
-                assert np.array_equal(other.isolated, one.isolated)
-                np.testing.assert_allclose(other.error, one.error[:, order], atol=1e-12)
+        one = create_detector(name, geometry, CONSTANT).detect(z)
+        units = [geometry.unit_of[i] for i in order]
+        other = create_detector(name, Geometry(geometry.axes[order], units=units), CONSTANT).detect(z[:, order])
+        np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-7, atol=1e-9)
+        assert np.array_equal(other.alarm, one.alarm)
+        assert one.alarm.any()
+        # On lopsided axes suspects may rest on trials; of several sums at their limit `cusum` takes the first.
+        if geometry.isolable.all() and name != "cusum":
+            assert np.array_equal(other.suspects, one.suspects[:, order])
+            assert np.array_equal(other.isolated, one.isolated)
+            np.testing.assert_allclose(other.error, one.error[:, order], atol=1e-12)
 
 
 def unequal(seed, n):
@@ -331,31 +333,32 @@ HARDLY_MORE = [
 ]
 
 
-class TestFalseAlarms:
-    @pytest.mark.parametrize(("name", "geometry", "noise", "probability"), AS_MANY)
-    def test_as_many_as_asked_for(self, name, geometry, noise, probability):
-        """Above three parity dimensions the threshold itself is an estimate, good to about 1 %."""
-        detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
-        rows = 200_000 if probability > 1e-4 else 3_000_000
-        count = alarms(detector, noise, rows, geometry.n)
-        assert within_standard_errors(count, rows, probability, 3.0 if noise.constant else 3.5)
+@pytest.mark.parametrize(("name", "geometry", "noise", "probability"), AS_MANY)
+def test_as_many_false_alarms_as_asked_for(name, geometry, noise, probability):
+    """Above three parity dimensions the threshold itself is an estimate, good to about 1 %."""
+    detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
+    rows = 200_000 if probability > 1e-4 else 3_000_000
+    count = alarms(detector, noise, rows, geometry.n)
+    assert within_standard_errors(count, rows, probability, 3.0 if noise.constant else 3.5)
 
-    @pytest.mark.parametrize(("name", "geometry", "noise"), HARDLY_MORE)
-    def test_hardly_more_nor_far_fewer_on_any_axes(self, name, geometry, noise):
-        rows, probability = 100_000, 0.01
-        detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
-        assert 0.5 < alarms(detector, noise, rows, 1) / (rows * probability) < 1.1
 
-    @pytest.mark.parametrize("name", [*RATE_OPTIONS, *RUN_LENGTHS])
-    def test_per_hour_is_a_probability_per_sample_or_a_run_length(self, name):
-        per_sample = {"run_length": 1e5} if name in RUN_LENGTHS else {"false_alarm_probability": 1e-5}
-        per_hour = {"false_alarms_per_hour": 3.6, "sample_rate": 100.0}
-        one, other = (
-            create_detector(name, usual_geometry(name), CONSTANT, **options) for options in (per_hour, per_sample)
-        )
-        z = np.zeros((1, one.geometry.n))
-        assert one.detect(z).threshold == pytest.approx(other.detect(z).threshold, rel=1e-9)
-        assert name not in RUN_LENGTHS or detector_of(name).run_length == 3.6e8
+@pytest.mark.parametrize(("name", "geometry", "noise"), HARDLY_MORE)
+def test_false_alarms_are_hardly_more_nor_far_fewer_on_any_axes(name, geometry, noise):
+    rows, probability = 100_000, 0.01
+    detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
+    assert 0.5 < alarms(detector, noise, rows, 1) / (rows * probability) < 1.1
+
+
+@pytest.mark.parametrize("name", [*RATE_OPTIONS, *RUN_LENGTHS])
+def test_a_rate_per_hour_is_a_probability_per_sample_or_a_run_length(name):
+    per_sample = {"run_length": 1e5} if name in RUN_LENGTHS else {"false_alarm_probability": 1e-5}
+    per_hour = {"false_alarms_per_hour": 3.6, "sample_rate": 100.0}
+    one, other = (
+        create_detector(name, usual_geometry(name), CONSTANT, **options) for options in (per_hour, per_sample)
+    )
+    z = np.zeros((1, one.geometry.n))
+    assert one.detect(z).threshold == pytest.approx(other.detect(z).threshold, rel=1e-9)
+    assert name not in RUN_LENGTHS or detector_of(name).run_length == 3.6e8
 
 
 def last_verdicts(name, geometry, **options):
@@ -367,75 +370,72 @@ def last_verdicts(name, geometry, **options):
         yield channel, Verdict(*(field[-1] for field in verdict))
 
 
-class TestChannelsThatCannotBeToldApart:
-    @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_two_parallel_triads(self, name):
-        for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 2)):
-            assert last.alarm
-            assert not last.isolated
-            assert set(np.flatnonzero(last.suspects)) == {channel, (channel + 3) % 6}
-
-    @pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
-    def test_two_of_five_channels(self, criterion):
-        geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]])
-        for _, last in list(last_verdicts("determinant", geometry, criterion=criterion))[:2]:
-            assert not last.isolated
-            assert np.flatnonzero(last.suspects).tolist() == [0, 1]
-
-    @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_three_parallel_triads(self, name):
-        for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 3)):
-            assert last.alarm
-            assert last.suspects[channel]
-            # Two wrong channels that agree look like one right one: only methods that assume one fault may isolate.
-            assert name not in SINGLE_FAULT or (last.isolated and last.suspects.sum() == 1)
-
-    @pytest.mark.parametrize("name", ANY_NUMBER)
-    def test_four_channels_detect_and_do_not_isolate(self, name):
-        for _, last in last_verdicts(name, Geometry.cone(4)):
-            assert last.alarm
-            assert last.suspects.all()
-            assert not last.isolated
-
-    @each_variant
-    def test_channel_no_fault_of_which_is_seen_is_never_suspect(self, name, options):
-        root = np.sqrt(0.5)
-        axes = [[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0.8, 0]]
-        geometry = Geometry(axes if name in ANY_NUMBER else axes[:5])
-        assert np.flatnonzero(~geometry.detectable).tolist() == [4]
-        for channel, last in last_verdicts(name, geometry, **options):
-            assert last.alarm == (channel != 4)
-            assert not last.suspects[4]
-            assert last.suspects[channel] == (channel != 4)
+@pytest.mark.parametrize("name", ANY_NUMBER)
+@pytest.mark.parametrize(
+    ("geometry", "alike"),
+    [(Geometry.from_triads([np.eye(3)] * 2), [[0, 3], [1, 4], [2, 5]] * 2), (Geometry.cone(4), [[0, 1, 2, 3]] * 4)],
+    ids=["two parallel triads", "four channels"],
+)
+def test_such_channels_are_suspects_together_and_none_is_isolated(name, geometry, alike):
+    for channel, last in last_verdicts(name, geometry):
+        assert last.alarm
+        assert not last.isolated
+        assert np.flatnonzero(last.suspects).tolist() == alike[channel]
 
 
-class TestLopsidedAxes:
-    """On arbitrary axes some methods name one channel for a fault of another, however large it is.
+@pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
+def test_two_of_five_channels_along_one_axis(criterion):
+    geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]])
+    for _, last in list(last_verdicts("determinant", geometry, criterion=criterion))[:2]:
+        assert not last.isolated
+        assert np.flatnonzero(last.suspects).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("name", ANY_NUMBER)
+def test_three_parallel_triads(name):
+    for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 3)):
+        assert last.alarm
+        assert last.suspects[channel]
+        # Two wrong channels that agree look like one right one: only methods that assume one fault may isolate.
+        assert name not in SINGLE_FAULT or (last.isolated and last.suspects.sum() == 1)
+
+
+@each_variant
+def test_channel_no_fault_of_which_is_seen_is_never_suspect(name, options):
+    root = np.sqrt(0.5)
+    axes = [[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0.8, 0]]
+    geometry = Geometry(axes if name in ANY_NUMBER else axes[:5])
+    assert np.flatnonzero(~geometry.detectable).tolist() == [4]
+    for channel, last in last_verdicts(name, geometry, **options):
+        assert last.alarm == (channel != 4)
+        assert not last.suspects[4]
+        assert last.suspects[channel] == (channel != 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [one for one in VARIANTS if one[0] in SINGLE_FAULT and one[0] != "recursive"], ids=str
+)
+def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
+    """There some methods name one channel for a fault of another, however large it is.
 
     `recursive` is not asked: noise alone may make what it divides by small.
     """
-
-    @pytest.mark.parametrize(
-        ("name", "options"), [one for one in VARIANTS if one[0] in SINGLE_FAULT and one[0] != "recursive"], ids=str
-    )
-    def test_isolated_verdict_is_never_wrong(self, name, options):
-        isolated = 0
-        for seed in range(30):
-            rng = np.random.default_rng(seed)
-            detector = create_detector(name, random_axes(rng, 5 + seed % 4), CONSTANT, **options)
-            n = detector.geometry.n
-            for channel in range(n):
-                z = rng.normal(0, SIGMA, (40, n))
-                z[:20, channel] += 50 * SIGMA
-                z[20:, channel] += 5000 * SIGMA
-                verdict = detector.detect(z)
-                # At 50 sigma a channel that is hardly seen gives no alarm, at 5000 every one does.
-                large = verdict.suspects[20:, channel]
-                assert large.all() or not detector.geometry.detectable[channel]
-                assert (verdict.suspects[verdict.isolated] == (np.arange(n) == channel)).all()
-                assert verdict.isolated[20:].all() or not detector.isolable[channel]
-                isolated += bool(verdict.isolated[20:].all())
-        assert isolated > 60
+    isolated = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        detector = create_detector(name, random_axes(rng, 5 + seed % 4), CONSTANT, **options)
+        n = detector.geometry.n
+        for channel in range(n):
+            z = rng.normal(0, SIGMA, (40, n))
+            z[:20, channel] += 50 * SIGMA
+            z[20:, channel] += 5000 * SIGMA
+            verdict = detector.detect(z)
+            # At 50 sigma a channel that is hardly seen gives no alarm, at 5000 every one does.
+            assert verdict.suspects[20:, channel].all() or not detector.geometry.detectable[channel]
+            assert (verdict.suspects[verdict.isolated] == (np.arange(n) == channel)).all()
+            assert verdict.isolated[20:].all() or not detector.isolable[channel]
+            isolated += bool(verdict.isolated[20:].all())
+    assert isolated > 60
 
 
 REFUSED = [
@@ -471,28 +471,27 @@ REFUSED = [
 ]  # fmt: skip
 
 
-class TestBadOptions:
-    @each
-    def test_unknown_option(self, name):
-        with pytest.raises(DetectorError, match=r"no option 'sensitivity', expected one of: \w+"):
-            create_detector(name, usual_geometry(name), CONSTANT, sensitivity=3)
+@each
+def test_unknown_option_or_detector(name):
+    with pytest.raises(DetectorError, match=r"no option 'sensitivity', expected one of: \w+"):
+        create_detector(name, usual_geometry(name), CONSTANT, sensitivity=3)
+    with pytest.raises(DetectorError, match=rf"unknown detector '{name}s', expected one of: .*{name}"):
+        create_detector(f"{name}s", usual_geometry(name), CONSTANT)
 
-    @pytest.mark.parametrize(("name", "options", "words"), REFUSED)
-    def test_refused(self, name, options, words):
-        with pytest.raises(FdiError) as caught:
-            create_detector(name, usual_geometry(name), CONSTANT, **options)
-        assert words in str(caught.value)
-        assert "\n" not in str(caught.value)
 
-    def test_unknown_detector(self):
-        with pytest.raises(DetectorError, match=r"unknown detector 'median', expected one of: .*max_residual"):
-            create_detector("median", Geometry.two_triad_cone(), CONSTANT)
+@pytest.mark.parametrize(("name", "options", "words"), REFUSED)
+def test_bad_options_are_refused(name, options, words):
+    with pytest.raises(FdiError) as caught:
+        create_detector(name, usual_geometry(name), CONSTANT, **options)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
 
-    @each
-    def test_numbers_of_channels_refused_are_those_that_fail(self, name):
-        for n in range(4, 13):
-            if reason := detector_class(name).refuses(n):
-                with pytest.raises(DetectorError, match=f"^{re.escape(reason)}$"):
-                    create_detector(name, Geometry.cone(n), CONSTANT)
-            else:
+
+@each
+def test_numbers_of_channels_refused_are_those_that_fail(name):
+    for n in range(4, 13):
+        if reason := detector_class(name).refuses(n):
+            with pytest.raises(DetectorError, match=f"^{re.escape(reason)}$"):
                 create_detector(name, Geometry.cone(n), CONSTANT)
+        else:
+            create_detector(name, Geometry.cone(n), CONSTANT)

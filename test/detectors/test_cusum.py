@@ -61,124 +61,107 @@ def test_threshold_and_delay_are_those_published(shift, h, published):
     assert delays.mean() == pytest.approx(published, rel=0.10)
 
 
-class TestThreshold:
-    @pytest.mark.parametrize(
-        ("geometry", "noise", "shift"),
-        [
-            (Geometry.cone(4), UNIT, 2.0),
-            (Geometry.dodecahedron(), NoiseModel([1, 2, 0.5, 1, 3, 1]), 1.0),
-            (Geometry.from_triads([np.eye(3), np.eye(3)]), UNIT, 1.0),
-            (Geometry.cone(9), UNIT, 2.0),
-        ],
-    )
-    def test_run_length(self, geometry, noise, shift):
-        # 3.6e8 samples take minutes: here shorter ones, where the approximation is worse.
-        detector = cusum(geometry, noise, shift=shift, run_length=1000)
-        lengths = runs_to_alarm(detector, noise, 600, 5)
-        assert lengths.mean() == pytest.approx(1000, rel=0.14)
-
-    def test_a_scale_factor_error_in_a_long_turn_is_no_drift(self):
-        """It keeps its sign for as long as the turn lasts: as white noise it would alarm within seconds."""
-        geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(11)
-        noise = NoiseModel(0.003, scale_std=0.002, timing_std=0.0)
-        turn = np.array([1.0, -0.7, 0.5])
-        z = rng.normal(0, 0.003, (20_000, 6))
-        z[5000:15_000] += (geometry.axes @ turn) * (1 + 0.002 * rng.uniform(-2, 2, 6))
-        detector = cusum(geometry, noise, run_length=1e7)
-        assert not detector.detect(z).alarm.any()
-        drifting = z.copy()
-        drifting[15_000:, 3] += 0.003
-        found = detector.detect(drifting)
-        assert not found.alarm[:15_000].any()
-        assert found.alarm[15_000:].any()
-        assert found.suspects[-1].tolist() == [False, False, False, True, False, False]
-
-    def test_what_a_start_up_average_leaves_is_no_drift(self):
-        """12 runs of 300 s at rest at 100 Hz, after an average over 3 s."""
-        geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
-        noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
-        # A small shift has a small k: this is where the bias adds up.
-        aware, unaware = (cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
-        usual, found = cusum(geometry, noise), 0
-        for _ in range(12):
-            z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
-            for detector in (aware, usual, unaware):
-                detector.reset()
-            assert not aware.detect(z).alarm.any()
-            assert not usual.detect(z).alarm.any()
-            found += bool(unaware.detect(z).alarm.any())
-        assert found >= 6
-        usual.reset()
-        drifting = usual.detect(z + 0.003 * np.eye(6)[2])
-        assert drifting.isolated[-1]
-        assert np.flatnonzero(drifting.suspects[-1]).tolist() == [2]
+@pytest.mark.parametrize(
+    ("geometry", "noise", "shift"),
+    [
+        (Geometry.cone(4), UNIT, 2.0),
+        (Geometry.dodecahedron(), NoiseModel([1, 2, 0.5, 1, 3, 1]), 1.0),
+        (Geometry.from_triads([np.eye(3), np.eye(3)]), UNIT, 1.0),
+        (Geometry.cone(9), UNIT, 2.0),
+    ],
+)
+def test_run_length(geometry, noise, shift):
+    # 3.6e8 samples take minutes: here shorter ones, where the approximation is worse.
+    detector = cusum(geometry, noise, shift=shift, run_length=1000)
+    lengths = runs_to_alarm(detector, noise, 600, 5)
+    assert lengths.mean() == pytest.approx(1000, rel=0.14)
 
 
-class TestDelay:
-    def test_late_fault_takes_no_longer(self):
-        # An hour at 100 Hz of a strong fault on one channel, a pause, then another: memory is bounded.
-        rng, geometry = np.random.default_rng(8), Geometry.dodecahedron()
-        z = rng.standard_normal((3000, 6))
-        z[2000:, 5] += 1.0
-        fresh, late = cusum(geometry), cusum(geometry)
-        strong = rng.standard_normal((36_000, 6))
-        strong[:, 0] += 50
-        for _ in range(10):
-            late.detect(strong)
-        first, second = fresh.detect(z), late.detect(z)
-        forgotten = int(2 * (0.5 * late.threshold) / 0.25)
-        assert not second.alarm[forgotten:2000].any()
-        assert abs(int(first.alarm[2000:].argmax()) - int(second.alarm[2000:].argmax())) <= 3
+def test_a_scale_factor_error_in_a_long_turn_is_no_drift():
+    """It keeps its sign for as long as the turn lasts: as white noise it would alarm within seconds."""
+    geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(11)
+    noise = NoiseModel(0.003, scale_std=0.002, timing_std=0.0)
+    turn = np.array([1.0, -0.7, 0.5])
+    z = rng.normal(0, 0.003, (20_000, 6))
+    z[5000:15_000] += (geometry.axes @ turn) * (1 + 0.002 * rng.uniform(-2, 2, 6))
+    detector = cusum(geometry, noise, run_length=1e7)
+    assert not detector.detect(z).alarm.any()
+    drifting = z.copy()
+    drifting[15_000:, 3] += 0.003
+    found = detector.detect(drifting)
+    assert not found.alarm[:15_000].any()
+    assert found.alarm[15_000:].any()
+    assert found.suspects[-1].tolist() == [False, False, False, True, False, False]
 
 
-class TestNaming:
-    @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
-    @pytest.mark.parametrize("sign", [1, -1])
-    def test_drifting_channel_is_named(self, geometry, sign):
-        detector, rng = cusum(geometry, shift=0.5), np.random.default_rng(9)
-        named = isolated = 0
-        for _ in range(100):
+def test_what_a_start_up_average_leaves_is_no_drift():
+    """12 runs of 300 s at rest at 100 Hz, after an average over 3 s."""
+    geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
+    noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
+    # A small shift has a small k: this is where the bias adds up.
+    aware, unaware = (cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
+    usual, found = cusum(geometry, noise), 0
+    for _ in range(12):
+        z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
+        for detector in (aware, usual, unaware):
             detector.reset()
-            z = rng.standard_normal((600, geometry.n))
-            z[:, 3] += sign * 0.8 / geometry.sensitivity[3]
-            verdict = detector.detect(z)
-            first = int(verdict.alarm.argmax())
-            assert verdict.alarm[first]
-            named += bool(verdict.suspects[first, 3])
-            isolated += bool(verdict.isolated[-1] and verdict.suspects[-1, 3])
-        assert named == 100
-        assert isolated >= 97
+        assert not aware.detect(z).alarm.any()
+        assert not usual.detect(z).alarm.any()
+        found += bool(unaware.detect(z).alarm.any())
+    assert found >= 6
+    usual.reset()
+    drifting = usual.detect(z + 0.003 * np.eye(6)[2])
+    assert drifting.isolated[-1]
+    assert np.flatnonzero(drifting.suspects[-1]).tolist() == [2]
 
-    def test_onset(self):
-        detector, rng, off = cusum(Geometry.dodecahedron(), shift=1.0), np.random.default_rng(11), []
-        for _ in range(150):
-            begin = int(rng.integers(300, 700))
-            z = rng.standard_normal((begin + 400, 6))
-            z[begin:, 4] += 1.0 / math.sqrt(0.5)
-            detector.reset()
-            assert not detector.samples_since_onset().any()
-            alarm = int(detector.detect(z).alarm.argmax())
-            detector.reset()
-            for part in np.array_split(z[: alarm + 1], 3):
-                detector.detect(part)
-            off.append(alarm + 1 - int(detector.samples_since_onset()[4]) - begin)
-        assert abs(np.median(off)) <= 3
-        assert np.mean(np.abs(off)) < 10
 
-    @pytest.mark.parametrize(("scale", "timing"), [(0.002, 0.0003), (0.01, 0.0005)])
-    @pytest.mark.parametrize("size", [0.1, 0.5, 2.0, 5.0, 30.0])
-    def test_no_sound_channel_is_isolated_under_rate_dependent_noise(self, scale, timing, size):
-        """A large fault passes for rate in the statistics of the others, and shrinks them."""
-        geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(13)
-        noise = NoiseModel(0.0025, scale, timing)
-        detector = cusum(geometry, noise)
-        for channel in range(6):
-            z, acceleration = sound(rng, geometry, noise, 500)
-            z[150:, channel] += size
-            detector.reset()
-            verdict = detector.detect(z, acceleration)
-            sound_ones = np.arange(6) != channel
-            assert not verdict.suspects[verdict.isolated][:, sound_ones].any()
-            assert verdict.isolated[-1] or size < 0.5
-            assert verdict.suspects[-1, channel]
-            assert verdict.error[-1, channel] == pytest.approx(size, rel=0.1)
+def test_late_fault_takes_no_longer():
+    # An hour at 100 Hz of a strong fault on one channel, a pause, then another: memory is bounded.
+    rng, geometry = np.random.default_rng(8), Geometry.dodecahedron()
+    z = rng.standard_normal((3000, 6))
+    z[2000:, 5] += 1.0
+    fresh, late = cusum(geometry), cusum(geometry)
+    strong = rng.standard_normal((36_000, 6))
+    strong[:, 0] += 50
+    for _ in range(10):
+        late.detect(strong)
+    first, second = fresh.detect(z), late.detect(z)
+    forgotten = int(2 * (0.5 * late.threshold) / 0.25)
+    assert not second.alarm[forgotten:2000].any()
+    assert abs(int(first.alarm[2000:].argmax()) - int(second.alarm[2000:].argmax())) <= 3
+
+
+def test_onset():
+    detector, rng, off = cusum(Geometry.dodecahedron(), shift=1.0), np.random.default_rng(11), []
+    for _ in range(150):
+        begin = int(rng.integers(300, 700))
+        z = rng.standard_normal((begin + 400, 6))
+        z[begin:, 4] += 1.0 / math.sqrt(0.5)
+        detector.reset()
+        assert not detector.samples_since_onset().any()
+        alarm = int(detector.detect(z).alarm.argmax())
+        detector.reset()
+        for part in np.array_split(z[: alarm + 1], 3):
+            detector.detect(part)
+        off.append(alarm + 1 - int(detector.samples_since_onset()[4]) - begin)
+    assert abs(np.median(off)) <= 3
+    assert np.mean(np.abs(off)) < 10
+
+
+@pytest.mark.parametrize(("scale", "timing"), [(0.002, 0.0003), (0.01, 0.0005)])
+@pytest.mark.parametrize("size", [0.1, 0.5, 2.0, 5.0, 30.0])
+def test_no_sound_channel_is_isolated_under_rate_dependent_noise(scale, timing, size):
+    """A large fault passes for rate in the statistics of the others, and shrinks them."""
+    geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(13)
+    noise = NoiseModel(0.0025, scale, timing)
+    detector = cusum(geometry, noise)
+    for channel in range(6):
+        z, acceleration = sound(rng, geometry, noise, 500)
+        z[150:, channel] += size
+        detector.reset()
+        verdict = detector.detect(z, acceleration)
+        sound_ones = np.arange(6) != channel
+        assert not verdict.suspects[verdict.isolated][:, sound_ones].any()
+        assert verdict.isolated[-1] or size < 0.5
+        assert verdict.suspects[-1, channel]
+        assert verdict.error[-1, channel] == pytest.approx(size, rel=0.1)

@@ -58,68 +58,68 @@ def test_statistics_equal_weighted_least_squares(seed, n, moving):
             assert scores[row, i] == pytest.approx(abs(w), rel=1e-7, abs=1e-7)
 
 
-class TestSingleFault:
-    @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
-    @pytest.mark.parametrize("confidence", [0.9, 0.999])
-    def test_true_channel_is_lost_no_more_often_than_the_confidence_says(self, geometry, confidence):
-        options = {"false_alarm_probability": 1e-3, "confidence": confidence}
-        detector, rows = create_detector("likelihood_ratio", geometry, UNIT, **options), 100_000
-        for b in (3, 5, 7, 10):
-            z = np.random.default_rng(42).standard_normal((rows, geometry.n))
-            z[:, 1] += b
-            verdict = detector.detect(z)
-            lost = int((verdict.alarm & ~verdict.suspects[:, 1]).sum())
-            assert lost < rows * (1 - confidence) + 3 * math.sqrt(rows * (1 - confidence))
+@pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
+@pytest.mark.parametrize("confidence", [0.9, 0.999])
+def test_true_channel_is_lost_no_more_often_than_the_confidence_says(geometry, confidence):
+    options = {"false_alarm_probability": 1e-3, "confidence": confidence}
+    detector, rows = create_detector("likelihood_ratio", geometry, UNIT, **options), 100_000
+    for b in (3, 5, 7, 10):
+        z = np.random.default_rng(42).standard_normal((rows, geometry.n))
+        z[:, 1] += b
+        verdict = detector.detect(z)
+        lost = int((verdict.alarm & ~verdict.suspects[:, 1]).sum())
+        assert lost < rows * (1 - confidence) + 3 * math.sqrt(rows * (1 - confidence))
 
 
-class TestTwoFaults:
-    @settings(max_examples=40)
-    @given(seed=st.integers(0, 100_000), n=st.integers(6, 8), moving=st.booleans(), size=st.floats(8, 40))
-    def test_suspects_are_the_channels_of_all_pairs_that_fit(self, seed, n, moving, size):
-        rng = np.random.default_rng(seed)
-        geometry = random_axes(rng, n)
-        assume(np.abs(geometry.rho[~np.eye(n, dtype=bool)]).max() < 0.99 and geometry.sensitivity.min() > 0.1)
-        noise = MOVING if moving else NoiseModel(1e-3)
-        z, a = sound(rng, geometry, noise, 1)
-        z[0, [0, 1]] += size * 1e-3 * np.array([1.0, rng.choice([-1.2, 1.2])])
-        verdict = create_detector("likelihood_ratio", geometry, noise, confidence=CONFIDENCE).detect(z, a)
-        assume(verdict.alarm[0])
-        left = {out: chi_square_without(geometry, noise, z[0], a[0], out) for out in combinations(range(n), 2)}
-        alone = [chi_square_without(geometry, noise, z[0], a[0], (i,)) for i in range(n)]
-        single_limit, pair_limit = chi2_isf(1 - CONFIDENCE, n - 4), chi2_isf(1 - CONFIDENCE, n - 5)
-        if min(alone) <= single_limit:
-            margin = 2 * math.log(CONFIDENCE / (1 - CONFIDENCE))
-            expected = {i for i in range(n) if alone[i] <= min(alone) + margin}
-            isolated = len(expected) == 1
-        else:
-            fits = [pair for pair, chi in left.items() if chi <= pair_limit]
-            expected = {i for pair in fits for i in pair} or set(range(n))
-            isolated = len(fits) == 1
-        assert set(np.flatnonzero(verdict.suspects[0])) == expected
-        assert verdict.isolated[0] == isolated
+@settings(max_examples=40)
+@given(seed=st.integers(0, 100_000), n=st.integers(6, 8), moving=st.booleans(), size=st.floats(8, 40))
+def test_suspects_are_the_channels_of_all_pairs_that_fit(seed, n, moving, size):
+    rng = np.random.default_rng(seed)
+    geometry = random_axes(rng, n)
+    assume(np.abs(geometry.rho[~np.eye(n, dtype=bool)]).max() < 0.99 and geometry.sensitivity.min() > 0.1)
+    noise = MOVING if moving else NoiseModel(1e-3)
+    z, a = sound(rng, geometry, noise, 1)
+    z[0, [0, 1]] += size * 1e-3 * np.array([1.0, rng.choice([-1.2, 1.2])])
+    verdict = create_detector("likelihood_ratio", geometry, noise, confidence=CONFIDENCE).detect(z, a)
+    assume(verdict.alarm[0])
+    left = {out: chi_square_without(geometry, noise, z[0], a[0], out) for out in combinations(range(n), 2)}
+    alone = [chi_square_without(geometry, noise, z[0], a[0], (i,)) for i in range(n)]
+    single_limit, pair_limit = chi2_isf(1 - CONFIDENCE, n - 4), chi2_isf(1 - CONFIDENCE, n - 5)
+    if min(alone) <= single_limit:
+        margin = 2 * math.log(CONFIDENCE / (1 - CONFIDENCE))
+        expected = {i for i in range(n) if alone[i] <= min(alone) + margin}
+        isolated = len(expected) == 1
+    else:
+        fits = [pair for pair, chi in left.items() if chi <= pair_limit]
+        expected = {i for pair in fits for i in pair} or set(range(n))
+        isolated = len(fits) == 1
+    assert set(np.flatnonzero(verdict.suspects[0])) == expected
+    assert verdict.isolated[0] == isolated
 
-    def test_isolated_pair_is_the_true_one(self):
-        rng, rows = np.random.default_rng(51), 20_000
-        geometry = Geometry.cone(9)
-        z = rng.standard_normal((rows, 9))
-        z[:, 0] += 25
-        z[:, 2] -= 20
-        verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
-        pair = np.isin(np.arange(9), [0, 2])
-        right = (verdict.suspects == pair).all(axis=1) & verdict.isolated
-        assert right.mean() > 0.8
-        assert (verdict.isolated & ~right).sum() <= 2e-3 * rows
-        np.testing.assert_allclose(verdict.error[right][:, pair].mean(axis=0), [25, -20], atol=0.1)
 
-    def test_five_channels_never_isolate_a_pair(self):
-        geometry = Geometry.cone(5)
-        z = np.random.default_rng(53).standard_normal((5000, 5))
-        # Two neighbouring parity directions, 36 deg apart: the sum is 18 deg from the nearest single one.
-        i, j = next((i, j) for i, j in combinations(range(5), 2) if abs(geometry.rho[i, j]) > 0.8)
-        z[:, i] += 40
-        z[:, j] += 40 * np.sign(geometry.rho[i, j])
-        verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
-        assert verdict.alarm.all()
-        no_single = verdict.suspects.all(axis=1)
-        assert no_single.mean() > 0.9
-        assert not verdict.isolated[no_single].any()
+def test_isolated_pair_is_the_true_one():
+    rng, rows = np.random.default_rng(51), 20_000
+    geometry = Geometry.cone(9)
+    z = rng.standard_normal((rows, 9))
+    z[:, 0] += 25
+    z[:, 2] -= 20
+    verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+    pair = np.isin(np.arange(9), [0, 2])
+    right = (verdict.suspects == pair).all(axis=1) & verdict.isolated
+    assert right.mean() > 0.8
+    assert (verdict.isolated & ~right).sum() <= 2e-3 * rows
+    np.testing.assert_allclose(verdict.error[right][:, pair].mean(axis=0), [25, -20], atol=0.1)
+
+
+def test_five_channels_never_isolate_a_pair():
+    geometry = Geometry.cone(5)
+    z = np.random.default_rng(53).standard_normal((5000, 5))
+    # Two neighbouring parity directions, 36 deg apart: the sum is 18 deg from the nearest single one.
+    i, j = next((i, j) for i, j in combinations(range(5), 2) if abs(geometry.rho[i, j]) > 0.8)
+    z[:, i] += 40
+    z[:, j] += 40 * np.sign(geometry.rho[i, j])
+    verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+    assert verdict.alarm.all()
+    no_single = verdict.suspects.all(axis=1)
+    assert no_single.mean() > 0.9
+    assert not verdict.isolated[no_single].any()

@@ -134,55 +134,55 @@ def random_mean(seed, n):
     return Mean(geometry, y, root @ root.T).moving(rng.normal(0, 1, 3), rng.normal(0, 20, 3))
 
 
-class TestOdds:
-    @settings(max_examples=25)
-    @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
-    def test_are_those_of_normal_densities(self, seed, n):
-        mean = random_mean(seed, n)
-        ours = {(m, w, k): o for k, (m, o, w) in enumerate(sorted(mean.hypotheses(), key=lambda one: (one[0], one[2])))}
-        theirs = sorted(oracle(mean), key=lambda one: (one[0], one[2]))
-        kept = {m for m, _, _ in ours}
-        # Pairs that can hardly be told apart are left out.
-        assert all(m.bit_count() == 2 for m, _, _ in theirs if m not in kept)
-        theirs = [one for one in theirs if one[0] in kept]
-        assert [(m, w) for m, w, _ in ours] == [(m, w) for m, _, w in theirs]
-        for mask in kept:
-            mine, expected = (
-                np.sort(list(odds))
-                for odds in ((o for (m, _, _), o in ours.items() if m == mask), (o for m, o, _ in theirs if m == mask))
-            )
-            if np.isfinite(expected).all():
-                np.testing.assert_allclose(mine, expected, rtol=1e-4, atol=1e-3)
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
+def test_odds_are_those_of_normal_densities(seed, n):
+    mean = random_mean(seed, n)
+    ours = {(m, w, k): o for k, (m, o, w) in enumerate(sorted(mean.hypotheses(), key=lambda one: (one[0], one[2])))}
+    theirs = sorted(oracle(mean), key=lambda one: (one[0], one[2]))
+    kept = {m for m, _, _ in ours}
+    # Pairs that can hardly be told apart are left out.
+    assert all(m.bit_count() == 2 for m, _, _ in theirs if m not in kept)
+    theirs = [one for one in theirs if one[0] in kept]
+    assert [(m, w) for m, w, _ in ours] == [(m, w) for m, _, w in theirs]
+    for mask in kept:
+        mine, expected = (
+            np.sort(list(odds))
+            for odds in ((o for (m, _, _), o in ours.items() if m == mask), (o for m, o, _ in theirs if m == mask))
+        )
+        if np.isfinite(expected).all():
+            np.testing.assert_allclose(mine, expected, rtol=1e-4, atol=1e-3)
 
 
-class TestChoice:
-    def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self):
-        """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
-        rng = np.random.default_rng(3)
-        for size in (0.2, 0.5, 0.8):
-            for other in (0.7, 1.4, 3.0):
-                y = rng.normal(0, 0.1, 9)
-                y[0], y[3] = y[0] + size, y[3] + other * size
-                assert Mean(PARALLEL, y, 0.01).explained()[0] <= {0, 3}
+def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third():
+    """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
+    rng = np.random.default_rng(3)
+    for size in (0.2, 0.5, 0.8):
+        for other in (0.7, 1.4, 3.0):
+            y = rng.normal(0, 0.1, 9)
+            y[0], y[3] = y[0] + size, y[3] + other * size
+            assert Mean(PARALLEL, y, 0.01).explained()[0] <= {0, 3}
 
-    def test_a_unit_that_measures_motion_too_late_does_not_blame_its_gyros(self):
-        acceleration = np.array([20.0, -10.0, 5.0])
-        y = np.random.default_rng(4).normal(0, 1e-3, 9)
-        y[3:6] -= 3e-3 * PARALLEL.axes[3:6] @ acceleration
-        faulty, among = Mean(PARALLEL, y, 1e-6).moving(np.zeros(3), acceleration).explained()
-        assert not faulty
-        assert among >= {3, 4, 5}
 
-    @settings(max_examples=25)
-    @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9, 12]))
-    def test_what_no_hypothesis_explains_blames_all(self, seed, n):
-        """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""
-        mean = random_mean(seed, n)
-        root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
-        faulty, among = mean.explained()
-        best = sorted(channels_of(int(mean.own["likeliest"])))
-        columns = root @ np.hstack([mean.geometry.axes, np.eye(n)[:, best]])
-        left = root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
-        limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)
-        if left @ left > 1.01 * limit:
-            assert (faulty, among) == (set(), set(range(n)))
+def test_a_unit_that_measures_motion_too_late_does_not_blame_its_gyros():
+    acceleration = np.array([20.0, -10.0, 5.0])
+    y = np.random.default_rng(4).normal(0, 1e-3, 9)
+    y[3:6] -= 3e-3 * PARALLEL.axes[3:6] @ acceleration
+    faulty, among = Mean(PARALLEL, y, 1e-6).moving(np.zeros(3), acceleration).explained()
+    assert not faulty
+    assert among >= {3, 4, 5}
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9, 12]))
+def test_what_no_hypothesis_explains_blames_all(seed, n):
+    """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""
+    mean = random_mean(seed, n)
+    root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
+    faulty, among = mean.explained()
+    best = sorted(channels_of(int(mean.own["likeliest"])))
+    columns = root @ np.hstack([mean.geometry.axes, np.eye(n)[:, best]])
+    left = root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
+    limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)
+    if left @ left > 1.01 * limit:
+        assert (faulty, among) == (set(), set(range(n)))

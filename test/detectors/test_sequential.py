@@ -80,136 +80,143 @@ def measured():
     return after(noisy())
 
 
-class TestSums:
-    def test_no_more_than_the_number_of_samples_in_the_mean(self):
-        """What makes the run length exact: their mean less the number of samples never tends upward."""
-        detector, sums = sequential(run_length=1e15), []
-        for k in range(400):
-            detector.reset()
-            sums.append(math.expm1(detector.detect(white(k, 100)).statistic[-1]))
-        assert np.mean(sums) < 100 + 3 * np.std(sums) / 20
-        assert np.median(sums) > 1
-
-    @pytest.mark.parametrize(
-        ("geometry", "noise"),
-        [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
-    )
-    def test_run_length_is_at_least_the_one_asked_for(self, geometry, noise):
-        detector, samples, alarms = sequential(geometry, noise, run_length=1000), 0, 0
-        for seed in range(30):
-            detector.reset()
-            z = white(seed, 4000, geometry.n) * noise.for_channels(geometry.n).noise_std
-            alarm = detector.detect(z).alarm
-            samples += int(alarm.argmax()) + 1 if alarm.any() else len(alarm)
-            alarms += bool(alarm.any())
-        assert alarms < 30
-        assert samples > 1000 * max(alarms, 1)
+def test_sums_are_no_more_than_the_number_of_samples_in_the_mean():
+    """What makes the run length exact: their mean less the number of samples never tends upward."""
+    detector, sums = sequential(run_length=1e15), []
+    for k in range(400):
+        detector.reset()
+        sums.append(math.expm1(detector.detect(white(k, 100)).statistic[-1]))
+    assert np.mean(sums) < 100 + 3 * np.std(sums) / 20
+    assert np.median(sums) > 1
 
 
-class TestDelay:
-    @pytest.mark.parametrize(("size", "most"), [(2.0, 2.0), (4.0, 1.7), (8.0, 2.0)])
-    def test_beside_the_optimal_bound(self, size, most):
-        """After 40 s without a fault, over which the noise was measured."""
-        delays = []
-        for k in range(60):
-            alarm = measured().detect(white(k, 200) + fault(k % 6, -size if k % 2 else size)).alarm
-            assert alarm.any()
-            delays.append(int(alarm.argmax()) + 1)
-        assert np.mean(delays) < most * BOUND[size]
-
-    def test_what_has_passed_is_forgotten(self):
-        """Sums are bounded: a fault of any size and length leaves no more than noise takes away in minutes."""
-        detector = measured()
-        detector.detect(white(7, 5000) + fault(0, 1000.0))
-        after = detector.detect(white(8, 40_000))
-        assert after.alarm[0]
-        assert not after.alarm[-1]
-
-    @pytest.mark.parametrize("geometry", [CONE, Geometry.cone(8), Geometry.from_triads([np.eye(3)] * 3)])
-    def test_one_fault_is_named_with_its_size(self, geometry):
-        detector = sequential(geometry)
-        for channel in range(geometry.n):
-            detector.reset()
-            z = white(channel, 1200, geometry.n)
-            z[1000:, channel] -= 12.0
-            verdict = detector.detect(z)
-            assert named(verdict) == {channel}
-            assert verdict.isolated[-1]
-            assert verdict.error[-1, channel] == pytest.approx(-12.0, abs=1.0)
+@pytest.mark.parametrize(
+    ("geometry", "noise"),
+    [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
+)
+def test_run_length_is_at_least_the_one_asked_for(geometry, noise):
+    detector, samples, alarms = sequential(geometry, noise, run_length=1000), 0, 0
+    for seed in range(30):
+        detector.reset()
+        z = white(seed, 4000, geometry.n) * noise.for_channels(geometry.n).noise_std
+        alarm = detector.detect(z).alarm
+        samples += int(alarm.argmax()) + 1 if alarm.any() else len(alarm)
+        alarms += bool(alarm.any())
+    assert alarms < 30
+    assert samples > 1000 * max(alarms, 1)
 
 
-class TestNoFault:
-    @settings(max_examples=40)
-    @given(size=st.floats(-1e7, 1e7), channel=st.integers(0, 5), at=st.integers(0, 699), common=st.booleans())
-    def test_one_wild_value_never_alarms(self, size, channel, at, common):
-        z = white(9, 700)
-        # A spike that all channels have in the same measure is one of the rate at times.
-        z[at, slice(None) if common else channel] += size
+@pytest.mark.parametrize(("size", "most"), [(2.0, 2.0), (4.0, 1.7), (8.0, 2.0)])
+def test_delays_beside_the_optimal_bound(size, most):
+    """After 40 s without a fault, over which the noise was measured."""
+    delays = []
+    for k in range(60):
+        alarm = measured().detect(white(k, 200) + fault(k % 6, -size if k % 2 else size)).alarm
+        assert alarm.any()
+        delays.append(int(alarm.argmax()) + 1)
+    assert np.mean(delays) < most * BOUND[size]
+
+
+def test_what_has_passed_is_forgotten():
+    """Sums are bounded: a fault of any size and length leaves no more than noise takes away in minutes."""
+    detector = measured()
+    detector.detect(white(7, 5000) + fault(0, 1000.0))
+    after = detector.detect(white(8, 40_000))
+    assert after.alarm[0]
+    assert not after.alarm[-1]
+
+
+@pytest.mark.parametrize("geometry", [CONE, Geometry.cone(8), Geometry.from_triads([np.eye(3)] * 3)])
+def test_one_fault_is_named_with_its_size(geometry):
+    detector = sequential(geometry)
+    for channel in range(geometry.n):
+        detector.reset()
+        z = white(channel, 1200, geometry.n)
+        z[1000:, channel] -= 12.0
+        verdict = detector.detect(z)
+        assert named(verdict) == {channel}
+        assert verdict.isolated[-1]
+        assert verdict.error[-1, channel] == pytest.approx(-12.0, abs=1.0)
+
+
+@settings(max_examples=40)
+@given(size=st.floats(-1e7, 1e7), channel=st.integers(0, 5), at=st.integers(0, 699), common=st.booleans())
+def test_one_wild_value_never_alarms(size, channel, at, common):
+    z = white(9, 700)
+    # A spike that all channels have in the same measure is one of the rate at times.
+    z[at, slice(None) if common else channel] += size
+    assert not fresh().detect(z).alarm.any()
+
+
+def test_a_bias_is_learned_and_what_comes_later_is_found():
+    detector, z = sequential(noise=NoiseModel(1.0, bias_std=0.2)), white(11, 30_000)
+    z += fault(3, 2.4 * 0.2)
+    assert not detector.detect(z[:20_000]).alarm.any()
+    found = detector.detect(z[20_000:] + fault(3, 1.0))
+    assert found.alarm.any()
+    assert found.suspects[found.alarm][:, 3].all()
+
+
+def test_errors_that_motion_explains_never_alarm():
+    """A turn as long as it likes, with scale factors up to three standard deviations off, and late instants."""
+    rng, noise = np.random.default_rng(12), NoiseModel(0.003, scale_std=0.002, timing_std=3e-4)
+    t = np.arange(20_000) / 100
+    rate = np.stack([np.sin(2 * t), 1.5 * np.cos(0.3 * t), np.full_like(t, 3.0)], axis=1)
+    turning = np.gradient(rate, 0.01, axis=0)
+    for _ in range(3):
+        scale, delay = 0.002 * rng.uniform(-3, 3, 6), 3e-4 * rng.uniform(-3, 3, 6)
+        z = (rate @ CONE.axes.T) * (1 + scale) + (turning @ CONE.axes.T) * delay
+        assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_of_another_size_is_no_fault(seed):
+    """Twice as large at once, five times within two seconds, and as expected after a long rest."""
+    assert not measured().detect(2.0 * white(seed, 600)).alarm.any()
+    rise = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
+    assert not measured().detect(rise * white(seed, 600)).isolated.any()
+    assert not after(rested()).detect(white(seed, 400)).alarm.any()
+
+
+def test_nothing_is_found_in_streams_without_noise():
+    """Not even in the rounding of single precision, after a long time of none."""
+    rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
+    z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
+    verdict = sequential(noise=NoiseModel(1e-3)).detect(z)
+    assert np.isfinite(verdict.statistic).all()
+    assert verdict.statistic.max() < 4.0
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.9])
+def test_coloured_noise_is_no_fault(correlation):
+    for seed in range(4):
+        z = white(seed, 6000)
+        for k in range(1, len(z)):
+            z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
         assert not fresh().detect(z).alarm.any()
 
-    def test_a_bias_is_learned_and_what_comes_later_is_found(self):
-        detector, z = sequential(noise=NoiseModel(1.0, bias_std=0.2)), white(11, 30_000)
-        z += fault(3, 2.4 * 0.2)
-        assert not detector.detect(z[:20_000]).alarm.any()
-        found = detector.detect(z[20_000:] + fault(3, 1.0))
-        assert found.alarm.any()
-        assert found.suspects[found.alarm][:, 3].all()
 
-    def test_errors_that_motion_explains_never_alarm(self):
-        """A turn as long as it likes, with scale factors up to three standard deviations off, and late instants."""
-        rng, noise = np.random.default_rng(12), NoiseModel(0.003, scale_std=0.002, timing_std=3e-4)
-        t = np.arange(20_000) / 100
-        rate = np.stack([np.sin(2 * t), 1.5 * np.cos(0.3 * t), np.full_like(t, 3.0)], axis=1)
-        turning = np.gradient(rate, 0.01, axis=0)
-        for _ in range(3):
-            scale, delay = 0.002 * rng.uniform(-3, 3, 6), 3e-4 * rng.uniform(-3, 3, 6)
-            z = (rate @ CONE.axes.T) * (1 + scale) + (turning @ CONE.axes.T) * delay
-            assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
+def test_heavy_tails_and_spikes_now_and_then_are_no_fault():
+    tails, spikes = np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2), white(10, 60_000)
+    rng = np.random.default_rng(10)
+    hit = rng.random(spikes.shape) < 0.002
+    spikes[hit] += rng.choice([-1, 1], int(hit.sum())) * rng.uniform(5, 500, int(hit.sum()))
+    for z in (tails, spikes):
+        assert not fresh().detect(z).alarm.any()
 
-    @pytest.mark.parametrize("seed", range(20))
-    def test_noise_of_another_size_is_no_fault(self, seed):
-        """Twice as large at once, five times within two seconds, and as expected after a long rest."""
-        assert not measured().detect(2.0 * white(seed, 600)).alarm.any()
-        rise = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
-        assert not measured().detect(rise * white(seed, 600)).isolated.any()
-        assert not after(rested()).detect(white(seed, 400)).alarm.any()
 
-    def test_nothing_is_found_in_streams_without_noise(self):
-        """Not even in the rounding of single precision, after a long time of none."""
-        rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
-        z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
-        verdict = sequential(noise=NoiseModel(1e-3)).detect(z)
-        assert np.isfinite(verdict.statistic).all()
-        assert verdict.statistic.max() < 4.0
-
-    @pytest.mark.parametrize("correlation", [0.5, 0.9])
-    def test_coloured_noise_is_no_fault(self, correlation):
-        for seed in range(4):
-            z = white(seed, 6000)
-            for k in range(1, len(z)):
-                z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
-            assert not fresh().detect(z).alarm.any()
-
-    def test_heavy_tails_and_spikes_now_and_then_are_no_fault(self):
-        tails, spikes = np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2), white(10, 60_000)
-        rng = np.random.default_rng(10)
-        hit = rng.random(spikes.shape) < 0.002
-        spikes[hit] += rng.choice([-1, 1], int(hit.sum())) * rng.uniform(5, 500, int(hit.sum()))
-        for z in (tails, spikes):
-            assert not fresh().detect(z).alarm.any()
-
-    @settings(max_examples=20)
-    @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
-    def test_any_axes_without_alarm_for_20_s(self, seed, n):
-        rng = np.random.default_rng(seed)
-        try:
-            geometry = random_axes(rng, n)
-            detector = sequential(geometry, NoiseModel(rng.uniform(0.5, 2.0, n)))
-        except FdiError:
-            return
-        verdict = detector.detect(rng.standard_normal((2000, n)) * detector.noise.noise_std)
-        assert np.isfinite(verdict.statistic).all()
-        assert not verdict.alarm.any()
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
+def test_any_axes_without_alarm_for_20_s(seed, n):
+    rng = np.random.default_rng(seed)
+    try:
+        geometry = random_axes(rng, n)
+        detector = sequential(geometry, NoiseModel(rng.uniform(0.5, 2.0, n)))
+    except FdiError:
+        return
+    verdict = detector.detect(rng.standard_normal((2000, n)) * detector.noise.noise_std)
+    assert np.isfinite(verdict.statistic).all()
+    assert not verdict.alarm.any()
 
 
 class TestDecision:
