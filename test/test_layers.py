@@ -112,15 +112,11 @@ def test_no_import_points_up():
 
 def test_no_import_goes_in_a_circle():
     known = modules()
-    graph = {
-        module: {
-            name if name in known else f"{name}.__init__"
-            for name in imported(path)
-            if name in known or f"{name}.__init__" in known
-        }
-        - {module}
-        for module, path in known.items()
-    }
+
+    def there(name):
+        return next((one for one in (name, f"{name}.__init__") if one in known), None)
+
+    graph = {module: {there(name) for name in imported(path)} - {None, module} for module, path in known.items()}
     graphlib.TopologicalSorter(graph).prepare()
 
 
@@ -141,16 +137,20 @@ def test_an_import_that_breaks_the_layers_is_found(part, line, words):
     assert any(words in violation for violation in violations(part, imports(ast.parse(line))))
 
 
+def names_after(code, timeout):
+    """What a fresh interpreter prints last, so that nothing loaded before hides a missing library."""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=timeout)
+    return set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
+
+
 def test_the_core_imports_without_ros_and_bag_libraries():
-    """In a fresh interpreter, so that nothing loaded before hides a missing library; and only what is used."""
-    code = (
+    """And only what is used."""
+    loaded = names_after(
         "import sys, fdi_ros; dir(fdi_ros); assert 'numpy' not in sys.modules;"
-        "fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))"
+        "fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))",
+        60,
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=60
-    )
-    loaded = set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
     assert "numpy" in loaded
     # Numba looks which SciPy there is; of SciPy itself nothing is used here, which the imports above show.
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
@@ -173,15 +173,10 @@ def make():
     node = process._make("fdi_node")
     node.live = lambda stop: live(node, stop)
     return node
-code = process.run("fdi_node", [], make)
-print(code, sorted(name for name in set(sys.modules) - before if sys.modules[name] is not None))
+assert process.run("fdi_node", [], make) == 0
+print([name for name in set(sys.modules) - before if sys.modules[name] is not None])
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=400
-    )
-    ended, _, names = done.stdout.strip().splitlines()[-1].partition(" ")
-    loaded = ast.literal_eval(names)
-    assert ended == "0", done.stderr
+    loaded = names_after(code, 400)
     parts = {name.split(".")[1] for name in loaded if name.startswith("fdi_ros.")}
     assert "monitor" in parts
     assert parts.isdisjoint(OFFLINE)

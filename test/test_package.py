@@ -125,21 +125,15 @@ def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root, tmp_pa
     assert told.stdout.split() == [fdi_ros.__version__, str(clone / "fdi_ros" / "__init__.py")]
 
 
-def test_one_version_everywhere(root):
+def test_one_version_everywhere_and_a_changelog_that_bloom_reads(root):
+    """REP-132; what is not released yet stands under Forthcoming, which the release replaces by version and date."""
     manifest = ElementTree.parse(root / "package.xml").getroot()
     assert manifest.findtext("version") == fdi_ros.__version__
     assert f'version="{fdi_ros.__version__}"' in (root / "setup.py").read_text()
-
-
-def test_the_changelog_is_one_that_bloom_reads(root):
-    """REP-132; what is not released yet stands under Forthcoming, which the release replaces by version and date."""
     catkin = pytest.importorskip("catkin_pkg.changelog")
-    text = (root / "CHANGELOG.rst").read_text()
-    released = f"{fdi_ros.__version__} (2000-01-01)"
-    changelog = catkin.Changelog("fdi_ros")
-    catkin.populate_changelog_from_rst(
-        changelog, re.sub(r"^Forthcoming\n-+$", f"{released}\n{'-' * 30}", text, flags=re.M)
-    )
+    released = f"{fdi_ros.__version__} (2000-01-01)\n{'-' * 30}"
+    text, changelog = (root / "CHANGELOG.rst").read_text(), catkin.Changelog("fdi_ros")
+    catkin.populate_changelog_from_rst(changelog, re.sub(r"^Forthcoming\n-+$", released, text, flags=re.M))
     assert changelog.get_content_of_version(fdi_ros.__version__)
 
 
@@ -168,21 +162,17 @@ def test_make_help_lists_every_target(root):
 
 def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root):
     order = steps(root)
+    words, runs = [word for word, _ in order], [rest for word, rest in order if word == "RUN"]
     assert order[0] == ("FROM", "ros:jazzy-ros-base")
-    runs = [rest for word, rest in order if word == "RUN"]
     assert "rosdep install --rosdistro jazzy --from-paths src" in runs[0]
     # Beside that an init, and by pip what no distribution of ROS has.
     assert {"tini", "pymavlink", "pyserial", *BAGS} <= set(runs[1].split())
     assert "chmod -R a+rX install" in runs[2]
-    (user,) = [rest for word, rest in order if word == "USER"]
+    (user,), (entry,) = ([rest for word, rest in order if word == what] for what in ("USER", "ENTRYPOINT"))
     assert f"useradd --create-home {user}" in runs[-1]
-    words = [word for word, _ in order]
-    last_run = len(words) - words[::-1].index("RUN")
-    assert last_run <= words.index("USER") < words.index("ENTRYPOINT") < words.index("CMD")
-    (entry,) = [json.loads(rest) for word, rest in order if word == "ENTRYPOINT"]
-    assert entry[: len(INIT)] == INIT
-    ignored = (root / ".dockerignore").read_text().split()
-    assert {".git", "**/__pycache__", ".venv*"} <= set(ignored)
+    assert [word for word in words if word != "ENV"][-4:] == ["RUN", "USER", "ENTRYPOINT", "CMD"]
+    assert json.loads(entry)[: len(INIT)] == INIT
+    assert {".git", "**/__pycache__", ".venv*"} <= set((root / ".dockerignore").read_text().split())
 
 
 def test_the_steps_build_it_and_a_user_runs_it_without_compiling(workspace, root, quiet_domain):
@@ -193,37 +183,28 @@ def test_the_steps_build_it_and_a_user_runs_it_without_compiling(workspace, root
     assert given[-1] == "/config.yaml"
     # Of the image: its init, and the ROS in it.
     start = entry[len(INIT) :]
-    start[-1] = with_compiled(start[-1], root)
-    command = [*start, *given[:-1], "config/two_imus.yaml"]
+    command = [*start[:-1], with_compiled(start[-1], root), *given[:-1], "config/two_imus.yaml"]
     home = workspace / "home"
     home.mkdir()
-    for path in (home, workspace):
-        os.chown(path, USER if path == home else 0, -1)
+    os.chown(home, USER, -1)
+    os.chown(workspace, 0, -1)
     # Where the tests run may be closed to others; reading is all that this user may do there.
-    caps = [
-        "--inh-caps",
-        "-all,+dac_read_search",
-        "--ambient-caps",
-        "+dac_read_search",
-        "--bounding-set",
-        "-all,+dac_read_search",
-    ]
-    become = ["setpriv", "--reuid", str(USER), "--regid", str(USER), "--clear-groups", *caps]
+    only = "-all,+dac_read_search"
+    become = ["setpriv", "--reuid", str(USER), "--regid", str(USER), "--clear-groups"]
+    become += ["--inh-caps", only, "--ambient-caps", "+dac_read_search", "--bounding-set", only]
     env = {**os.environ, "HOME": str(home), "ROS_LOG_DIR": str(home / "log"), "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-    node = subprocess.Popen(
-        [*become, *command], cwd=workspace, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     said = []
-    assert node.stdout is not None
-    try:
-        for line in node.stdout:
-            said.append(line)
-            if " monitoring " in line:
-                assert os.stat(f"/proc/{node.pid}").st_uid == USER
-                break
-    finally:
-        node.send_signal(signal.SIGTERM)
-        said.append(node.communicate(timeout=120)[0])
+    with subprocess.Popen([*become, *command], cwd=workspace, env=env, **pipes) as node:
+        try:
+            for line in node.stdout:
+                said.append(line)
+                if " monitoring " in line:
+                    assert os.stat(f"/proc/{node.pid}").st_uid == USER
+                    break
+        finally:
+            node.send_signal(signal.SIGTERM)
+            said.append(node.communicate(timeout=120)[0])
     assert node.returncode == 0, said
     assert any(" monitoring " in line for line in said), said
     assert "compil" not in "".join(said)

@@ -1,7 +1,6 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-import contextlib
 import json
 import math
 import os
@@ -16,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -52,13 +50,14 @@ SMALL = {
 
 def study_file(tmp_path, content):
     path = tmp_path / "study.yaml"
-    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
 
 
-def run(tmp_path, content):
+def run(tmp_path, kind, seed=8, **settings):
     """Result of a study of one section."""
-    return plain(run_study(load_study(study_file(tmp_path, content)), workers=1))["sections"][0]
+    path = study_file(tmp_path, {"seed": seed, kind: settings})
+    return plain(run_study(load_study(path), workers=1))["sections"][0]
 
 
 @pytest.fixture
@@ -135,22 +134,22 @@ list(run_jobs(exec, [(text,), ("",)], 2, None, lost))
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
-def test_workers_end_when_their_parent_is_killed(tmp_path):
-    started = []
-    for lost in ("None", "given"):
-        said = tmp_path / lost
-        started.append((subprocess.Popen([sys.executable, "-c", WORK, lost, said]), said))
-    for parent, said in started:
-        deadline = time.monotonic() + 60
-        while not (said.exists() and said.read_text().endswith("\n")) and time.monotonic() < deadline:
+@pytest.mark.parametrize("lost", ["None", "given"])
+def test_workers_end_when_their_parent_is_killed(tmp_path, lost):
+    def until(done):
+        end = time.monotonic() + 60
+        while not done():
+            assert time.monotonic() < end
             time.sleep(0.05)
-        worker = Path("/proc") / said.read_text().strip()
-        assert worker.exists()
-        parent.kill()
-        parent.wait()
-        while worker.exists() and "Z" not in (worker / "stat").read_text().split()[2] and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert time.monotonic() < deadline
+
+    said = tmp_path / "said"
+    parent = subprocess.Popen([sys.executable, "-c", WORK, lost, said])
+    until(lambda: said.exists() and said.read_text().endswith("\n"))
+    worker = Path("/proc") / said.read_text().strip()
+    assert worker.exists()
+    parent.kill()
+    parent.wait()
+    until(lambda: not worker.exists() or "Z" in (worker / "stat").read_text().split()[2])
 
 
 def test_workers_that_always_die_end_the_study_with_one_line():
@@ -176,13 +175,10 @@ def check_that_one_is_lost(folder, cluster):
             os.kill(os.getpid(), signal.SIGKILL)
         return 10 * k
 
-    given = [(k,) for k in range(6)]
-    found = list(jobs.run_jobs(note, given, 2, cluster, lost=lambda k, words: (k, words)))
+    found = list(jobs.run_jobs(note, [(k,) for k in range(6)], 2, cluster, lost=lambda k, words: words))
     results = dict(found)
-    assert len(found) == len(results) == len(given)
-    k, words = results.pop(1)
-    assert k == 1
-    times = int(re.fullmatch(r"the worker process that ran it died (\d) times \(.*\)", words)[1])
+    assert len(found) == len(results)
+    times = int(re.fullmatch(r"the worker process that ran it died (\d) times \(.*\)", results.pop(1))[1])
     assert results == {k: 10 * k for k in (0, 2, 3, 4, 5)}
     return times, {k: len(list(folder.glob(f"{k}_*"))) for k in range(6)}
 
@@ -207,37 +203,34 @@ def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are
 
 
 def certificate(folder, name):
-    """A key, and a certificate that it has signed itself."""
+    """A certificate that its key has signed itself, and the key."""
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed")
     key, made = folder / f"{name}-key.pem", folder / f"{name}.pem"
-    words = ["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}"]
-    subprocess.run(["openssl", *words, "-keyout", key, "-out", made], check=True, capture_output=True)
-    return made, key
-
-
-def configured(ca_file, cert, key):
-    """Dask's configuration with these files for a client."""
-    import dask
-
-    names = {"ca-file": ca_file, "client.cert": cert, "client.key": key}
-    return dask.config.set({f"distributed.comm.tls.{name}": str(path) for name, path in names.items()})
+    words = f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN={name} -keyout {key} -out {made}"
+    subprocess.run(["openssl", *words.split()], check=True, capture_output=True)
+    return str(made), str(key)
 
 
 def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monkeypatch, distributed):
-    (ours, key), (foreign, foreign_key) = certificate(tmp_path, "ours"), certificate(tmp_path, "foreign")
-    known = {f"tls_{who}_{what}": str(path) for who in ("scheduler", "worker", "client")
-             for what, path in (("cert", ours), ("key", key))}  # fmt: skip
-    security = distributed.Security(tls_ca_file=str(ours), require_encryption=True, **known)
+    import dask
+
+    ours, foreign = certificate(tmp_path, "ours"), certificate(tmp_path, "foreign")
+    known = {f"tls_{who}_{what}": path for who in ("scheduler", "worker", "client")
+             for what, path in zip(("cert", "key"), ours, strict=True)}  # fmt: skip
+    security = distributed.Security(tls_ca_file=ours[0], require_encryption=True, **known)
     monkeypatch.setattr(jobs, "CONNECT_TIMEOUT", 3.0)
     with distributed.LocalCluster(protocol="tls", security=security, processes=False, **ONE_WORKER) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
-        with configured(ours, ours, key):
-            assert dict(jobs.run_jobs(abs, [(-1,), (-2,)], 1, address)) == {0: 1, 1: 2}
-        for other in (configured(ours, foreign, foreign_key), contextlib.nullcontext()):
-            with other, pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
-                list(jobs.run_jobs(abs, [(-1,)], 1, address))
+        for given in (ours, foreign, None):
+            names = zip(("ca-file", "client.cert", "client.key"), (ours[0], *(given or ())), strict=False)
+            with dask.config.set({f"distributed.comm.tls.{name}": path for name, path in names if given}):
+                if given == ours:
+                    assert dict(jobs.run_jobs(abs, [(-1,), (-2,)], 1, address)) == {0: 1, 1: 2}
+                    continue
+                with pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
+                    list(jobs.run_jobs(abs, [(-1,)], 1, address))
 
 
 @pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
@@ -259,27 +252,24 @@ def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, refused, mo
 
 
 def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path):
-    section = run(
-        tmp_path,
-        "{seed: 5, snapshot: {geometries: [dodecahedron, two_triad_cone], detectors: [chi_square], thresholds: "
-        "derived, sizes: [4, 6, 8], trials: 30000, sound_trials: 1000}}",
-    )
-    identified = {"dodecahedron": (0.753, 0.945, 0.993), "two_triad_cone": (0.715, 0.910, 0.978)}
-    both = {"dodecahedron": (0.161, 0.652, 0.961), "two_triad_cone": (0.153, 0.630, 0.948)}
-    for name in identified:
+    """Shares named, and named and declared, as printed, for sizes 4, 6 and 8."""
+    printed = {
+        "dodecahedron": [(0.753, 0.161), (0.945, 0.652), (0.993, 0.961)],
+        "two_triad_cone": [(0.715, 0.153), (0.910, 0.630), (0.978, 0.948)],
+    }
+    what = {"geometries": [*printed], "detectors": ["chi_square"], "thresholds": "derived", "sizes": [4, 6, 8]}
+    section = run(tmp_path, "snapshot", 5, **what, trials=30_000, sound_trials=1000)
+    for name, shares in printed.items():
         cells = [cell for cell in section["cells"] if cell["geometry"] == name and cell["size"]]
-        for cell, name_alone, name_and_alarm in zip(cells, identified[name], both[name], strict=True):
+        for cell, (named, both) in zip(cells, shares, strict=True):
             (figures,) = cell["methods"]["chi_square"]
             closed = float(stats.ncx2.sf(16.266, 3, cell["size"] ** 2 / 2))
-            for value, truth, printed in (
-                (figures["declared"]["value"], closed, 0.0),
-                (figures["identified"]["value"], name_alone, 5e-4),
-                (figures["right"]["value"], name_and_alarm, 5e-4),
-            ):
-                assert value == pytest.approx(truth, abs=3.5 * math.sqrt(truth * (1 - truth) / 3e4) + printed)
+            for key, truth, digits in (("declared", closed, 0.0), ("identified", named, 5e-4), ("right", both, 5e-4)):
+                error = 3.5 * math.sqrt(truth * (1 - truth) / 3e4) + digits
+                assert figures[key]["value"] == pytest.approx(truth, abs=error)
 
 
-def best_possible(geometry: Geometry, size: float, alarm: float, draws: int = 60_000) -> float:
+def best_possible(geometry, size, alarm, draws=60_000):
     """Share of faults declared with the right name by Bayes' decision, which knows the size; of one simulation."""
     rng, directions = np.random.default_rng(4), geometry.parity.T
     channel = rng.integers(geometry.n, size=draws)
@@ -294,11 +284,8 @@ def best_possible(geometry: Geometry, size: float, alarm: float, draws: int = 60
 
 
 def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_find_it(tmp_path):
-    section = run(
-        tmp_path,
-        "{seed: 8, snapshot: {sizes: [5], false_alarms: [0.01], trials: 5000, sound_trials: 50000, geometries: "
-        "[cone_5]}}",
-    )
+    what = {"sizes": [5], "false_alarms": [0.01], "geometries": ["cone_5"]}
+    section = run(tmp_path, "snapshot", **what, trials=5000, sound_trials=50_000)
     sound, faulty = section["cells"]
     assert {"determinant", "likelihood_ratio", "guaranteed"} <= set(sound["methods"])
     assert "judges a stream" in section["not_run"]["cone_5"]["cusum"]
@@ -315,18 +302,18 @@ def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_fin
 def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selection(tmp_path):
     """80.3 % detected, 8 % undetected, 7.3 % falsely determined; at sigma_0 = 0.2 sigma_k 2 deg/s."""
     names = ["mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual", "likelihood_ratio"]
-    settings = {"detectors": names, "false_alarms": [0.01], "trials": 8000, "sound_trials": 4000}
-    settings["selections"] = ["stands_out", "printed"]
-    section = run(tmp_path, {"seed": 2019, "residual_search": settings})
+    what = {"detectors": names, "false_alarms": [0.01], "selections": ["stands_out", "printed"]}
+    section = run(tmp_path, "residual_search", 2019, **what, trials=8000, sound_trials=4000)
     cells = {cell["selection"]: cell for cell in section["cells"]}
     outcomes = [
         {name: figure["value"] for name, figure in cells["stands_out"]["paper_tolerance"][search].items()}
         for search in names[:4]
     ]
     assert outcomes[1:] == outcomes[:-1], "the four searches name the same channel"
-    assert outcomes[0]["right_declared"] == pytest.approx(0.803, abs=0.04)
-    assert outcomes[0]["right_within"] + outcomes[0]["wrong_within"] == pytest.approx(0.08, abs=0.04)
-    assert outcomes[0]["wrong_declared"] == pytest.approx(0.073, abs=0.04)
+    found = outcomes[0]
+    assert found["right_declared"] == pytest.approx(0.803, abs=0.04)
+    assert found["right_within"] + found["wrong_within"] == pytest.approx(0.08, abs=0.04)
+    assert found["wrong_declared"] == pytest.approx(0.073, abs=0.04)
     assert 0.14 < cells["sound"]["paper_tolerance"]["max_residual"]["declared"]["value"] < 0.18
     assert cells["printed"]["paper_tolerance"]["max_residual"]["right_declared"]["value"] < 0.25
     # Rate-dependent errors weighed sample by sample name the right channel more often.
@@ -335,23 +322,15 @@ def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selec
 
 
 def test_delays_without_memory_are_geometric_and_those_of_cusum_shorter_never_below_the_limit(tmp_path):
-    section = run(
-        tmp_path,
-        "{seed: 9, delay: {detectors: [likelihood_ratio, cusum], sizes: [3.0], run_length: 1000, trials: 300, "
-        "sound_trials: 600, longest: 400, lead: 50}}",
-    )
-    (cell,) = section["cells"]
-    delay = {name: figures["mean_delay"] for name, figures in cell["methods"].items()}
-    section = run(
-        tmp_path,
-        "{seed: 9, snapshot: {sound_trials: 100000, detectors: [likelihood_ratio], sizes: [3], false_alarms: [0.001], "
-        "trials: 40000}}",
-    )
+    what = {"detectors": ["likelihood_ratio", "cusum"], "run_length": 1000, "longest": 400, "lead": 50}
+    (cell,) = run(tmp_path, "delay", 9, **what, sizes=[3.0], trials=300, sound_trials=600)["cells"]
+    ratio, cusum = (cell["methods"][name]["mean_delay"] for name in what["detectors"])
+    what = {"detectors": ["likelihood_ratio"], "false_alarms": [0.001], "sound_trials": 100_000}
+    section = run(tmp_path, "snapshot", 9, **what, sizes=[3], trials=40_000)
     power = section["cells"][1]["methods"]["likelihood_ratio"][0]["declared"]["value"]
     # Run lengths are found from 600 windows: some 15 % of uncertainty, beside that of 300 delays.
-    assert delay["likelihood_ratio"]["value"] == pytest.approx(1 / power, rel=0.3)
-    assert delay["cusum"]["high"] < delay["likelihood_ratio"]["low"]
-    assert delay["cusum"]["high"] > cell["limit"]["moustakides"]
+    assert ratio["value"] == pytest.approx(1 / power, rel=0.3)
+    assert cell["limit"]["moustakides"] < cusum["high"] < ratio["low"]
 
 
 def test_cusum_run_lengths_of_the_textbook():
@@ -371,12 +350,9 @@ def test_the_least_delay_lies_below_a_cusum_that_watches_both_sides_and_near_the
 
 
 def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not(tmp_path):
-    section = run(
-        tmp_path,
-        "{seed: 13, flight: {detectors: [likelihood_ratio], kinds: [none, bias, dropout], trials: 8, monitor: "
-        "{noise.noise_std: 0.003, noise.scale_std: 0.002, noise.timing_std: 0.0003, bias.startup_bias_duration: "
-        "2.0}}}",
-    )
+    monitor = {"noise.noise_std": 0.003, "noise.scale_std": 0.002, "noise.timing_std": 0.0003}
+    what = {"detectors": ["likelihood_ratio"], "kinds": ["none", "bias", "dropout"], "monitor": monitor | LEARNING}
+    section = run(tmp_path, "flight", 13, **what, trials=8)
     cells = {cell["fault"]: cell["methods"]["likelihood_ratio"] for cell in section["cells"]}
     assert cells["none"]["wrong"]["value"] == 0
     assert cells["bias"]["right"]["value"] == cells["dropout"]["right"]["value"] == 1
@@ -384,15 +360,18 @@ def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not
     assert cells["bias"]["rms_after"] < 2 * cells["none"]["rms_after"]
 
 
+LEARNING = {"bias.startup_bias_duration": 2.0}
+
+
 @pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
 def test_a_flight_leaves_nothing_behind_for_the_next(name):
-    settings = {"kinds": ["bias"], "detectors": [name], "monitor": {"bias.startup_bias_duration": 2.0}}
-    flight = Flight({field: known.default for field, known in Flight.schema.items()} | settings)
-    block = flight._flight("bias", np.random.default_rng(3))[0]
+    settings = {field: known.default for field, known in Flight.schema.items()}
+    flight = Flight(settings | {"kinds": ["bias"], "detectors": [name], "monitor": LEARNING})
+    first, second = (flight._flight("bias", np.random.default_rng(seed))[0] for seed in (4, 3))
     used, fresh = (flight._monitor(name) for _ in range(2))
-    used.process(flight._flight("bias", np.random.default_rng(4))[0])
+    used.process(first)
     used.restart()
-    after, alone = used.process(block), fresh.process(block)
+    after, alone = used.process(second), fresh.process(second)
     assert list(after.events) == list(alone.events) != []
     for field in after.rows.dtype.names:
         np.testing.assert_array_equal(after.rows[field], alone.rows[field])
@@ -400,22 +379,19 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
 
 
 def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):
-    path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
-    results = []
+    page, results = tmp_path / "page.html", []
     monkeypatch.setattr(
         "fdi_ros.experiments.montecarlo.run_study",
         lambda *arguments: results.append(run_study(*arguments)) or results[0],
     )
-    said = fdi("montecarlo", path, "--workers", 1, "--report", page, "--json", "-")
+    said = fdi("montecarlo", study_file(tmp_path, SMALL), "--workers", 1, "--report", page, "--json", "-")
     assert said.code == 0
     assert "best possible" in said.err
     assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
-    text = page.read_text()
-    shown = tables(results[0])
-    titles = {"One fault, two_triad_cone", "Largest residual is the right one, two_triad_cone", "Delay, two_triad_cone"}
-    assert titles < {one.title for one in shown}
-    assert all(one.title in text and one.title in said.err for one in shown)
-    assert "http://" not in text.split("<script>")[0]
+    text, titles = page.read_text(), {one.title for one in tables(results[0])}
+    kinds = ("One fault", "Largest residual is the right one", "Delay")
+    assert {f"{kind}, two_triad_cone" for kind in kinds} < titles
+    assert all(title in text and title in said.err for title in titles)
     assert '"type":"band"' in text
 
 
