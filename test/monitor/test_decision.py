@@ -4,6 +4,7 @@
 """Decision over time, against a plain account of the same rules over whole windows."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -109,42 +110,31 @@ def test_alarms_held_off_are_suspicion_and_never_a_declaration():
     assert changes == [False] * 5 + [True]
 
 
-def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_small():
-    for error, returns in ((0.4, True), (0.6, False)):
-        decider = Decider(1, 1, latch=False, clean_time=10)
-        assert decider.take((3,), isolated=True)
-        errors = np.zeros(12)
-        errors[3] = error
-        changes = [decider.take((), agrees=ALL, error=errors) for _ in range(20)]
-        assert np.flatnonzero(changes).tolist() == ([9] if returns else [])
-        assert decider.channels("faulty") == (set() if returns else {3})
-
-
-def test_a_small_fault_that_ended_does_not_count_against_the_return():
-    """Sample by sample it agrees with the others; its mean does not, until it has ended."""
+@pytest.mark.parametrize(
+    ("samples", "returns"),
+    [
+        ([(True, 0.4)] * 20, 9),
+        ([(True, 0.6)] * 20, None),
+        ([(k != 6, 0.0) for k in range(30)], 16),
+        # Sample by sample a small fault agrees with the others; its mean does not, until it has ended.
+        ([(True, 3.0)] * 200, None),
+    ],
+)
+def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_small(samples, returns):
     decider = Decider(1, 1, latch=False, clean_time=10)
-    decider.take((3,), isolated=True)
-    errors = np.zeros(12)
-    errors[3] = 3.0
-    for _ in range(200):
-        assert not decider.take((), agrees=ALL, error=errors)
+    assert decider.take((3,), isolated=True)
+    changes = [decider.take((), agrees=ALL if agrees else 0, error=np.eye(12)[3] * size) for agrees, size in samples]
+    assert np.flatnonzero(changes).tolist() == ([] if returns is None else [returns])
+    assert decider.channels("faulty") == ({3} if returns is None else set())
     changes = [decider.take((), agrees=ALL, error=np.zeros(12)) for _ in range(20)]
-    assert np.flatnonzero(changes).size == 1
+    assert sum(changes) == (returns is None)
 
 
 def test_the_clean_time_of_a_second_channel_counts_from_its_own_declaration():
-    decider = Decider(1, 1, latch=False, clean_time=10)
+    decider, others = Decider(1, 1, latch=False, clean_time=10), ALL & ~mask_of((3,))
     decider.take((3,), isolated=True)
     for _ in range(15):
-        decider.take((), agrees=ALL & ~mask_of((3,)))
+        decider.take((), agrees=others)
     decider.take((1,), isolated=True)
-    changes = [decider.take((), agrees=ALL & ~mask_of((3,))) for _ in range(20)]
-    assert np.flatnonzero(changes).tolist() == [9]
+    assert np.flatnonzero([decider.take((), agrees=others) for _ in range(20)]).tolist() == [9]
     assert decider.channels("faulty") == {3}
-
-
-def test_one_disagreement_begins_the_clean_time_anew():
-    decider = Decider(1, 1, latch=False, clean_time=10)
-    decider.take((3,), isolated=True)
-    changes = [decider.take((), agrees=0 if k == 6 else ALL) for k in range(30)]
-    assert np.flatnonzero(changes).tolist() == [16]

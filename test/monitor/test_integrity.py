@@ -171,19 +171,22 @@ def test_the_level_grows_with_noise_and_priors_and_falls_with_risk(prior, risk, 
     assert (integrity(prior=prior, risk=2 * risk).of(ALL).level <= level * (1 + 1e-9)).all()
 
 
-def test_without_redundancy_there_is_no_level_unless_faults_are_rarer_than_the_risk():
-    three = np.array([True, True, True, False, False, False])
-    assert np.isinf(integrity(prior=1e-3, risk=1e-5).of(three).level).all()
-    assert np.isfinite(integrity(prior=1e-7, risk=1e-5).of(three).level).all()
-    two = np.array([True, True, False, False, False, False])
-    assert np.isinf(integrity(prior=1e-9, risk=1e-2).of(two).level).all()
-
-
-def test_two_parallel_triads_protect_against_one_fault_but_not_against_twins():
-    parallel = Geometry.from_triads([np.eye(3), np.eye(3)])
-    assert np.isfinite(integrity(parallel, prior=1e-4, risk=1e-7).of(ALL).level).all()
-    # Three pairs of twins at 1e-8 each are more than this risk.
-    assert np.isinf(integrity(parallel, prior=1e-4, risk=2e-8).of(ALL).level).all()
+@pytest.mark.parametrize(
+    ("channels", "prior", "risk", "given"),
+    [
+        # Without redundancy only faults that are rarer than the risk leave a level, and two channels none.
+        (3, 1e-3, 1e-5, False),
+        (3, 1e-7, 1e-5, True),
+        (2, 1e-9, 1e-2, False),
+        # Parallel triads protect against one fault; three pairs of twins at 1e-8 each are more than the lower risk.
+        (0, 1e-4, 1e-7, True),
+        (0, 1e-4, 2e-8, False),
+    ],
+)
+def test_a_level_is_given_where_redundancy_or_priors_bear_the_risk(channels, prior, risk, given):
+    geometry = None if channels else Geometry.from_triads([np.eye(3), np.eye(3)])
+    level = integrity(geometry, prior=prior, risk=risk).of(np.arange(6) < (channels or 6)).level
+    assert (np.isfinite(level) == given).all()
 
 
 def monitor(**parameters):
