@@ -25,7 +25,7 @@ from fdi_ros.estimator.error_states import SIGNALS, Layout, fill_signals
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
+from fdi_ros.monitor.receiver import warm_detector, warm_path
 from fdi_ros.system.installation import BAGS, there
 
 
@@ -64,12 +64,6 @@ def _quietly(part: tuple[Any, ...]) -> int:
     finally:
         LOG.setLevel(level)
     return compilations() - before
-
-
-def warm_path() -> None:
-    """Compile the way of a sample, in blocks and in messages."""
-    warm_blocks()
-    warm_messages()
 
 
 def warm_verbs() -> None:

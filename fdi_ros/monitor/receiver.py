@@ -64,13 +64,7 @@ class Watchdog:
 
 
 class SampleRateCheck:
-    """Compares the rate of the samples, by their stamps, with the one that thresholds and times are made for.
-
-    Parameters
-    ----------
-    configured
-        Sample rate, Hz.
-    """
+    """Compares the rate of the samples, by their stamps, with the configured one, Hz, which all times are made for."""
 
     def __init__(self, configured: float) -> None:
         self.words = ""
@@ -86,19 +80,14 @@ class SampleRateCheck:
             self._rates.clear()
             return
         self._rates.append(1e9 * (count - before[0]) / (stamp - before[1]))
-        low, high = min(self._rates), max(self._rates)
-        if len(self._rates) < RATE_WINDOWS or high > (1 + RATE_TOLERANCE) * low:
+        if len(self._rates) < RATE_WINDOWS or max(self._rates) > (1 + RATE_TOLERANCE) * min(self._rates):
             return
-        rate = sum(self._rates) / RATE_WINDOWS
-        wrong = abs(rate / self._configured - 1) > RATE_TOLERANCE
-        self.words = (
-            (
+        rate, self.words = sum(self._rates) / RATE_WINDOWS, ""
+        if abs(rate / self._configured - 1) > RATE_TOLERANCE:
+            self.words = (
                 f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
                 " the false-alarm rate and all times are wrong by as much"
             )
-            if wrong
-            else ""
-        )
 
 
 # One at a time --------------------------------------------------------------------------------------------------------
@@ -112,15 +101,10 @@ _NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
 
 
 class Receiver:
-    """Takes messages, aligns those of several units, and has the pipeline work the samples.
+    """Takes messages as a pipeline's settings say, aligns those of several units, and has it work the samples.
 
     `receive` and `go_on` work one sample at most; what they return says whether its messages are to
     be published, and whether to go on (`fdi_ros.core.path`).
-
-    Parameters
-    ----------
-    pipeline
-        Of which the settings say what arrives.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
@@ -147,10 +131,9 @@ class Receiver:
 
     def _update_detector(self) -> None:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
-        pipeline, detector = self.pipeline, self.pipeline.detector
-        self._detector = detector
+        self._detector = self.pipeline.detector
         messages = self.messages[FUSED], self.messages[INTEGRITY]
-        self._records = (*pipeline.path, *(self.aligner, self.live, self._events), *messages)
+        self._records = (*self.pipeline.path, *(self.aligner, self.live, self._events), *messages)
         self._process: Callable[[], int] = partial(process, *self._records)
         if others := [output for output in self.messages if not output.by_path]:
             self._process = partial(self._process_and_fill, self._process, others)
@@ -259,12 +242,12 @@ def warm_detector(name: str) -> None:
     create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(np.zeros((1, geometry.n)))
 
 
-def warm_blocks() -> None:
-    """Compile or load what takes blocks of samples and of messages through any monitor."""
-    pipeline = _any_pipeline()
-    n = pipeline.geometry.n
+def warm_path() -> None:
+    """Compile or load what takes samples through any monitor, in blocks and in messages, and what messages need."""
+    pipeline = Pipeline(Config.from_parameters({"detector.name": next(iter(DETECTORS))}))
     # Nothing is prepared for a set of channels that lacks two.
-    z = np.array([[0.0] * n, [np.nan] * 2 + [0.0] * (n - 2)])
+    z = np.zeros((2, pipeline.geometry.n))
+    z[1, :2] = np.nan
     pipeline.process(Block(np.arange(2), z))
     pipeline.status()
     pipeline.reset()
@@ -273,11 +256,7 @@ def warm_blocks() -> None:
     alignment.push_block(np.arange(2), np.zeros(2, dtype=np.int64), np.zeros((2, 3)))
     alignment.flush()
     alignment.is_live(0)
-
-
-def warm_messages() -> None:
-    """Compile or load what takes single messages through any monitor, and what reads and writes messages."""
-    receiver = Receiver(_any_pipeline())
+    receiver = Receiver(pipeline)
     for kind in SOURCES.values():
         receiver.warm(kind)
         warm_codec(kind)
@@ -292,7 +271,3 @@ def warm_codec(kind: type[Source] | Source) -> None:
     kind.decode(*as_batch(b"\0"), 1)
     with contextlib.suppress(MessageError):
         kind.patch(b"\0", (0.0,))
-
-
-def _any_pipeline() -> Pipeline:
-    return Pipeline(Config.from_parameters({"detector.name": next(iter(DETECTORS))}))

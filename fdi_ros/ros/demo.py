@@ -26,7 +26,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, parse_fault
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.receiver import warm_messages
+from fdi_ros.monitor.receiver import warm_path
 from fdi_ros.ros.watch import show
 from fdi_ros.ros.watch_node import DEEP, Watcher
 
@@ -132,7 +132,7 @@ def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list
     try:
         # One process compiles, and all find it done.
         with announced():
-            warm_messages()
+            warm_path()
         observer = Observer(begin, end, fault, struck)
         with running(commands) as check:
             show(observer, plain, lambda: (check(), observer.is_over())[1])
