@@ -10,7 +10,6 @@ slowly is asked for again now and then.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -27,8 +26,6 @@ ENOUGH = 0.8
 """Of the rate asked for."""
 RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in progress", "cancelled")
 """MAV_RESULT."""
-
-
 _HOPEFUL = ("not asked yet", RESULTS[5])
 
 
@@ -48,7 +45,8 @@ class Streams:
 
     def __init__(self) -> None:
         self._wanted: dict[int, _Wanted] = {}
-        self._queue: deque[int] = deque()
+        self._queue: dict[int, None] = {}
+        """Messages to be asked for, in this order."""
         self._current: int | None = None
 
     def want(self, messages: Iterable[int], interval: int) -> None:
@@ -60,20 +58,18 @@ class Streams:
 
     def refused(self, number: int) -> bool:
         """Whether a message was asked for in vain."""
-        wanted = self._wanted.get(number)
-        return wanted is not None and wanted.answer not in (*_HOPEFUL, RESULTS[0])
+        return number in self._wanted and self._wanted[number].answer not in (*_HOPEFUL, RESULTS[0])
 
     def ask_again(self) -> None:
         """Ask for all anew: the autopilot has."""
         self._current = None
         for number, wanted in self._wanted.items():
             if wanted.interval != DEFAULT_INTERVAL:
-                wanted.tries = 0
                 self._enqueue(number)
 
     def _enqueue(self, number: int) -> None:
-        if number not in self._queue:
-            self._queue.append(number)
+        self._wanted[number].tries = 0
+        self._queue[number] = None
 
     def due(self, now: int) -> tuple[int, int] | None:
         """Return message id and interval, us, of a request to be sent now; None: there is none."""
@@ -86,7 +82,8 @@ class Streams:
         if self._current is None:
             if not self._queue:
                 return None
-            self._current = self._queue.popleft()
+            self._current = next(iter(self._queue))
+            del self._queue[self._current]
         wanted = self._wanted[self._current]
         wanted.asked, wanted.tries = now, wanted.tries + 1
         return self._current, wanted.interval
@@ -98,7 +95,6 @@ class Streams:
         wanted = self._wanted[self._current]
         wanted.answer = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
         if wanted.answer not in _HOPEFUL:
-            wanted.tries = 0
             self._current = None
 
     def check(self, rates: Sequence[tuple[int, float]], now: int) -> None:
@@ -109,7 +105,6 @@ class Streams:
                 continue
             after = AGAIN_REFUSED if self.refused(number) else AGAIN
             if rate < ENOUGH * 1e6 / wanted.interval and now >= wanted.asked + after:
-                wanted.tries = 0
                 self._enqueue(number)
 
     def answer_to(self, number: int | None) -> str:

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from fdi_ros.core.messages import LAST_STAMP
@@ -464,25 +465,19 @@ def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> Message:
     # A simulator may say any time.
     stamp = min(max(now, 0), LAST_STAMP)
     out = bytearray(struct.pack("<4BiI", 0, 1, 0, 0, *divmod(stamp, 1_000_000_000)))
-    _add_text(out, "")
-    _add_count(out, len(lines))
+
+    def add(content: str | int) -> None:
+        data = b"" if isinstance(content, int) else content.encode() + b"\0"
+        # The 4 bytes of encapsulation do not change what is aligned to 4.
+        out.extend(bytes(-len(out) % 4) + struct.pack("<I", content if isinstance(content, int) else len(data)) + data)
+
+    add("")
+    add(len(lines))
     for line in lines:
         out.append(line.level)
         for text in (line.name, line.message, line.hardware_id):
-            _add_text(out, text)
-        _add_count(out, len(line.values))
-        for pair in line.values:
-            for text in pair:
-                _add_text(out, text)
+            add(text)
+        add(len(line.values))
+        for text in chain(*line.values):
+            add(text)
     return Message(DIAGNOSTICS, stamp, bytes(out))
-
-
-def _add_text(out: bytearray, text: str) -> None:
-    data = text.encode() + b"\0"
-    _add_count(out, len(data))
-    out += data
-
-
-def _add_count(out: bytearray, count: int) -> None:
-    # The 4 bytes of encapsulation do not change what is aligned to 4.
-    out += bytes(-len(out) % 4) + struct.pack("<I", count)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from os import PathLike
 from typing import Any
 
@@ -73,12 +73,9 @@ class Pipeline:
         self._equip(config, None)
 
     def __repr__(self) -> str:
-        status = self.status()
-        states = ", ".join(f"{one.name} {one.state.name}" for one in status.channels if one.state.name != "OK")
-        return (
-            f"Pipeline({status.detector}, {self.geometry.n} channels, {status.samples} samples;"
-            f" {states or 'every channel OK'})"
-        )
+        states = ", ".join(f"{one.name} {one.state.name}" for one in self.status().channels if one.state.name != "OK")
+        about = f"{self.detector.name}, {self.geometry.n} channels, {self.core['samples'][0]} samples"
+        return f"Pipeline({about}; {states or 'every channel OK'})"
 
     def _repr_html_(self) -> str:
         status = self.status()
@@ -142,13 +139,7 @@ class Pipeline:
         return next(self._parts(samples, False), nothing)
 
     def steps(self, block: Block) -> Iterator[Output]:
-        """Judge and fuse a block, in parts that each end at a sample that brought events, or at the end.
-
-        Raises
-        ------
-        ConfigError
-            If the block has another number of channels, or stamps that do not increase.
-        """
+        """Judge and fuse a block as `process` does, in parts that each end at a sample with events, or at the end."""
         return self._parts(self._checked(block), True)
 
     def status(self) -> Status:
@@ -187,14 +178,12 @@ class Pipeline:
 
     def _equip(self, config: Config, before: Config | None) -> None:
         """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""
-        for name in config.excluded_channels:
-            if name not in self.channel_names:
-                raise ConfigError(
-                    f"excluded_channels names {name!r}, expected some of: {', '.join(self.channel_names)}"
-                )
-        excluded = np.array([name in config.excluded_channels for name in self.channel_names])
+        names = self.channel_names
+        if unknown := [name for name in config.excluded_channels if name not in names]:
+            raise ConfigError(f"excluded_channels names {unknown[0]!r}, expected some of: {', '.join(names)}")
+        excluded = np.array([name in config.excluded_channels for name in names])
         if not spans_space(self.geometry.axes[~excluded]):
-            left = ", ".join(name for name in self.channel_names if name not in config.excluded_channels) or "none"
+            left = ", ".join(name for name in names if name not in config.excluded_channels) or "none"
             raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
@@ -228,18 +217,18 @@ class Pipeline:
     def _parts(self, samples: NDArray[Any], stop: bool) -> Iterator[Output]:
         """Process samples in one part, or in parts that stop at a sample with events."""
         rows = allocate(OutputRow, len(samples))
-        events: list[NDArray[Any]] = []
+        events: list[Event] = []
         first = row = 0
         while row < len(rows):
             row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
-            if count:
-                events.append(self._events[:count].copy())
+            self._events["row"][:count] -= first
+            events += events_of(self._events[:count])
             if waits:
                 self.supply()
                 # The level of the row before was not known; otherwise this changes nothing.
                 rows["level"][row - 1] = self.core["last"]["level"][0]
             if (events and stop) or row == len(rows):
-                yield Output(rows[first:row], self.geometry.n, _joined(events, first), self.channel_names)
+                yield Output(rows[first:row], self.geometry.n, events, self.channel_names)
                 first, events = row, []
 
     def _checked(self, block: Block) -> NDArray[Any]:
@@ -248,7 +237,7 @@ class Pipeline:
         count = len(z)
         if z.shape[1] != n:
             raise ConfigError(f"samples have shape {z.shape}, expected (N, {n})")
-        if count > 1 and bool((stamp[1:] <= stamp[:-1]).any()):
+        if (stamp[1:] <= stamp[:-1]).any():
             raise ConfigError("stamps of the samples do not increase")
         if count:
             first, end, last = int(stamp[0]), int(stamp[-1]), int(self._last_stamp[0])
@@ -260,11 +249,3 @@ class Pipeline:
         samples["stamp"], samples["z"][:, :n] = stamp, z
         samples["received"][:, :n] = True if block.received is None else block.received
         return samples
-
-
-def _joined(parts: list[NDArray[Any]], first: int) -> Sequence[Event]:
-    if not parts:
-        return ()
-    rows = np.concatenate(parts)
-    rows["row"] -= first
-    return events_of(rows)
