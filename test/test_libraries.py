@@ -3,8 +3,6 @@
 
 """What an installation needs: a live node what a distribution has, everything else asked for by one line."""
 
-import ast
-import functools
 import re
 import subprocess
 import sys
@@ -13,9 +11,8 @@ from xml.etree import ElementTree
 import numba
 import pytest
 import yaml
-from test_layers import PACKAGE, imports
+from test_layers import PACKAGE
 
-from fdi_ros.cli.command_line import VERBS
 from fdi_ros.errors import FdiError
 from fdi_ros.system import installation
 
@@ -63,58 +60,6 @@ def test_libraries_named_as_required_are_those_of_setup_py(root):
     (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
     names = set(re.findall(r'"(\w+)>=', required))
     assert names == {*installation.REQUIRED, "numpy", "numba", "PyYAML"}
-
-
-def run_on_import(body):
-    """What is no function, of a module or a class in it, nor needed for types only."""
-    for node in body:
-        if isinstance(node, ast.ClassDef):
-            yield from run_on_import(node.body)
-        elif not isinstance(node, (ast.FunctionDef, ast.If)):
-            yield node
-
-
-def imported_on_the_way(path, function):
-    """Modules that a function imports, or one of its module that it uses."""
-    functions = {node.name: node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
-    waiting, used, found = [function], set(), set()
-    while waiting:
-        node = functions[waiting.pop()]
-        used.add(node.name)
-        for name in imports(ast.Module([node], [])):
-            found |= {name, name.rpartition(".")[0]}
-        names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
-        waiting += (names & functions.keys()) - used
-    return found
-
-
-def test_every_verb_names_the_libraries_that_its_modules_import(root):
-    """All that is imported on the way, not within functions of other modules: those ask for themselves."""
-    outside = {*installation.REQUIRED, "scipy", "pyarrow"}
-    sources = {
-        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
-        for path in PACKAGE.rglob("*.py")
-    }
-
-    @functools.cache
-    def imported(module):
-        return frozenset(imports(ast.Module(list(run_on_import(ast.parse(sources[module].read_text()).body)), [])))
-
-    def needed(module, seen):
-        seen.add(module)
-        mine = {name.partition(".")[0] for name in imported(module)} & outside
-        for name in imported(module):
-            for known in (name, name.rpartition(".")[0]):
-                if known in sources and known not in seen:
-                    mine |= needed(known, seen)
-        return mine
-
-    for name, verb in VERBS.items():
-        modules = imported_on_the_way(sources[verb.run.__module__], verb.run.__name__)
-        libraries = {module.partition(".")[0] for module in modules} & outside
-        for module in modules & sources.keys():
-            libraries |= needed(module, set())
-        assert libraries <= set(verb.libraries), name
 
 
 VERBS_WITHOUT = """

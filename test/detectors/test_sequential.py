@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from monitor.streams import RATE, SIGMA, START, declarations, parallel, swing
 from vehicles import vehicle
 
-from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
@@ -169,40 +169,46 @@ def test_errors_that_motion_explains_never_alarm():
         assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_noise_of_another_size_is_no_fault(seed):
-    """Twice as large at once, five times within two seconds, and as expected after a long rest."""
-    assert not measured().detect(2.0 * white(seed, 600)).alarm.any()
-    rise = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
-    assert not measured().detect(rise * white(seed, 600)).isolated.any()
-    assert not after(rested()).detect(white(seed, 400)).alarm.any()
+def coloured(seed, correlation):
+    z = white(seed, 6000)
+    for k in range(1, len(z)):
+        z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
+    return z
+
+
+def spiky(rng):
+    z = white(10, 60_000)
+    hit = rng.random(z.shape) < 0.002
+    z[hit] += rng.choice([-1, 1], int(hit.sum())) * rng.uniform(5, 500, int(hit.sum()))
+    return z
+
+
+RISE = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
+NOISES = {
+    "twice as large at once": (measured, [2.0 * white(seed, 600) for seed in range(20)]),
+    "as expected after a long rest": (lambda: after(rested()), [white(seed, 400) for seed in range(20)]),
+    "coloured": (fresh, [coloured(seed, one) for seed in range(4) for one in (0.5, 0.9)]),
+    "of heavy tails": (fresh, [np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2)]),
+    "with spikes now and then": (fresh, [spiky(np.random.default_rng(10))]),
+}
+
+
+@pytest.mark.parametrize(("detector", "streams"), NOISES.values(), ids=NOISES)
+def test_noise_of_another_kind_is_no_fault(detector, streams):
+    for z in streams:
+        assert not detector().detect(z).alarm.any()
+
+
+def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
+    for seed in range(20):
+        assert not measured().detect(RISE * white(seed, 600)).isolated.any()
 
 
 def test_nothing_is_found_in_streams_without_noise():
     """Not even in the rounding of single precision, after a long time of none."""
     rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
     z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
-    verdict = sequential(noise=NoiseModel(1e-3)).detect(z)
-    assert np.isfinite(verdict.statistic).all()
-    assert verdict.statistic.max() < 4.0
-
-
-@pytest.mark.parametrize("correlation", [0.5, 0.9])
-def test_coloured_noise_is_no_fault(correlation):
-    for seed in range(4):
-        z = white(seed, 6000)
-        for k in range(1, len(z)):
-            z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
-        assert not fresh().detect(z).alarm.any()
-
-
-def test_heavy_tails_and_spikes_now_and_then_are_no_fault():
-    tails, spikes = np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2), white(10, 60_000)
-    rng = np.random.default_rng(10)
-    hit = rng.random(spikes.shape) < 0.002
-    spikes[hit] += rng.choice([-1, 1], int(hit.sum())) * rng.uniform(5, 500, int(hit.sum()))
-    for z in (tails, spikes):
-        assert not fresh().detect(z).alarm.any()
+    assert sequential(noise=NoiseModel(1e-3)).detect(z).statistic.max() < 4.0
 
 
 @settings(max_examples=20)
@@ -210,8 +216,7 @@ def test_heavy_tails_and_spikes_now_and_then_are_no_fault():
 def test_any_axes_without_alarm_for_20_s(seed, n):
     rng = np.random.default_rng(seed)
     try:
-        geometry = random_axes(rng, n)
-        detector = sequential(geometry, NoiseModel(rng.uniform(0.5, 2.0, n)))
+        detector = sequential(random_axes(rng, n), NoiseModel(rng.uniform(0.5, 2.0, n)))
     except FdiError:
         return
     verdict = detector.detect(rng.standard_normal((2000, n)) * detector.noise.noise_std)
@@ -219,56 +224,50 @@ def test_any_axes_without_alarm_for_20_s(seed, n):
     assert not verdict.alarm.any()
 
 
-class TestDecision:
-    """What becomes of the evidence in the monitor."""
+def flown(fault, seed, **changes):
+    """Three parallel triads at rest in the monitor, after ten seconds with a bias of so many noise_std on imu_2.y."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
+    z = SIGMA * white(seed, 2500, 9)
+    z[1000:, 4] += fault * SIGMA
+    stamp = START + np.arange(len(z), dtype=np.int64) * round(1e9 / RATE)
+    return pipeline, pipeline.process(Block(stamp, z))
 
-    def flown(self, fault, seed, **changes):
-        """Three parallel triads at rest, after ten seconds with a bias of so many noise_std on imu_2.y."""
-        pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
-        z = SIGMA * white(seed, 2500, 9)
-        z[1000:, 4] += fault * SIGMA
-        stamp = START + np.arange(len(z), dtype=np.int64) * round(1e9 / RATE)
-        return pipeline, pipeline.process(Block(stamp, z))
 
-    @pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
-    def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(self, rule, after):
-        changes = {"decision__rule": rule, "decision__confirm_alarms": 20, "decision__confirm_window": 20}
-        pipeline, output = self.flown(50.0, 20, **changes)
-        assert [name for name, state in declarations(pipeline, output) if state == "FAULTY"] == ["imu_2.y"]
-        declared = np.isin(output.state, (ChannelState.AMBIGUOUS, ChannelState.FAULTY)).any(axis=1)
-        assert int(declared.argmax()) == int(output.alarm.argmax()) + after < 1040
+@pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
+def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(rule, after):
+    changes = {"decision__rule": rule, "decision__confirm_alarms": 20, "decision__confirm_window": 20}
+    pipeline, output = flown(50.0, 20, **changes)
+    assert [name for name, state in declarations(pipeline, output) if state == "FAULTY"] == ["imu_2.y"]
+    declared = np.isin(output.state, (ChannelState.AMBIGUOUS, ChannelState.FAULTY)).any(axis=1)
+    assert int(declared.argmax()) == int(output.alarm.argmax()) + after < 1040
 
-    def test_an_undecided_set_leaves_the_culprit_as_evidence_grows(self):
-        sizes = []
-        for seed in range(8):
-            pipeline, output = self.flown(4.0, seed)
-            undecided = (output.state == ChannelState.AMBIGUOUS).sum(axis=1)
-            assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
-            assert np.flatnonzero(output.state[-1] == ChannelState.FAULTY).tolist() == [4]
-            assert undecided[-1] == 0
-            sizes.append(int(undecided.max()))
-        assert max(sizes) > 1
+
+def test_an_undecided_set_leaves_the_culprit_as_evidence_grows():
+    sizes = []
+    for seed in range(8):
+        pipeline, output = flown(4.0, seed)
+        sizes += [(output.state == ChannelState.AMBIGUOUS).sum(axis=1).max()]
+        assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
+        assert output.state[-1].tolist() == [ChannelState.FAULTY * (i == 4) for i in range(9)]
+    assert max(sizes) > 1
 
 
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
 @pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
 def test_single_spikes_teach_nothing_and_name_nobody(kind, value):
     """Sixty values far off: before the first motion no delay is known, and after it none is wrong."""
-    one, rng = vehicle(2, kind, 3), np.random.default_rng(52)
-    axes, nominal = one.axes.ravel().tolist(), Config.from_parameters({**one.config.parameters(), "imus.mounts": []})
-    late = [float(v) for v in one.late]
-    config = Config.from_parameters({**nominal.parameters(), "geometry.preset": "axes", "geometry.axes": axes})
+    one, rng, still = vehicle(2, kind, 3), np.random.default_rng(52), 1400
+    axes = {"geometry.preset": "axes", "geometry.axes": one.axes.ravel().tolist(), "imus.mounts": []}
     z = one.block.z.copy()
-    rows, channels = rng.integers(len(z), size=60), rng.integers(9, size=60)
-    z[rows, channels] = z[rows, channels] + 1.0 if value == 1.0 else value
-    pipeline, still = Pipeline.from_config(config), 1400
+    at = rng.integers(len(z), size=60), rng.integers(9, size=60)
+    z[at] = z[at] + 1.0 if value == 1.0 else value
+    pipeline = Pipeline.from_config(one.config.replaced(axes))
     pipeline.process(Block(one.block.stamp[:still], z[:still]))
     assert min(pipeline.status().delay_std[1:]) > 0.01
     events = pipeline.process(Block(one.block.stamp[still:], z[still:])).events
     assert not [event for event in events if event.after is ChannelState.FAULTY]
     status = pipeline.status()
-    for delay, std, true in zip(status.delays[1:], status.delay_std[1:], late[1:], strict=True):
-        assert abs(delay - true) < 4 * std + 1e-4
+    assert (np.abs(np.subtract(status.delays, one.late)) < 4 * np.array(status.delay_std) + 1e-4).all()
 
 
 def two_units(seconds, late, seed):
