@@ -86,33 +86,17 @@ def test_one_or_two_wrong_answers_change_nothing(wrong: int, trip: int, count: i
         assert abs(sync.offset(now + 4 * MS) or 0) <= 4 * MS
 
 
-def test_a_better_offset_is_followed_without_a_step() -> None:
-    sync = TimeSync()
-    sync.answer(sync.request(NS) or 0, 5 * NS, NS + 30 * MS)
-    first = sync.offset(NS + 30 * MS)
-    sync.answer(sync.request(2 * NS) or 0, 6 * NS, 2 * NS + 1 * MS)
-    offsets = [sync.offset(2 * NS + MS + k * NS // 10) for k in range(400)]
-    assert first is not None
-    steps = np.diff([first, *offsets])
-    assert np.abs(steps[1:]).max() <= 1e-3 * NS / 10 + 1
-    assert abs(offsets[-1] - (4 * NS - MS // 2)) < MS
-
-
 @pytest.mark.parametrize(
     ("sent", "remote", "after"), [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)]
 )
-def test_an_answer_that_cannot_be_says_nothing(sent: int, remote: int, after: int) -> None:
+def test_an_answer_that_cannot_be_says_nothing_and_one_that_can_counts_once(sent: int, remote: int, after: int) -> None:
     sync = TimeSync()
     assert sync.request(NS) == NS
     assert not sync.answer(sent, remote, NS + after)
     assert sync.offset(2 * NS) is None
-
-
-def test_an_answer_counts_once() -> None:
-    sync = TimeSync()
-    sync.request(NS)
-    assert sync.answer(NS, 3 * NS, NS + MS)
-    assert not sync.answer(NS, 9 * NS, NS + 2 * MS)
+    again = TimeSync()
+    again.request(NS)
+    assert [again.answer(NS, 3 * NS, NS + MS) for _ in range(2)] == [True, False]
 
 
 def test_without_answers_the_least_delayed_arrival_counts() -> None:
@@ -146,17 +130,6 @@ def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> N
     assert clock.restarts == 1
     assert taken[:3] == [None] * 3
     assert taken[3:] == [k * 20 * MS for k in range(3, 10)]
-
-
-def test_a_step_ahead_is_found_and_a_pause_is_none() -> None:
-    clock = BootClock()
-    clock.unwrap(NS, NS, False)
-    # The link was cut for an hour; then what it had kept comes late.
-    assert clock.unwrap(2 * NS, 3601 * NS, False) == 2 * NS
-    assert clock.unwrap(3601 * NS, 3601 * NS, False) == 3601 * NS
-    assert clock.restarts == 0
-    assert [clock.unwrap((4000 + k) * NS, 3602 * NS, False) for k in range(4)] == [None, None, None, 4003 * NS]
-    assert clock.restarts == 1
 
 
 def test_the_time_of_the_system_is_measured_between_interruptions() -> None:

@@ -51,11 +51,6 @@ def test_values_are_pymavlinks_in_our_units_and_axes(number: int, time: int, val
     np.testing.assert_allclose(reading.acceleration, np.array([1, -1, -1]) * a * np.array(acceleration), atol=1e-9)
 
 
-def test_a_magnetometer_alone_is_no_imu() -> None:
-    """Both autopilots send SCALED_IMU3 for a third compass, with zeros in place of a third IMU."""
-    assert read(129, payload_of(mavlink.MAVLink_scaled_imu3_message(5000, *(0,) * 6, 210, -40, 400, 0))) is None
-
-
 @pytest.mark.parametrize("updated", [0, 0b000111, 0b011000])
 def test_a_gyro_that_is_not_new_is_no_sample(updated: int) -> None:
     made = mavlink.MAVLink_highres_imu_message(5, 0.0, 0.0, -9.8, 0.1, 0.2, 0.3, *(0.0,) * 7, updated, 0)
@@ -66,9 +61,3 @@ def test_raw_counts_have_no_unit_but_from_ardupilot() -> None:
     assert understood("RAW_IMU", ARDUPILOT)
     assert not understood("RAW_IMU", PX4)
     assert understood("SCALED_IMU", PX4)
-
-
-@given(number=st.sampled_from(sorted(MESSAGES)), payload=st.binary(max_size=255))
-def test_any_payload_is_read_or_left(number: int, payload: bytes) -> None:
-    reading = read(number, payload)
-    assert reading is None or 0 <= reading.unit < 256

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 import sys
@@ -14,18 +13,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import FdiError
-from fdi_ros.mavlink.link import now_in_steps, open_link, read_key
+from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import Reporter
 from mavlink.autopilots import NS, Autopilot
 from mavlink.conversation import UTC, Conversation
 
 MS = 1_000_000
 KEY = bytes(range(32))
+
+
+def talk_to(autopilot: Autopilot, seconds: float, **settings) -> Conversation:
+    """Talk to one autopilot, asked for SCALED_IMU, for a time."""
+    return Conversation(autopilot, **{"kind": "SCALED_IMU", **settings}).run(seconds)
 
 
 def check_flight(talk: Conversation, autopilot: Autopilot, rate: float = 50.0, since: float = 3.0) -> None:
@@ -79,66 +83,75 @@ def test_one_imu_is_never_its_own_witness_and_a_compass_is_none(autopilot: Calla
     assert talk.vehicle.magnetometers == ({2} if kind else set())
 
 
-def test_a_restart_is_survived() -> None:
-    autopilot = Autopilot("px4", boot=-3600 * NS)
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
+def reboot(talk: Conversation, autopilot: Autopilot) -> None:
     autopilot.reboot(talk.now)
     talk.run(25.0)
-    assert talk.vehicle.clock.restarts <= 1
-    check_flight(talk, autopilot)
-    assert "stepped" in " ".join(talk.vehicle.events) or talk.vehicle.clock.restarts == 0
 
 
-@pytest.mark.parametrize("jump", [-3000.0, -5.0, 20.0])
-def test_a_step_of_the_clock_is_followed(jump: float) -> None:
-    autopilot = Autopilot("ardupilot", boot=-4000 * NS)
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
-    # The motion goes on; only the clock is another.
-    autopilot.boot -= round(jump * NS)
-    talk.run(8.0)
-    assert talk.vehicle.clock.restarts == 1
-    check_flight(talk, autopilot)
+def step(seconds: float) -> Callable[[Conversation, Autopilot], None]:
+    def trouble(talk: Conversation, autopilot: Autopilot) -> None:
+        # The motion goes on; only the clock is another.
+        autopilot.boot -= round(seconds * NS)
+        talk.run(8.0)
+
+    return trouble
 
 
-def test_a_cut_link_is_survived_and_said() -> None:
-    autopilot = Autopilot("px4")
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(4.0)
-    talk.cut = True
-    before = len(talk.samples)
+def cut(talk: Conversation, autopilot: Autopilot) -> None:
+    talk.cut, before = True, len(talk.samples)
     talk.run(20.0)
     assert not talk.vehicle.in_reach
     assert len(talk.samples) <= before + 3
     talk.cut = False
     talk.run(5.0)
-    assert talk.vehicle.clock.restarts == 0
-    check_flight(talk, autopilot)
     words = list(talk.vehicle.events)
-    assert [word for word in words if word.startswith(("nothing of PX4", "again"))] == words[-2:]
+    assert [word for word in words if word.startswith(("nothing of ", "again"))] == words[-2:]
 
 
-def test_lost_and_late_packets_are_counted_and_no_time_goes_back() -> None:
-    random = np.random.default_rng(3)
-    autopilot = Autopilot("px4", loss=0.2, seed=2)
-    talk = Conversation(autopilot, kind="SCALED_IMU", latency=lambda: round(random.exponential(20 * MS))).run(15.0)
-    for samples in talk.by_unit().values():
-        assert (np.diff([sample.stamp for sample in samples]) > 0).all()
-        assert len(samples) > 0.5 * 50 * 10
-    assert talk.vehicle.counts["lost"] > 0.1 * talk.vehicle.counts["messages"]
-    assert talk.vehicle.clock.restarts == 0
+def lower(talk: Conversation, autopilot: Autopilot) -> None:
+    """Somebody else lowers the rate: it is asked for again."""
+    autopilot.intervals = dict.fromkeys(autopilot.intervals, 500_000)
+    talk.run(16.0)
 
 
-def test_a_link_that_is_slow_at_times_makes_no_stamp_go_back() -> None:
+@pytest.mark.parametrize("stack", ["px4", "ardupilot"])
+@pytest.mark.parametrize(
+    ("trouble", "restarts"),
+    [
+        (reboot, {0, 1}),
+        *((step(seconds), {1}) for seconds in (-3000.0, -5.0, 20.0)),
+        (cut, {0}),
+        (lower, {0}),
+    ],
+)
+def test_after_whatever_happens_all_units_come_as_before(stack: str, trouble: Callable, restarts: set[int]) -> None:
+    autopilot = Autopilot(stack, boot=-4000 * NS)
+    talk = talk_to(autopilot, 5.0)
+    trouble(talk, autopilot)
+    assert talk.vehicle.clock.restarts in restarts
+    assert ("stepped" in " ".join(talk.vehicle.events)) == bool(talk.vehicle.clock.restarts)
+    check_flight(talk, autopilot)
+
+
+def jitter(now: int) -> int:
+    return round(np.random.default_rng(now).exponential(20 * MS))
+
+
+def slow_at_times(now: int) -> int:
     """Round trips of 800 and 10 ms in turn: the first offsets are poor, and better ones are steps."""
-    autopilot, since = Autopilot("px4"), 1000 * NS
+    return 5 * MS if (now - 1000 * NS) // (4 * NS) % 2 else 400 * MS
 
-    def latency() -> int:
-        return 5 * MS if (talk.now - since) // (4 * NS) % 2 else 400 * MS
 
-    talk = Conversation(autopilot, kind="SCALED_IMU", latency=latency)
+@pytest.mark.parametrize(("latency", "loss", "share"), [(jitter, 0.2, 0.4), (slow_at_times, 0.0, 0.7)])
+def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(
+    latency: Callable, loss: float, share: float
+) -> None:
+    talk = Conversation(Autopilot("px4", loss=loss, seed=2), kind="SCALED_IMU", latency=lambda: latency(talk.now))
     talk.run(24.0)
     for samples in talk.by_unit().values():
         assert (np.diff([sample.stamp for sample in samples]) > 0).all()
-        assert len(samples) > 0.8 * 50 * 20
+        assert len(samples) > share * 50 * 24
+    assert talk.vehicle.counts["lost"] >= 0.5 * loss * talk.vehicle.counts["messages"]
     assert talk.vehicle.clock.restarts == 0
 
 
@@ -188,13 +201,13 @@ def test_the_same_system_from_another_address_is_left_aside() -> None:
 def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> None:
     autopilot = Autopilot("px4")
     autopilot.refuses = {129}
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(40.0)
+    talk = talk_to(autopilot, 40.0)
     assert talk.vehicle.streams.answer_to(129) == "failed"
     assert talk.vehicle.streams.answer_to(26) == "accepted"
     assert sum(command[1] == 129 for command in autopilot.commands) == 1
     deaf = Autopilot("px4", rates={26: 10, 116: 10, 129: 10})
     deaf.take = lambda data, now: []
-    talk = Conversation(deaf, kind="SCALED_IMU").run(40.0)
+    talk = talk_to(deaf, 40.0)
     assert talk.vehicle.streams.answer_to(26) == "no answer"
     assert talk.sent["COMMAND_LONG"] <= 20
     assert not talk.vehicle.sync.synchronised
@@ -210,53 +223,37 @@ def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> Non
         check_flight(Conversation(deaf, kind=kind).run(12.0), deaf, 20.0)
     refusing = Autopilot("ardupilot")
     refusing.refuses = {26}
-    talk = Conversation(refusing, kind="SCALED_IMU").run(12.0)
+    talk = talk_to(refusing, 12.0)
     assert refusing.intervals.keys() == {27, 116, 129}
     check_flight(talk, refusing)
-
-
-def test_a_rate_that_somebody_else_has_lowered_is_asked_for_again() -> None:
-    autopilot = Autopilot("ardupilot")
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
-    autopilot.intervals = dict.fromkeys(autopilot.intervals, 500_000)
-    talk.run(16.0)
-    check_flight(talk, autopilot)
 
 
 # Signing ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("data", [KEY, KEY.hex().encode(), KEY.hex().upper().encode() + b"\n"])
-def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach(tmp_path: Path, data: bytes) -> None:
+HEX = KEY.hex().encode()
+
+
+@pytest.mark.parametrize("data", [KEY, HEX, HEX.upper() + b"\n", b"", b"secret", KEY[:31], HEX[:-2], bytes(5000)])
+def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach_and_is_never_shown(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "key"
     path.write_bytes(data)
     path.chmod(0o600)
-    assert read_key(str(path)) == KEY
+    if data in (KEY, HEX, HEX.upper() + b"\n"):
+        assert read_key(str(path)) == KEY
+    else:
+        with pytest.raises(FdiError, match="is no key: expected 32 bytes, or 64 hexadecimal digits") as refused:
+            read_key(str(path))
+        assert not data or data.decode("latin1") not in str(refused.value)
     for mode in (0o640, 0o604, 0o620):
         path.chmod(mode)
         with pytest.raises(FdiError, match="can be read by others: chmod 600"):
             read_key(str(path))
 
 
-@pytest.mark.parametrize("data", [b"", b"secret", KEY[:31], KEY.hex().encode()[:-2], bytes(5000)])
-def test_what_is_no_key_is_refused_and_not_shown(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "key"
-    path.write_bytes(data)
-    path.chmod(0o600)
-    with pytest.raises(FdiError, match="is no key: expected 32 bytes, or 64 hexadecimal digits") as refused:
-        read_key(str(path))
-    assert not data or data.decode("latin1") not in str(refused.value)
-
-
-def test_the_time_of_signatures_counts_from_2015() -> None:
-    assert now_in_steps(1_420_070_400) == 0
-    assert now_in_steps(1_420_070_401.5) == 150_000
-    assert now_in_steps(0) == 0
-
-
 def test_with_a_key_only_what_is_signed_with_it_counts() -> None:
     autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
-    talk = Conversation(autopilot, kind="SCALED_IMU", key=KEY).run(6.0)
+    talk = talk_to(autopilot, 6.0, key=KEY)
     check_flight(talk, autopilot)
     # It takes signed commands alone, and ours were taken.
     assert autopilot.inbound.signing.goodsig_count > 10
@@ -272,7 +269,7 @@ def test_with_a_key_only_what_is_signed_with_it_counts() -> None:
 def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
     """pymavlink's own check keeps the time of a message before it looks at the signature."""
     autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
-    talk = Conversation(autopilot, kind="SCALED_IMU", key=KEY).run(4.0)
+    talk = talk_to(autopilot, 4.0, key=KEY)
     forged = mavlink.MAVLink(None, 1, 1)
     forged.signing.secret_key, forged.signing.sign_outgoing = bytes(32), True
     for link in range(256):
@@ -312,7 +309,7 @@ def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
     autopilot = Autopilot("px4")
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    talk = talk_to(autopilot, 3.0)
     talk.cut = True
     unknown = struct.pack("<BBBBBBBHB", 0xFD, 4, 0, 0, 7, 1, 1, 0x1234, 0x56) + bytes(6)
     for _ in range(50):
@@ -327,18 +324,17 @@ def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
 
 @settings(max_examples=12)
 @given(pieces=st.lists(st.binary(max_size=300), max_size=30), seed=st.integers(0, 999))
-def test_garbage_between_messages_does_no_harm(pieces: list[bytes], seed: int) -> None:
+@example(pieces=600 * [b"\xfd\xff\x00"], seed=0)
+@example(pieces=600 * [struct.pack("<BBB", 0xFD, 9, 1)], seed=1)
+def test_garbage_between_messages_does_no_harm_and_what_is_left_of_it_does_not_grow(pieces, seed) -> None:
     autopilot = Autopilot("ardupilot", seed=seed)
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    talk = talk_to(autopilot, 3.0)
     for piece in pieces:
         talk.inject(piece)
-        talk.run(0.02)
-    talk.run(1.5)
-    samples = [sample for at, sample in talk.samples if at > talk.now - NS]
-    assert len(samples) > 100
-    assert all(math.isfinite(value) for sample in samples for value in sample.rate)
-    parser = next(iter(talk.vehicle._parsers.values()))
-    assert len(parser.buf) < 8192
+        talk.run(0.01)
+    assert all(len(parser.buf) < 8192 for parser in talk.vehicle._parsers.values())
+    talk.run(4.0)
+    check_flight(talk, autopilot)
 
 
 def test_addresses_of_strangers_take_no_memory() -> None:
@@ -348,17 +344,4 @@ def test_addresses_of_strangers_take_no_memory() -> None:
         talk.inject(b"\xfd\xff\x00", ("stranger", k))
     assert len(talk.vehicle._parsers) <= 9
     talk.run(3.0)
-    check_flight(talk, autopilot)
-
-
-@pytest.mark.parametrize("piece", [b"\xfd\xff\x00", b"\xfe\xff", struct.pack("<BBB", 0xFD, 9, 1)])
-def test_an_unfinished_message_swallows_no_more_than_its_length(piece: bytes) -> None:
-    """A stream without end whose buffer is never empty does not grow."""
-    autopilot = Autopilot("ardupilot")
-    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
-    for _ in range(600):
-        talk.inject(piece)
-        talk.run(0.005)
-    assert all(len(parser.buf) < 8192 for parser in talk.vehicle._parsers.values())
-    talk.run(4.0)
     check_flight(talk, autopilot)

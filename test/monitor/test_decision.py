@@ -95,13 +95,6 @@ def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
     assert decider.why[1] == "disagrees"
 
 
-def test_a_channel_that_is_not_finite_for_long_is_declared_by_itself():
-    decider = Decider()
-    assert decider.take((), broken=mask_of([2]))
-    assert decider.channels("faulty") == {2}
-    assert decider.why[2] == "non-finite"
-
-
 def test_alarms_held_off_are_suspicion_and_never_a_declaration():
     decider, changes = Decider(2, 4), []
     for held in (True, True, True, True, False, False):
