@@ -10,7 +10,7 @@ stops the node.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -42,13 +42,12 @@ NAMED = 4
 
 
 class InputQueue:
-    """The subscriptions of a node to raw messages: drained after every turn of the executor, and bounded in a flood.
+    """The subscriptions of a node to raw messages: drained after every turn of the executor, and watched for a flood.
 
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond. But the EventsExecutor keeps an event for every message that arrives, without bound, also for those
     that were drained or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too
-    many events must be waiting, a new executor with an empty queue takes over. These subscriptions are hidden from it
-    (`visible`) and only drained, in short turns, until the flood is over.
+    many events must be waiting, another kind of executor is to take over until the flood is over.
     """
 
     def __init__(self, node: Node) -> None:
@@ -103,40 +102,27 @@ class InputQueue:
         self._full |= taken >= DEPTH
         return taken
 
-    def turn(self, executor: Any, now: float, bounded: bool) -> bool:
-        """Take what waits after a turn of an executor, whose queue may be bounded, at the steady time now, s.
-
-        Returned is whether a new executor is to take over.
-        """
+    def turn(self, now: float) -> None:
+        """Take what waits after a turn of an executor, at the steady time now, s, and see whether it is a flood."""
         self.drain()
-        if bounded or not self.subscriptions:
-            return False
         if self.flooded:
             if now - self._since >= FLOOD_END_TIME:
-                over = self._count < FLOOD_END_RATE * (now - self._since) and not self._full
-                self._count, self._since, self._full = 0, now, False
-                if over:
-                    self._change(flooded=False)
-                    executor.wake()
-            return False
-        if self._waiting and not self.taken:
-            # The turn has used up the event of a message that was drained, or was a timer's.
-            self._waiting -= 1
-        self.taken = 0
-        if self._waiting <= FLOOD:
-            return False
+                lasts = self._full or self._count >= FLOOD_END_RATE * (now - self._since)
+                self._change(lasts, now)
+        else:
+            if self._waiting and not self.taken:
+                # The turn has used up the event of a message that was drained, or was a timer's.
+                self._waiting -= 1
+            self.taken = 0
+            if self._waiting > FLOOD:
+                self._change(True, now)
+
+    def _change(self, flooded: bool, now: float) -> None:
+        if flooded != self.flooded:
+            words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
+            self._node.get_logger().warning(words, throttle_duration_sec=10.0)
+        self.flooded, self._waiting = flooded, 0
         self._count, self._since, self._full = 0, now, False
-        self._change(flooded=True)
-        return True
-
-    def _change(self, flooded: bool) -> None:
-        self.flooded, self._waiting, self.taken = flooded, 0, 0
-        words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
-        self._node.get_logger().warning(words, throttle_duration_sec=10.0)
-
-    def visible(self, subscriptions: Iterator[Any]) -> Iterator[Any]:
-        """Return those of a node's subscriptions that its executor is to wait for."""
-        return (one for one in subscriptions if not (self.flooded and one in self.subscriptions))
 
 
 def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:

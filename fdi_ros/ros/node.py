@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -104,11 +104,6 @@ class CheckedNode(Node):
     def live(self, stop: Stop) -> None:
         """Work until stopped."""
         spin(self, stop)
-
-    @property
-    def subscriptions(self) -> Iterator[Any]:
-        """Subscriptions that an executor is to wait for."""
-        return self.inputs.visible(super().subscriptions)
 
     def resolved(self, topic: str) -> str:
         """Return the full name of a topic, remapped; `ConfigError` if it is no name of a topic."""

@@ -26,9 +26,6 @@ from fdi_ros.system.installation import BAGS, require
 
 TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
-SHORT = 0.001
-"""The same in a flood, when inputs are polled after each turn, s."""
-
 ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-config-file", "--enclave")
 NODES = {
     "fdi_node": "monitor_node.MonitorNode",
@@ -55,7 +52,8 @@ class Stop:
 def spin(node: Any, stop: Stop) -> None:
     """Turn the executor until stopped; the node's ``inputs`` are drained after every turn.
 
-    What a callback raises ends no node: rclpy itself raises for some requests and times that come from outside.
+    What a callback raises ends no node: rclpy itself raises for some requests and times that come from outside. In a
+    flood of messages a SingleThreadedExecutor, which has no queue, takes over from the EventsExecutor.
     """
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -64,16 +62,21 @@ def spin(node: Any, stop: Stop) -> None:
         executor = make_executor(node)
     except ExternalShutdownException:
         return
-    bounded = isinstance(executor, SingleThreadedExecutor)
+    single, flooded = isinstance(executor, SingleThreadedExecutor), False
     # What is there now stays: the collector need not look at it again.
     gc.collect()
     gc.freeze()
     try:
         while rclpy.ok() and not stop.asked:
             with guarded(node):
-                executor.spin_once(timeout_sec=SHORT if node.inputs.flooded else TIMEOUT)
-                if node.inputs.turn(executor, time.monotonic(), bounded):
-                    executor = replace_executor(node, executor)
+                executor.spin_once(timeout_sec=TIMEOUT)
+                if single:
+                    node.inputs.drain()
+                else:
+                    node.inputs.turn(time.monotonic())
+                if node.inputs.flooded != flooded:
+                    flooded = not flooded
+                    executor = replace_executor(node, executor, flooded)
                 node.keep_up()
     except ExternalShutdownException:
         return
@@ -95,30 +98,16 @@ def guarded(node: Any) -> Iterator[None]:
         node.get_logger().error(words, throttle_duration_sec=1.0)
 
 
-def replace_executor(node: Any, executor: Any) -> Any:
-    """Return a new executor with an empty queue; nothing else empties that of the former one.
-
-    Requests that were announced to the former one are announced to no other: they are answered here. The new one finds
-    nothing where it comes for one of them, and goes on.
-    """
+def replace_executor(node: Any, executor: Any, flooded: bool) -> Any:
+    """Return the executor for a flood, or for after it; what was announced to the former one, this one finds itself."""
+    executor.remove_node(node)
+    # Nothing else empties its queue.
     executor.shutdown()
-    executor = _events_executor(node)
-    for service in list(node.services):
-        while True:
-            with service.handle:
-                request, header = service.handle.service_take_request(service.srv_type.Request)
-            if request is None:
-                break
-            with guarded(node):
-                service.send_response(service.callback(request, service.srv_type.Response()), header)
-                node.keep_up()
-    return executor
+    return _single_executor(node) if flooded else _events_executor(node)
 
 
 def make_executor(node: Any, preferred: str = "events") -> Any:
     """Choose the executor, add the node to it, and log which it is; preferred is what auto means."""
-    from rclpy.executors import SingleThreadedExecutor
-
     wanted = node.get_parameter("executor").value
     if wanted == "events" or (wanted == "auto" and preferred == "events"):
         try:
@@ -131,9 +120,15 @@ def make_executor(node: Any, preferred: str = "events") -> Any:
             node.get_logger().info(f"executor: SingleThreadedExecutor, EventsExecutor does not work here: {error}")
         else:
             return executor
-    single = SingleThreadedExecutor()
-    single.add_node(node)
-    return single
+    return _single_executor(node)
+
+
+def _single_executor(node: Any) -> Any:
+    from rclpy.executors import SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    return executor
 
 
 def _events_executor(node: Any) -> Any:
