@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 import fdi_ros
+from fdi_ros.config.config import Config
 from fdi_ros.core.subsets import mask_of, prepare_subsets
 from fdi_ros.experiments.montecarlo import StudyResult, load_study, run_study
 from fdi_ros.experiments.report import tables
@@ -131,7 +132,9 @@ def integrity_table() -> list[str]:
     named |= {f"cone_{n}": Geometry.cone(n) for n in (5, 9)}
     for name, geometry in named.items():
         for prior, risk in ((1e-3, 1e-3), (1e-3, 1e-5), (1e-4, 1e-7)):
-            known = Integrity(geometry, NoiseModel(1.0), fault_probability=prior, risk=risk, alarm_probability=1e-6)
+            rate = {"integrity.fault_rate": -math.log1p(-prior), "integrity.exposure": 1.0, "integrity.risk": risk}
+            alarms = {"detector.false_alarms_per_hour": 0.0, "detector.false_alarm_probability": 1e-6}
+            known = Integrity(Config.from_parameters(rate | alarms), geometry, NoiseModel(1.0))
             subsets, whole = prepare_subsets(geometry, NoiseModel(1.0)), mask_of(range(geometry.n))
             worst = known.after_loss(subsets, whole)
             shown = [" ".join(f"{x:.2f}" for x in level) for level in (subsets["level"][whole], worst)]

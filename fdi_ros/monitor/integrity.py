@@ -83,59 +83,29 @@ class Integrity:
 
     Parameters
     ----------
+    config
+        Risk, fault rates, false-alarm probability of the test, and the greatest motion.
     geometry
         All channels.
     noise
         Error model of a healthy channel; the weights of the fused rate are 1 / noise_std^2. Biases left,
         bias_std, count as if they hung together as is worst for each axis.
-    fault_probability
-        Prior probability that a channel is faulty unnoticed, scalar or (n,).
-    risk
-        Allowed probability, at any one sample, of an error above the level while the test passes; 0: no level.
-    alarm_probability
-        Probability per sample that the test fails on healthy channels.
-    max_rate, max_acceleration
-        Body rate, rad/s, and angular acceleration, rad/s^2, up to which the levels of `of` and `after_loss` hold:
-        what they add to the variance of a channel is taken at its largest.
     """
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        noise: NoiseModel,
-        *,
-        fault_probability: Array | float,
-        risk: float,
-        alarm_probability: float,
-        max_rate: float = 0.0,
-        max_acceleration: float = 0.0,
-    ) -> None:
-        noise = noise.for_channels(geometry.n)
-        self.risk = risk
-        self.prior: Array = np.broadcast_to(np.asarray(fault_probability, dtype=np.float64), geometry.n)
-        self.alarm_probability = alarm_probability
+    def __init__(self, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
+        settings, noise = config.integrity, noise.for_channels(geometry.n)
+        self.risk, self.alarm_probability = settings.risk, alarm_probability(config)
+        unnoticed = [-math.expm1(-rate * settings.exposure) for rate in settings.fault_rate]
+        self.prior: Array = np.broadcast_to(np.array(unnoticed), geometry.n)
+        """(n,) probability that a channel is faulty unnoticed."""
         self._axes, self._noise = geometry.axes, noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
-        scale, timing = noise.scale_std * norm * max_rate, noise.timing_std * norm * max_acceleration
+        scale = noise.scale_std * norm * settings.max_rate
+        timing = noise.timing_std * norm * settings.max_acceleration
         self.variance: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
         """(n,) of the channels in the greatest motion, (rad/s)^2."""
         self.scale = math.sqrt(float((self.variance / self._noise).max()))
         """By how much their errors then exceed noise_std."""
-
-    @classmethod
-    def from_config(cls, config: Config, geometry: Geometry, noise: NoiseModel) -> Integrity:
-        """Build from settings."""
-        settings = config.integrity
-        hours = np.array(settings.fault_rate) * settings.exposure
-        return cls(
-            geometry,
-            noise,
-            fault_probability=-np.expm1(-hours) if len(hours) > 1 else -math.expm1(-float(hours[0])),
-            risk=settings.risk,
-            alarm_probability=alarm_probability(config),
-            max_rate=settings.max_rate,
-            max_acceleration=settings.max_acceleration,
-        )
 
     def fill(self, subsets: NDArray[Any], *masks: int) -> None:
         """Write the levels for sets of channels, by their bits, into their records (2^n,), unless they are there."""

@@ -193,7 +193,7 @@ class Pipeline:
         else:
             detector = self.detector
         if before is None or alarm_probability(config) != alarm_probability(before):
-            self.integrity = Integrity.from_config(config, self.geometry, self.noise)
+            self.integrity = Integrity(config, self.geometry, self.noise)
             self.subsets["has_level"] = False
         if self.core["samples"][0] and detector.takes_any and self.detector.takes_any:
             # What was learned of the sensors holds for another threshold as well.
