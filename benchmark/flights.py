@@ -182,7 +182,7 @@ def delays_of(flown: Replayed, true: Array) -> dict[str, Any]:
     delays, std = np.array(status.delays), np.array(status.delay_std)
     if len(delays) != len(true):
         return {}
-    off = np.abs(delays + (status.delays_taken_off or 0.0) - true)[1:]
+    off = np.abs(delays + (status.config.imus.delays or 0.0) - true)[1:]
     with np.errstate(divide="ignore", invalid="ignore"):
         return {"late_off": 1e3 * float(off.max()), "late_sigmas": float((off / std[1:]).max())}
 

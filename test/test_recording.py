@@ -45,7 +45,7 @@ def test_shaken_to_saturation_it_declares_no_sound_channel(recording, config):
     # 3 s at rest for the bias, then a rate for every sample up to there.
     assert output.valid[188:11_251].all()
     assert pipeline.status().bias_state == "learned"
-    counted = sum(channel.out_of_range for channel in pipeline.status().channels)
+    counted = sum(channel.counts["out of range"] for channel in pipeline.status().channels)
     assert counted == (np.abs(whole.z) >= 34.8).sum() > 100
 
 

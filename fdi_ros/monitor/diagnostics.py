@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.monitor.output import Message, Topic
+from fdi_ros.sources import source_of
 from fdi_ros.system.text import plus_minus
 
 if TYPE_CHECKING:
@@ -141,7 +142,6 @@ ODD = {
 
 def describe(
     status: Status,
-    hardware_id: str = "",
     prefix: str = PREFIX,
     *,
     inputs: Sequence[InputStatus] = (),
@@ -156,8 +156,6 @@ def describe(
     ----------
     status
         Of the pipeline.
-    hardware_id
-        Of the sensors.
     prefix
         What all names begin with.
     inputs
@@ -186,7 +184,7 @@ def describe(
     rows += [(f"{INPUT}{line.name}", *_input_message(line)) for line in inputs]
     values += [_input_values(line) for line in inputs]
     return [
-        StatusLine(level, prefix + name, message, hardware_id, pairs)
+        StatusLine(level, prefix + name, message, status.config.hardware_id, pairs)
         for (name, level, message), pairs in zip(rows, values, strict=True)
     ]
 
@@ -212,17 +210,17 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
 
 
 def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
-    words = []
+    words, bias = [], status.config.bias
     if channel.noisy:
         times = f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
         words.append(f"noise {times} times noise_std and above the others'")
-    if abs(channel.drift) > NEARLY * status.max_drift > 0:
-        limit = f"a fault beyond {status.max_drift:g} (bias.max_drift)"
+    if abs(channel.drift) > NEARLY * bias.max_drift > 0:
+        limit = f"a fault beyond {bias.max_drift:g} (bias.max_drift)"
         words.append(f"bias has drifted by {_figure(channel.drift)} rad/s, {limit}")
     if status.is_far(channel):
         words.append(
             f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
-            f" {status.turn_on_std:g}: learned, as a fault from before the start would be"
+            f" {bias.turn_on_std:g}: learned, as a fault from before the start would be"
         )
     return words
 
@@ -254,10 +252,11 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
     ]
     words += [_format_frozen(unit) for unit in status.units if unit.frozen]
     words += [f"{unit.name} as a whole: {'; '.join(worse[unit.name])}" for unit in late]
-    if late and len(status.delays_taken_off) == len(status.units):
+    set_now = source_of(status.config).delays
+    if late and len(set_now) == len(status.units):
         delays = [
             round(before + (unit.delay if unit in late else 0.0), 5)
-            for before, unit in zip(status.delays_taken_off, status.units, strict=True)
+            for before, unit in zip(set_now, status.units, strict=True)
         ]
         words[-1] += f" (to take it off from the start: imus.delays: {delays})"
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
@@ -400,11 +399,7 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
         ("repeats for (s)", "".join(_figure(unit.frozen) for unit in _frozen_units(channel, status))),
         ("last value", ago),
-        ("samples", str(channel.samples)),
-        ("missing", str(channel.missing)),
-        ("non-finite", str(channel.non_finite)),
-        ("out of range", str(channel.out_of_range)),
-        ("stuck", str(channel.stuck)),
+        *((kind, str(count)) for kind, count in channel.counts.items()),
     )
 
 

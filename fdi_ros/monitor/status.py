@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,6 @@ from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_wo
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
-from fdi_ros.sources import source_of
 from fdi_ros.system.text import plus_minus
 
 CERTAIN = 4.0
@@ -56,11 +55,8 @@ class ChannelStatus:
     """Of the last sample, rad/s; NaN where missing."""
     last_received: int
     """Stamp of the last sample it delivered, ns; 0 if none."""
-    samples: int
-    non_finite: int
-    out_of_range: int
-    stuck: int
-    missing: int
+    counts: Mapping[str, int]
+    """``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``."""
     delivers: float = 1.0
     """Share of the samples that it has lately given a finite number for."""
     drift: float = 0.0
@@ -145,6 +141,7 @@ class ErrorStatus:
 class Status:
     """The whole monitor as it stands after the last sample."""
 
+    config: Config = field(repr=False)
     stamp: int
     """Of the last sample, ns; 0 before the first."""
     samples: int
@@ -178,12 +175,6 @@ class Status:
     """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
     delay_std: tuple[float, ...] = ()
     """Standard deviation of each, s."""
-    delays_taken_off: tuple[float, ...] = ()
-    """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
-    turn_on_std: float = 0.0
-    """Standard deviation of a bias from one start to the next, rad/s (``bias.turn_on_std``)."""
-    max_drift: float = 0.0
-    """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
     errors: tuple[ErrorStatus, ...] = ()
     """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
     names_rest_on: str = ""
@@ -195,14 +186,14 @@ class Status:
 
     def is_far(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
-        return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.turn_on_std > 0
+        return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.config.bias.turn_on_std > 0
 
 
 def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: Integrity, config: Config) -> Status:
     """Snapshot of a monitor after its last sample, from its record and what every set of channels can do, (2^n,)."""
     geometry = detector.geometry
     names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
-    begun, state, settings = bool(core["samples"]), core["state"][:n], core["settings"]
+    begun, state = bool(core["samples"]), core["state"][:n]
     repeated = flags_of(int(core["copies"]["channels"]), n)
     detectable, isolable, note, rests_on = _capability(detector, ~(np.isin(state, LOST) | repeated))
     seen = detectable & (state != ChannelState.UNCHECKED)
@@ -211,6 +202,7 @@ def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: I
     x, y, z = last["level"].tolist()
     late, late_std = _delays(detector, begun)
     return Status(
+        config=config,
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
         detector=detector.name,
@@ -223,16 +215,13 @@ def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: I
         can_detect=_named(names, seen),
         can_isolate=_named(names, isolable & seen),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
-        bias_state=_format_bias(core["bias"], names, float(settings["turn_on"])),
+        bias_state=_format_bias(core["bias"], names, config.bias.turn_on_std),
         note=note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(now["fused"]) & well) if valid else NO_LEVEL,
         units=_units(core, detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
-        delays_taken_off=source_of(config).delays,
-        max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
-        turn_on_std=float(settings["turn_on"]),
         errors=_errors(detector, begun),
         names_rest_on=rests_on,
         copies=_copies(core, geometry, config),
@@ -252,12 +241,14 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         error=float(core["error"][i]),
         residual=float(core["last"]["residual"][i]) if begun else math.nan,
         last_received=int(health["received_stamp"][i]) if health["samples"][i] else 0,
-        samples=int(health["samples"][i]),
-        non_finite=int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
-        out_of_range=int(count[Condition.OUT_OF_RANGE]),
-        stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
+        counts={
+            "samples": int(health["samples"][i]),
+            "missing": int(count[Condition.MISSING] + count[Condition.SILENT]),
+            "non-finite": int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
+            "out of range": int(count[Condition.OUT_OF_RANGE]),
+            "stuck": int(health["stuck"][i] + count[Condition.FROZEN]),
+        },
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
-        missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
         start_bias=float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
         bias_std=float(core["remaining"][i]) if followed else math.nan,

@@ -178,7 +178,7 @@ class OutputBag(Sink):
         return self._writer.add_connection(name, kind, typestore=_STORE)
 
     def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
-        lines = describe(pipeline.status(), self._config.hardware_id, inputs=inputs)
+        lines = describe(pipeline.status(), inputs=inputs)
         self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now).data)
 
 

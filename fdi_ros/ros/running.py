@@ -298,7 +298,7 @@ class Running:
         else:
             status = self.receiver.pipeline.status()
             lines = describe(
-                *(status, hardware, prefix),
+                *(status, prefix),
                 inputs=[topic.status(now) for topic in self.topics],
                 figures=self._figures(),
                 silent=self._watchdog.seconds(now) if self._has_no_samples else None,

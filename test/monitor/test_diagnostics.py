@@ -30,7 +30,7 @@ from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.system.text import plus_minus
 
 SECOND = 10**9
-CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)
+CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, {"samples": 100})
 INPUT = InputStatus("imu_1", "imu_1/data_raw", 100, 100.0, 0.01, True, max_lag=0.002)
 
 
@@ -40,7 +40,7 @@ def by_name(lines: list[StatusLine]) -> dict[str, StatusLine]:
 
 def told(pipeline: Pipeline) -> dict[str, StatusLine]:
     """What is told of a monitor as it stands, by name."""
-    return by_name(describe(pipeline.status(), "unit 7"))
+    return by_name(describe(pipeline.status()))
 
 
 def lost(*start: int) -> list[str]:
@@ -59,7 +59,11 @@ GONE = ["channel=g2 kind=dropout missing=1 start=2"]
 @pytest.mark.parametrize(
     ("settings", "faults", "said"),
     [
-        (config(), [], {"monitor": (Level.OK, "6 of 6 channels healthy; a further fault would be isolated")}),
+        (
+            config(hardware_id="unit 7"),
+            [],
+            {"monitor": (Level.OK, "6 of 6 channels healthy; a further fault would be isolated")},
+        ),
         (config(), lost(2, 2, 2, 2), {"monitor": (Level.ERROR, "no fused rate")}),
         (
             config(),
@@ -85,7 +89,7 @@ def test_what_is_said(settings: Config, faults: list[str], said: dict[str, tuple
         assert lines[name].level == level
         assert lines[name].message.startswith(words)
     assert status.has_rate == ("no fused rate" not in lines["monitor"].message)
-    assert {line.hardware_id for line in lines.values()} == {"unit 7"}
+    assert {line.hardware_id for line in lines.values()} == {settings.hardware_id}
     assert lines["monitor"].level != Level.OK or {line.level for line in lines.values()} == {Level.OK}
     refused = replace(status, has_rate=False, withheld=False, bias_state="refused, not at rest: g1 had mean 0.5 rad/s")
     words = by_name(describe(refused))["monitor"].message

@@ -117,7 +117,7 @@ def test_one_axis_turns_non_finite_for_one_sample(value):
     assert output.valid.all()
     assert np.isfinite(output.rate).all()
     assert declarations(pipeline, output) == []
-    assert pipeline.status().channels[4].non_finite == 1
+    assert pipeline.status().channels[4].counts["non-finite"] == 1
     assert output.state[250, 4] == ChannelState.SUSPECT
     assert output.state[251, 4] == ChannelState.OK
 
@@ -212,7 +212,7 @@ def test_a_sensor_saturates_in_a_hard_manoeuvre():
     free[:4] = False
     assert 0.1 < free.mean() < 0.9
     assert (output.state[free] == ChannelState.OK).all()
-    counted = sum(c.out_of_range for c in pipeline.status().channels)
+    counted = sum(c.counts["out of range"] for c in pipeline.status().channels)
     assert counted == clipped.sum()
 
 
@@ -407,5 +407,5 @@ def test_a_value_that_stands_within_one_step_of_its_sensor_is_not_stuck(stuck):
     output = pipeline.process(block)
     found = pipeline.status().channels[3]
     assert (found.state == ChannelState.FAULTY) == stuck
-    assert stuck or found.stuck == 0
+    assert stuck or found.counts["stuck"] == 0
     assert {e.channel for e in output.events if e.after == ChannelState.FAULTY} == ({3} if stuck else set())
