@@ -26,14 +26,7 @@ from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.inputs import InputTopic
-from fdi_ros.ros.messages import (
-    REPORT_PERIOD,
-    BoundedLog,
-    diagnostics_publisher,
-    message_class,
-    output_qos,
-    prefix_of,
-)
+from fdi_ros.ros.messages import REPORT_PERIOD, BoundedLog, diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.node import CheckedNode
 
 REMEMBERED = 4096

@@ -75,9 +75,7 @@ def wait(until: Callable[[], object], seconds: float = PATIENCE) -> bool:
     return True
 
 
-def healthy(
-    count: int, seed: int = 0, size: float = 0.5, rate: float = RATE, start: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
+def healthy(count: int, seed=0, size=0.5, rate=RATE, start=0.0) -> tuple[np.ndarray, np.ndarray]:
     """Body rate (N, 3) and healthy channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
     omega = body_rate(start + np.arange(count) / rate, size)
     return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
@@ -126,11 +124,6 @@ class Process:
         pages = int(Path(f"/proc/{self.popen.pid}/statm").read_text().split()[1])
         return pages * 4096 / 1e6
 
-    def cpu(self) -> float:
-        """CPU time used, s."""
-        fields = Path(f"/proc/{self.popen.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / 100
-
 
 def assert_refused(name: str, starts: dict[str, str], *first: str) -> None:
     """Each of some starts of a node, all in one process, is refused in one line with some words in it."""
@@ -152,7 +145,7 @@ for arguments in {[[*first, *words.split()] for words in starts]!r}:
 class Listener(Node):
     """Publishes the inputs of a monitor and keeps all it says."""
 
-    def __init__(self, topics: tuple[str, ...], kind: type) -> None:
+    def __init__(self, topics, kind) -> None:
         super().__init__("listener")
         self.outputs = [self.create_publisher(kind, topic, DEEP) for topic in topics]
         self.fused: list[bytes] = []
@@ -202,11 +195,11 @@ class Listener(Node):
 
     def prime(self) -> None:
         """Publish a few samples at rest."""
-        if len(self.outputs) == 1:
+        if len(self.outputs) > 1:
+            self.play(healthy(10, size=0.0)[1])
+        else:
             self.send_channels([0.0] * 6)
             time.sleep(1 / RATE)
-        else:
-            self.play(healthy(10, size=0.0)[1])
 
     def rates(self) -> dict[int, tuple[float, float, float]]:
         """Fused rates by stamp."""
@@ -230,16 +223,13 @@ class Listener(Node):
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
         return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
 
-    def says(self, name: str, words: str, seconds: float = PATIENCE) -> str:
+    def says(self, name: str, words: str) -> str:
         """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
-
-        def said() -> list[str]:
-            return [status.message for status in self._statuses(name) if words in status.message]
-
-        if not wait(said, seconds):
-            print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
-            return ""
-        return said()[-1]
+        said: list[str] = []
+        if wait(lambda: said.extend(s.message for s in self._statuses(name) if words in s.message) or said):
+            return said[-1]
+        print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
+        return ""
 
     def call(self, kind: type, service: str, request, seconds: float = PATIENCE):
         client = self.create_client(kind, service)
@@ -251,6 +241,15 @@ class Listener(Node):
 
     def trigger(self, service: str) -> Trigger.Response:
         return self.call(Trigger, f"fdi_node/{service}", Trigger.Request())
+
+    def change(self, transition: int) -> bool:
+        """Ask the monitor for a transition of its life cycle; whether it was done."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self.call(ChangeState, "fdi_node/change_state", request).success
+
+    def state(self) -> str:
+        """State of the life cycle of the monitor."""
+        return self.call(GetState, "fdi_node/get_state", GetState.Request()).current_state.label
 
     def set(self, node: str = "fdi_node", **values: object):
         """Set parameters together; two underscores stand for a dot."""
@@ -275,42 +274,8 @@ TRANSITIONS = {
 """Which transitions are possible in which state, but for those that end the node, and where they lead."""
 
 
-def wander(listener: Listener, count: int, seed: int) -> dict[str, int]:
-    """Ask an unconfigured node for transitions at random, possible or not, under messages; how many were what."""
-    random, now, told = np.random.default_rng(seed), "unconfigured", {"done": 0, "refused": 0}
-    stop = threading.Event()
-
-    def feed() -> None:
-        while not stop.is_set():
-            listener.play(healthy(10)[1])
-
-    feeder = threading.Thread(target=feed, daemon=True)
-    feeder.start()
-    try:
-        for k in range(count):
-            possible = list(TRANSITIONS[now])
-            # As often one that is possible as one that mostly is not, or that does not exist.
-            pick = possible if random.random() < 0.5 else [1, 2, 3, 4, 9, 60, 99, 255]
-            wanted = int(random.choice(pick))
-            request = ChangeState.Request(transition=Transition(id=wanted))
-            answer = listener.call(ChangeState, "fdi_node/change_state", request, 60.0)
-            goal = TRANSITIONS[now].get(wanted)
-            assert answer.success == (goal is not None), (k, now, wanted)
-            told["done" if goal else "refused"] += 1
-            now = goal or now
-            state = listener.call(GetState, "fdi_node/get_state", GetState.Request(), 60.0).current_state
-            assert state.label == now, (k, state.label, now)
-    finally:
-        stop.set()
-        feeder.join()
-    for wanted in {"active": (4, 2), "inactive": (2,), "unconfigured": ()}[now]:
-        request = ChangeState.Request(transition=Transition(id=wanted))
-        assert listener.call(ChangeState, "fdi_node/change_state", request, 60.0).success
-    return told
-
-
 @contextlib.contextmanager
-def listening(topics: tuple[str, ...], kind: type = Imu) -> Iterator[Listener]:
+def listening(topics=(), kind=Imu) -> Iterator[Listener]:
     """A listener that spins in a thread, in the ROS domain that processes started now have."""
     context = rclpy.get_default_context()
     # A test before may have had another domain.
@@ -340,9 +305,7 @@ def listening(topics: tuple[str, ...], kind: type = Imu) -> Iterator[Listener]:
 
 
 @contextlib.contextmanager
-def monitoring(
-    config: Config, folder: Path, *arguments: str, prime: bool = True, **parameters: object
-) -> Iterator[tuple]:
+def monitoring(config: Config, folder: Path, *arguments: str, prime=True, **parameters: object) -> Iterator[tuple]:
     """The monitor in its own process, connected to a listener: (listener, process)."""
     kind = Imu if config.input == "imus" else Float64MultiArray
     file = parameter_file(config, folder, **parameters)

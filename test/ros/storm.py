@@ -37,6 +37,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import Config
+from fdi_ros.config.settings import ALL_NODES, MONITOR
 from fdi_ros.core.messages import ImuTemplate
 
 STACK = ROOT / "config" / "px4.yaml"
@@ -47,30 +48,8 @@ OUTSTANDING = 8
 """Requests that wait for their answers: DDS keeps ten of a service."""
 LONGEST = 60.0
 """An answer is waited for so long, s."""
-NAMES = [
-    *CONFIG.parameters(),
-    "url",
-    "rate",
-    "named_values",
-    "use_sim_time",
-    "state_file",
-    "autostart",
-    "executor",
-    "start_type_description_service",
-]
-WORDS = (
-    "",
-    "x",
-    "\n\x1b[2J",
-    "a" * 5000,
-    "é\u202e",
-    "sequential",
-    "likelihood_ratio",
-    "cusum",
-    "imu_1.z",
-    "~/a//b",
-    "%s%n",
-)
+NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_values", "use_sim_time"]
+WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)
 WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
 
@@ -114,21 +93,31 @@ class Storm(Node):
         while self._waiting:
             self.turn()
 
+    def activate(self) -> None:
+        """Bring the monitor back to where it works."""
+        now = ""
+        while now != "active":
+            wanted = {"unconfigured": 1, "inactive": 3}.get(now, 0)
+            if wanted:
+                self.ask(ChangeState, "change_state", ChangeState.Request(transition=Transition(id=wanted)))
+            state = self.ask(GetState, "get_state", GetState.Request())
+            self.settle()
+            now = state.result().current_state.label
+
     # What storms are made of ------------------------------------------------------------------------------------------
 
     def value(self) -> ParameterValue:
-        draw = self.draw
-        kind = draw.choice((*range(10), 10, 11, 128, 255))
-        many = draw.choice((0, 1, 2, 9, 300))
+        choice = self.draw.choice
+        many = choice((0, 1, 2, 9, 300))
         return ParameterValue(
-            type=kind,
-            bool_value=draw.random() < 0.5,
-            integer_value=draw.choice(WHOLE),
-            double_value=draw.choice(REALS),
-            string_value=draw.choice(WORDS),
-            double_array_value=[draw.choice(REALS) for _ in range(many)],
-            string_array_value=[draw.choice(WORDS) for _ in range(min(many, 9))],
-            integer_array_value=[draw.choice(WHOLE) for _ in range(many)],
+            type=choice((*range(10), 10, 11, 128, 255)),
+            bool_value=choice((False, True)),
+            integer_value=choice(WHOLE),
+            double_value=choice(REALS),
+            string_value=choice(WORDS),
+            double_array_value=[choice(REALS) for _ in range(many)],
+            string_array_value=[choice(WORDS) for _ in range(min(many, 9))],
+            integer_array_value=[choice(WHOLE) for _ in range(many)],
         )
 
     def parameter(self) -> Parameter:
@@ -144,24 +133,24 @@ class Storm(Node):
                 )
             )
             return Parameter(name=name, value=ParameterValue(type=kind, **value))
-        name = draw.choice(NAMES) if draw.random() < 0.7 else draw.choice((*WORDS, "detector.nmae", "b" * 100_000))
-        return Parameter(name=name, value=self.value())
+        odd = (*WORDS, "detector.nmae", "b" * 100_000)
+        return Parameter(name=draw.choice(NAMES if draw.random() < 0.7 else odd), value=self.value())
 
     def send_parameters(self) -> None:
-        draw = self.draw
-        names = [draw.choice((*NAMES, *WORDS)) for _ in range(draw.choice((0, 1, 50)))]
-        changes = [self.parameter() for _ in range(draw.choice((0, 1, 1, 1, 3, 60)))]
-        kind, request = draw.choice(
+        choice = self.draw.choice
+        names = [choice((*NAMES, *WORDS)) for _ in range(choice((0, 1, 50)))]
+        changes = [self.parameter() for _ in range(choice((0, 1, 1, 1, 3, 60)))]
+        kind, request = choice(
             (
                 *[(SetParameters, SetParameters.Request(parameters=changes))] * 2,
                 (SetParametersAtomically, SetParametersAtomically.Request(parameters=changes)),
                 (GetParameters, GetParameters.Request(names=names)),
                 (DescribeParameters, DescribeParameters.Request(names=names)),
-                (ListParameters, ListParameters.Request(prefixes=names[:3], depth=draw.choice((0, 1, 2**63)))),
+                (ListParameters, ListParameters.Request(prefixes=names[:3], depth=choice((0, 1, 2**63)))),
             )
         )
         service = re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower()
-        self.ask(kind, service, request, draw.choice(NODES))
+        self.ask(kind, service, request, choice(NODES))
 
     def send_services(self) -> None:
         self.ask(Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request())
@@ -200,22 +189,6 @@ class Storm(Node):
         self.answered = self.sent
 
 
-def activate(storm: Storm) -> None:
-    """Bring the monitor back to where it works."""
-    for _ in range(50):
-        future = storm.ask(GetState, "get_state", GetState.Request())
-        storm.settle()
-        if not future.done():
-            continue
-        now = future.result().current_state.label
-        if now == "active":
-            return
-        wanted = {"unconfigured": 1, "inactive": 3}.get(now)
-        assert wanted, now
-        storm.ask(ChangeState, "change_state", ChangeState.Request(transition=Transition(id=wanted)))
-        storm.settle()
-
-
 KINDS = ("parameters", "services", "lifecycle", "links", "mavlink")
 
 
@@ -230,7 +203,7 @@ def rage(kind: str, seconds: float, seed: int, port: int) -> str:
     storm.settle()
     sent, answered = storm.sent, storm.answered
     if kind == "lifecycle":
-        activate(storm)
+        storm.activate()
     return f"{sent} {answered}"
 
 
@@ -268,18 +241,15 @@ def vehicle(folder: Path) -> Iterator[Vehicle]:
         assert "Traceback" not in link.said()
 
 
-def _environment() -> dict[str, str]:
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "PYTHONPATH": path}
-
-
 def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
     """Let one storm loose; what it cost."""
     words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed), str(over.port)]
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     processes = {"monitor": over.monitor, "link": over.link}
     lines = {name: process.said().count("\n") for name, process in processes.items()}
     begun = time.monotonic()
-    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=_environment())
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     end = time.monotonic()
     sent, answered = map(int, done.stdout.split()[-2:])

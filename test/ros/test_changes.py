@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 pytest.importorskip("rclpy", reason="the log is that of a node")
@@ -18,40 +20,29 @@ AMBIGUOUS, FAULTY = ChannelState.AMBIGUOUS, ChannelState.FAULTY
 NAMES = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
 
 
-class Lines(list[tuple[str, str]]):
-    """A log: severity and words of each line."""
-
-    def info(self, words: str) -> None:
-        self.append(("info", words))
-
-    def warning(self, words: str) -> None:
-        self.append(("warning", words))
-
-    def error(self, words: str) -> None:
-        self.append(("error", words))
+@pytest.fixture
+def said():
+    """Severity and words of each line of the log."""
+    return []
 
 
 @pytest.fixture
-def said() -> Lines:
-    return Lines()
-
-
-@pytest.fixture
-def now() -> list[float]:
+def now():
     return [100.0]
 
 
 @pytest.fixture
-def changes(said: Lines, now: list[float]) -> ChangeLog:
-    return ChangeLog(said, NAMES, lambda: now[0])
+def changes(said, now) -> ChangeLog:
+    log = {name: lambda words, name=name: said.append((name, words)) for name in ("info", "warning", "error")}
+    return ChangeLog(SimpleNamespace(**log), NAMES, lambda: now[0])
 
 
-def events(before: ChannelState, after: ChannelState, *channels: int, why: Reason = Reason.NONE) -> list[Event]:
+def events(before, after, *channels: int, why=Reason.NONE) -> list[Event]:
     group = channels if after is AMBIGUOUS else ()
     return [Event(12 * 10**9, channel, before, after, why, group or (channel,), 0.0) for channel in channels]
 
 
-def test_channels_that_change_alike_share_a_line(changes: ChangeLog, said: Lines) -> None:
+def test_channels_that_change_alike_share_a_line(changes, said) -> None:
     changes.add(events(UNCHECKED, OK, 0, 1, 3) + events(OK, FAULTY, 2, why=Reason.DISAGREES), 2 * 10**9, None)
     assert said == [
         ("info", "imu_1.x, imu_1.y, imu_2.y: UNCHECKED -> OK at 10.000 s"),
@@ -59,9 +50,7 @@ def test_channels_that_change_alike_share_a_line(changes: ChangeLog, said: Lines
     ]
 
 
-def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_counted(
-    changes: ChangeLog, said: Lines, now: list[float]
-) -> None:
+def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_counted(changes, said, now) -> None:
     for k in range(2000):
         changes.add(events(OK, UNCHECKED, k % 4) if k % 2 else events(UNCHECKED, OK, k % 4), 0, None)
         changes.check()
@@ -80,7 +69,7 @@ def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_cou
     assert len(said) == count
 
 
-def test_what_becomes_worse_is_said_at_once(changes: ChangeLog, said: Lines, now: list[float]) -> None:
+def test_what_becomes_worse_is_said_at_once(changes, said, now) -> None:
     pair = ApartStatus(("imu_1.x", "imu_2.x"), "the x axis of imu_1 or imu_2,", 0.1, 0.002)
     before = OK
     for after, channels in ((UNCHECKED, (0,)), (SUSPECT, (0,)), (OK, (0,)), (SUSPECT, (0,)), (AMBIGUOUS, (0, 2))):

@@ -12,7 +12,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from inspect import Parameter, Signature
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -52,19 +52,11 @@ class Given:
 
     signature: Signature
 
-    def __init__(self, *arguments: object, **keywords: object) -> None:
+    def __init__(self, *arguments, **keywords) -> None:
         self.given = self.signature.bind_partial(*arguments, **keywords).arguments
 
-    def perform(self, context: Context) -> str:
+    def perform(self, context) -> str:
         return context.values[self.given["variable_name"]]
-
-
-@dataclass
-class Context:
-    """Values of the launch arguments."""
-
-    values: dict[str, str]
-    is_shutdown: bool = False
 
 
 @pytest.fixture
@@ -78,14 +70,15 @@ def load(names, monkeypatch):
         every = dict.fromkeys([*own, *(word for other in further for word in parameters_of(other))])
         return {word: None for word in every if word != "kwargs"}
 
-    def stand_in(name: str) -> type[Given]:
+    def stand_in(name: str) -> type:
+        if not any(held.get(name) for held in names.values()):
+            return object
         signature = Signature([Parameter(word, Parameter.POSITIONAL_OR_KEYWORD) for word in parameters_of(name)])
         return classes.setdefault(name, type(name, (Given,), {"signature": signature}))
 
     for module, held in names.items():
         made = ModuleType(module)
-        for name in held:
-            setattr(made, name, stand_in(name) if any(other.get(name) for other in names.values()) else object)
+        vars(made).update({name: stand_in(name) for name in held})
         monkeypatch.setitem(sys.modules, module, made)
     monkeypatch.delitem(sys.modules, "fdi_ros.ros.launching", raising=False)
 
@@ -95,11 +88,11 @@ def load(names, monkeypatch):
         spec.loader.exec_module(module)
         (*declared, function) = module.generate_launch_description().given["initial_entities"]
         values = {one.given["name"]: one.given.get("default_value") for one in declared}
-        for one in declared:
-            value = given.get(one.given["name"], one.given.get("default_value"))
-            assert value in one.given.get("choices", [value])
         assert given.keys() <= values.keys()
-        return {node.given["name"]: node.given for node in function.given["function"](Context(values | given))}
+        values |= given
+        assert all(values[one.given["name"]] in one.given["choices"] for one in declared if "choices" in one.given)
+        context = SimpleNamespace(values=values, is_shutdown=False)
+        return {node.given["name"]: node.given for node in function.given["function"](context)}
 
     yield run
     sys.modules.pop("fdi_ros.ros.launching", None)
@@ -147,10 +140,10 @@ def test_the_clock_of_a_launch_file_around_it_is_not_overridden(load) -> None:
 def test_a_node_that_ends_ends_the_launch_and_one_that_fails_fails_it(load) -> None:
     end = load("mavlink")["mavlink_node"]["on_exit"]
     with pytest.raises(RuntimeError, match="mavlink_node has failed: exit code 2"):
-        end(SimpleNamespace(process_name="mavlink_node", returncode=2), Context({}))
-    (shutdown,) = end(SimpleNamespace(process_name="player_node", returncode=0), Context({}))
+        end(SimpleNamespace(process_name="mavlink_node", returncode=2), SimpleNamespace(is_shutdown=False))
+    (shutdown,) = end(SimpleNamespace(process_name="player_node", returncode=0), SimpleNamespace(is_shutdown=False))
     assert shutdown.given == {"reason": "player_node has ended"}
-    assert end(SimpleNamespace(process_name="fdi_node", returncode=2), Context({}, is_shutdown=True)) == []
+    assert end(SimpleNamespace(process_name="fdi_node", returncode=2), SimpleNamespace(is_shutdown=True)) == []
 
 
 @pytest.mark.skipif(
@@ -212,26 +205,33 @@ class Analyzer:
 
     def level(self, now: float) -> int:
         own = self.settings
-        stale = {name for name, (at, _) in self.items.items() if now - at > own["timeout"]}
+        fresh = {name: item for name, item in self.items.items() if now - item[0] <= own["timeout"]}
         if own.get("discard_stale"):
-            self.items = {name: item for name, item in self.items.items() if name not in stale}
-            stale = set()
-        levels = [3 if name in stale else level for name, (_, level) in self.items.items()]
-        level = max(levels, default=0)
-        if all(one == 3 for one in levels):
-            level = 3
-        elif level == 3:
-            level = 2
-        expected = own.get("num_items", -1)
-        if expected == 0 and not levels:
+            self.items = fresh
+        levels = [self.items[name][1] if name in fresh else 3 for name in self.items]
+        if not levels and own.get("num_items") == 0:
             return 0
-        return max(2, level) if 0 < expected != len(levels) else level
+        level = 3 if all(one == 3 for one in levels) else min(max(levels), 2)
+        return max(2, level) if 0 < own.get("num_items", -1) != len(levels) else level
 
 
 def analyzed(text: str) -> dict[str, Analyzer]:
     """Analyzers of a parameter file."""
     group = yaml.safe_load(text)["analyzers"]["ros__parameters"]["gyros"]["analyzers"]
     return {name: Analyzer(settings) for name, settings in group.items()}
+
+
+def hear(analyzers: dict[str, Analyzer], lines, at: float) -> None:
+    """Give lines to the analyzers, each to one at most."""
+    for line in lines:
+        for analyzer in [one for one in analyzers.values() if one.takes(line.name)]:
+            analyzer.items[line.name] = (at, int(line.level))
+
+
+def whole(analyzers: dict[str, Analyzer], now: float) -> int:
+    """An AnalyzerGroup: the highest level, ERROR where some are STALE and others not."""
+    levels = [analyzer.level(now) for analyzer in analyzers.values()]
+    return 2 if max(levels) == 3 and min(levels) < 3 else max(levels)
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +254,6 @@ def reports():
     ("given", "names"),
     [
         ((), ("fdi_node",)),
-        ((), ("/drone/fdi_node",)),
         ((), ("/a/fdi_node", "/b/c/fdi_node", "fdi_node")),
         (("/drone/monitor",), ("/drone/monitor",)),
         (("/a/fdi_node", "/b/left"), ("/a/fdi_node", "/b/left")),
@@ -262,56 +261,41 @@ def reports():
 )
 def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(reports, given, names) -> None:
     analyzers = analyzed(made_for(given, ANALYZERS) if given else ANALYZERS)
+    for line in [line for name in names for line in reports(name)]:
+        assert sum(analyzer.takes(line.name) for analyzer in analyzers.values()) == 1, line.name
 
-    def hear(lines: list[StatusLine], at: float) -> None:
-        for line in lines:
-            taken = [analyzer for analyzer in analyzers.values() if analyzer.takes(line.name)]
-            assert len(taken) == 1, line.name
-            taken[0].items[line.name] = (at, int(line.level))
+    def all_say(at: float, but: str = "", well: bool = True) -> None:
+        for name in [name for name in names if name != but]:
+            hear(analyzers, reports(name, well), at)
 
-    def hear_all(at: float, but: str = "") -> None:
-        for name in names:
-            hear(reports(name) if name != but else [], at)
-
-    def whole(now: float) -> int:
-        """An AnalyzerGroup: the highest level, ERROR where some are STALE and others not."""
-        levels = [analyzer.level(now) for analyzer in analyzers.values()]
-        return 2 if max(levels) == 3 and min(levels) < 3 else max(levels)
-
-    assert whole(0.0) == 2
-    hear_all(0.0)
-    assert whole(1.0) == 0
+    assert whole(analyzers, 0.0) == 2
+    all_say(0.0)
     # An injector that comes, and ends.
-    hear([StatusLine(Level.OK, "drone/injector_node: injector", "off", "", ())], 0.0)
-    assert whole(1.0) == 0
-    hear_all(4.0)
-    assert whole(5.0) == 0
+    hear(analyzers, [StatusLine(Level.OK, "drone/injector_node: injector", "off")], 0.0)
+    assert whole(analyzers, 1.0) == 0
+    all_say(4.0)
+    assert whole(analyzers, 5.0) == 0
     # A link to an autopilot that comes, loses the autopilot, and has it again.
     for level, expected in ((Level.OK, 0), (Level.STALE, 2), (Level.OK, 0)):
-        hear([StatusLine(level, f"mavlink_node: {what}", "", "", ()) for what in ("link", "unit imu_1")], 4.0)
-        assert whole(5.0) == expected
-    for name in names:
-        hear(reports(name, well=False), 5.0)
-        assert whole(5.0) == 2
-        hear(reports(name), 5.0)
-        assert whole(5.0) == 0
+        hear(analyzers, [StatusLine(level, f"mavlink_node: {what}", "") for what in ("link", "unit imu_1")], 4.0)
+        assert whole(analyzers, 5.0) == expected
+    for well in (False, True):
+        all_say(5.0, well=well)
+        assert whole(analyzers, 5.0) == (0 if well else 2)
     # The node of the link is gone.
-    hear_all(8.0)
-    assert whole(8.0) == 2
+    all_say(8.0)
+    assert whole(analyzers, 8.0) == 2
     analyzers["link"].items.clear()
-    assert whole(8.0) == 0
+    assert whole(analyzers, 8.0) == 0
     # One of the monitors is gone; then all are.
-    hear_all(12.0, but=names[-1])
-    assert whole(12.5) == 2
-    assert whole(16.0) == 2
+    all_say(12.0, but=names[-1])
+    assert whole(analyzers, 12.5) == 2
+    assert whole(analyzers, 16.0) == 2
 
 
 def test_a_monitor_that_never_came_is_red_where_it_was_named(reports) -> None:
     analyzers = analyzed(made_for(["/a/fdi_node", "/b/fdi_node"], ANALYZERS))
-    for line in reports("/a/fdi_node"):
-        for analyzer in analyzers.values():
-            if analyzer.takes(line.name):
-                analyzer.items[line.name] = (0.0, int(line.level))
+    hear(analyzers, reports("/a/fdi_node"), 0.0)
     assert analyzers["monitor"].level(1.0) == 2
     # Another node of a similar name is none of these.
     assert not any(analyzer.takes("c/a/fdi_node: monitor") for analyzer in analyzers.values())
