@@ -29,7 +29,7 @@ SPIKE_PORTION, RARE = 256, 0.1  # samples looked at at once, and share of them t
 MEDIAN_TO_RMS = 1.4826  # of normal errors: standard deviation over median absolute deviation
 
 
-@dataclass(frozen=True)
+@dataclass
 class Data:
     """A recording made ready."""
 
@@ -37,20 +37,13 @@ class Data:
     z: Array  # (N, n) rad/s, NaN where not usable
     unusable: dict[str, Int]  # (n,) samples not usable, by the reason: missing, not_finite, out_of_range, repeated
 
-    @property
-    def seconds(self) -> Array:
-        """(N,) time since the first sample, s."""
-        return (self.stamp - self.stamp[0]) * 1e-9
-
-    @property
-    def duration(self) -> float:
-        """Length, s."""
-        return float(self.stamp[-1] - self.stamp[0]) * 1e-9
-
-    @property
-    def step(self) -> float:
-        """Usual time from sample to sample, s."""
-        return float(np.median(np.diff(self.stamp))) * 1e-9
+    def __post_init__(self) -> None:
+        self.seconds: Array = np.asarray(
+            (self.stamp - self.stamp[:1]) * 1e-9, dtype=np.float64
+        )  # (N,) since the first sample
+        self.duration = float(self.seconds[-1]) if len(self.stamp) else 0.0  # s
+        # Usual time from sample to sample, s.
+        self.step = float(np.median(np.diff(self.stamp))) * 1e-9 if len(self.stamp) > 1 else 0.0
 
     def slow_rates(self) -> Array:
         """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
@@ -69,18 +62,18 @@ def prepare(block: Block, max_rate: Array) -> Data:
     received, finite = block.delivered, np.isfinite(block.z)
     with np.errstate(invalid="ignore"):
         inside = np.abs(block.z) < max_rate
-    step = float(np.median(np.diff(block.stamp))) * 1e-9 if len(block) > 1 else 0.0
+    data = Data(block.stamp, np.where(received & inside, block.z, np.nan), {})
     # What does not change at all is an old value: it shows neither rest nor motion.
-    z = np.where(received & inside, block.z, np.nan)
-    old = repeated(z, step)
-    z[old] = np.nan
-    lost = {
+    old = repeated(data.z, data.step)
+    data.z[old] = np.nan
+    reasons = {
         "missing": ~received,
         "not_finite": received & ~finite,
         "out_of_range": received & finite & ~inside,
         "repeated": old,
     }
-    return Data(block.stamp, z, {why: np.asarray(which.sum(axis=0)) for why, which in lost.items()})
+    data.unusable.update({why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()})
+    return data
 
 
 def spikes(z: Array, axes: Array) -> Mask:
@@ -161,7 +154,7 @@ PORTION = 100_000  # samples worked on at once, about
 NOT_SHIFTED = 1e-6  # s; smaller delays are none
 
 
-@dataclass(frozen=True)
+@dataclass
 class Blocks:
     """Means of blocks, and windows of blocks."""
 
@@ -172,30 +165,12 @@ class Blocks:
     white: Array  # (n,) what interpolation has left of the variance of white noise in them
     count: Int  # (W,) samples that it is of
 
-    @property
-    def windows(self) -> int:
-        """Number of windows."""
-        return len(self.start)
-
-    @property
-    def size(self) -> Int:
-        """(W,) blocks of each window."""
-        return np.diff(self.start, append=len(self.mean))
-
-    @property
-    def window(self) -> Int:
-        """(B,) number of the window of each block."""
-        return np.repeat(np.arange(self.windows), self.size)
-
-    @property
-    def length(self) -> float:
-        """Usual time from block to block, s."""
-        return float(np.median(np.diff(self.seconds)))
-
-    @property
-    def time(self) -> Array:
-        """(W,) middle of each window, s."""
-        return np.asarray(np.add.reduceat(self.seconds, self.start) / self.size)
+    def __post_init__(self) -> None:
+        self.windows = len(self.start)
+        self.size = np.diff(self.start, append=len(self.mean))  # (W,) blocks of each window
+        self.window = np.repeat(np.arange(self.windows), self.size)  # (B,) that each block is in
+        self.length = float(np.median(np.diff(self.seconds)))  # usual time from block to block, s
+        self.time = np.add.reduceat(self.seconds, self.start) / self.size  # (W,) middle of each window, s
 
 
 def make_blocks(data: Data, delay: Array) -> Blocks:

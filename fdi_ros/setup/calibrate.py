@@ -119,7 +119,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
     """Refuse a recording that is too short, too slow, or lacks too much of a channel."""
     samples, words = len(data.stamp), ""
     if samples < 2 or data.duration < LEAST_DURATION:
-        words = f"is {data.duration if samples else 0.0:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
+        words = f"is {data.duration:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
     elif samples < LEAST_SAMPLES:
         words = f"has {samples} samples, a calibration needs at least {LEAST_SAMPLES}"
     elif data.step > LONGEST_STEP:

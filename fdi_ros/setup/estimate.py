@@ -213,12 +213,8 @@ class _Pass:
         each = -(-blocks.windows // MOST_STEPS)
         self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
         self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
+        self.times = blocks.time[0] + self.middle - self.middle[0]  # (K,) of the joined windows, s from the first
         self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration * inside[:, None], scale)
-
-    @property
-    def times(self) -> Array:
-        """(K,) middle of the joined windows, s from the first."""
-        return np.asarray(self.blocks.time[0] + self.middle - self.middle[0])
 
     def curve_of(self, found: Smoothed) -> Array:
         """Biases (K, n) over time, rad/s."""

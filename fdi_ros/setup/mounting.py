@@ -109,7 +109,7 @@ class Loss:
     isolable: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Mounting:
     """What follows from the geometry and the noise at rest."""
 
@@ -121,20 +121,11 @@ class Mounting:
     waiting: dict[str, Array]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
     losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
 
-    def pairs(self, above: float, up_to: float = math.inf) -> list[list[int]]:
-        """Pairs of channels whose |rho| is above the one and not above the other."""
-        rho = np.abs(self.geometry.rho)
-        return np.argwhere(np.triu((rho > above) & (rho <= up_to), 1)).tolist()
-
-    @property
-    def alike(self) -> list[list[int]]:
-        """Pairs of channels that cannot be told apart."""
-        return self.pairs(SAME_DIRECTION)
-
-    @property
-    def similar(self) -> list[list[int]]:
-        """Pairs that can be told apart with effort."""
-        return self.pairs(ALIKE, SAME_DIRECTION)
+    def __post_init__(self) -> None:
+        rho = np.triu(np.abs(self.geometry.rho), 1)
+        # Pairs of channels that cannot be told apart, and those that can with effort.
+        self.alike = np.argwhere(rho > SAME_DIRECTION).tolist()
+        self.similar = np.argwhere((rho > ALIKE) & (rho <= SAME_DIRECTION)).tolist()
 
     def lost(self, *numbers: int) -> list[Loss]:
         """Losses of these numbers of channels."""

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from fdi_ros.model.noise import much_noisier, noisier_words
-from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import SHOWN
@@ -51,7 +50,7 @@ class Span(NamedTuple):
     end: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class Calibration:
     """Result for the channels in use; all that is per channel is in their order."""
 
@@ -66,75 +65,32 @@ class Calibration:
     settings: dict[str, object]  # parameters to be changed, ``{"section.field": value}``
     spectrum: Spectrum  # of what channels differ by from the fused rate with these settings
 
-    @property
-    def units(self) -> tuple[tuple[int, ...], ...]:
-        """Places of the channels of each unit; of an array without units each channel is alone."""
-        unit_of = [name.rpartition(".")[0] or name for name in self.names]
-        return tuple(tuple(i for i, one in enumerate(unit_of) if one == unit) for unit in dict.fromkeys(unit_of))
-
-    @property
-    def axes(self) -> Array:
-        """(n, 3)."""
-        return self.estimate.axes
-
-    @property
-    def axes_std(self) -> Array:
-        """(n, 3) standard errors of the axes."""
-        return np.sqrt(np.diag(self.estimate.axes_covariance)).reshape(-1, 3)
-
-    @property
-    def bias_std(self) -> Array:
-        """(n,) standard errors of the mean biases, rad/s."""
-        return np.sqrt(np.diag(self.estimate.bias_covariance))
-
-    @cached_property
-    def scale(self) -> tuple[float, float]:
-        """Scale error left between channels, as written, and its uncertainty."""
-        return self.estimate.disagreement()
-
-    @property
-    def angle(self) -> Array:
-        """(n,) angle between calibrated and nominal axes, rad."""
-        sine = np.linalg.norm(np.cross(self.axes, self.nominal), axis=1)
-        return np.arctan2(sine, (self.axes * self.nominal).sum(axis=1))
-
-    @property
-    def angle_error(self) -> Array:
-        """(n,) standard error of each direction, rad, in each of the two directions across it."""
+    def __post_init__(self) -> None:
+        found, n = self.estimate, len(self.names)
+        self.axes = axes = found.axes  # (n, 3)
+        self.axes_std = np.sqrt(np.diag(found.axes_covariance)).reshape(-1, 3)
+        self.bias_std = np.sqrt(np.diag(found.bias_covariance))  # (n,) of the mean biases, rad/s
+        self.scale = found.disagreement()  # scale error left between channels, as written, and its uncertainty
+        # (n,) angle between calibrated and nominal axes, rad, and its standard error in each of two directions.
+        sine = np.linalg.norm(np.cross(axes, self.nominal), axis=1)
+        self.angle = np.arctan2(sine, (axes * self.nominal).sum(axis=1))
+        length = np.linalg.norm(axes, axis=1)
+        each, along = found.axes_covariance.reshape(n, 3, n, 3), axes / length[:, None]
+        # (n,) scale factor relative to nominal, and its standard error.
+        self.factor = length / np.linalg.norm(self.nominal, axis=1)
+        square = np.einsum("ia,iab,ib->i", along, each[range(n), :, range(n)], along)
+        self.factor_error = np.sqrt(np.maximum(square, 0))
         across = (self.axes_std**2).sum(axis=1) - self.factor_error**2
-        return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
-
-    @property
-    def factor(self) -> Array:
-        """(n,) scale factor relative to nominal."""
-        return np.asarray(np.linalg.norm(self.axes, axis=1) / np.linalg.norm(self.nominal, axis=1))
-
-    @property
-    def factor_error(self) -> Array:
-        """(n,) its standard error, relative."""
-        each = self._covariances[range(len(self.names)), :, range(len(self.names))]
-        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", self._directions, each, self._directions), 0))
-
-    @property
-    def _directions(self) -> Array:
-        return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
-
-    @property
-    def _covariances(self) -> Array:
-        return self.estimate.axes_covariance.reshape(len(self.axes), 3, len(self.axes), 3)
-
-    @cached_property
-    def axis_errors(self) -> Array:
-        """Uncertainty (3,) of the disagreement of axes along x, y and z of the body."""
-        n, each = len(self.names), self._covariances
-        apart = np.eye(n) - self.axes @ np.linalg.pinv(self.axes)
-        square = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
-        return np.sqrt(np.maximum(square, 0.0))
-
-    @property
-    def measured(self) -> Mask:
-        """(n,) channels whose scale factor the recording shows, against the others."""
-        return np.asarray(np.sqrt(self._directions**2 @ self.axis_errors**2) < UNMEASURED)
+        self.angle_error = np.sqrt(np.maximum(across, 0) / 2) / length
+        # (3,) uncertainty of the disagreement of axes along x, y and z of the body.
+        apart = np.eye(n) - axes @ np.linalg.pinv(axes)
+        squares = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
+        self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
+        # (n,) channels whose scale factor the recording shows, against the others.
+        self.measured = np.sqrt(along**2 @ self.axis_errors**2) < UNMEASURED
+        # Places of the channels of each unit; of an array without units each channel is alone.
+        unit_of = [name.rpartition(".")[0] or name for name in self.names]
+        self.units = [[i for i, one in enumerate(unit_of) if one == unit] for unit in dict.fromkeys(unit_of)]
 
 
 def calibration_figures(result: Calibration) -> dict[str, object]:

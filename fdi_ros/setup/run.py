@@ -49,7 +49,7 @@ MOST_NAMED = 12  # topics that an error names
 LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
 
 
-@dataclass(frozen=True)
+@dataclass
 class Tried:
     """One config on the recording of a proof."""
 
@@ -57,23 +57,13 @@ class Tried:
     note: str
     isolated: dict[float, tuple[int, int]]  # by size, rad/s: biases isolated, and tried; empty: too short
 
-    @property
-    def judged(self) -> float:
-        """Share of the samples that are judged."""
-        return 0.0 if self.baseline is None else self.baseline.judged
-
-    @property
-    def declared(self) -> dict[str, float]:
-        """Channels declared, without a fault, and when first, s."""
-        first: dict[str, float] = {}
+    def __post_init__(self) -> None:
+        self.judged = 0.0 if self.baseline is None else self.baseline.judged  # share of the samples
+        self.declared: dict[str, float] = {}  # channels declared, without a fault, and when first, s
         for event in self.baseline.declared if self.baseline is not None else ():
-            first.setdefault(event.channel, event.at_s)
-        return first
-
-    @property
-    def isolated_of(self) -> tuple[int, int]:
-        """Biases isolated, and tried, of all sizes."""
-        return sum(good for good, _ in self.isolated.values()), sum(of for _, of in self.isolated.values())
+            self.declared.setdefault(event.channel, event.at_s)
+        # Biases isolated, and tried, of all sizes.
+        self.isolated_of = tuple(map(sum, zip(*self.isolated.values(), strict=True))) or (0, 0)
 
 
 def times_words(declared: Mapping[str, float]) -> str:
