@@ -85,7 +85,13 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
     try:
         found = estimate(data, sensors)
         tried = config.replaced(_settings(config, active, data.step, found))
-        faults, spectrum = _watch(_aligned(block, data, found.delay, active), tried, active)
+        z, received = block.z.copy(), block.delivered.copy()
+        # As the monitor will have them once the delays are taken off.
+        still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
+        z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
+        # Where there is none for the instant, the value of another one is not it.
+        received[:, used] = np.isfinite(z[:, used])
+        faults, spectrum = _watch(Block(block.stamp, z, received), tried, active)
         if faults:
             found = estimate(_without(faults, data, nominal.channel_names), sensors)
     except np.linalg.LinAlgError as error:
@@ -103,16 +109,6 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
         settings=_settings(config, active, data.step, found),
         spectrum=spectrum,
     )
-
-
-def _aligned(block: Block, data: Data, delay: Array, active: Int) -> Block:
-    """Return the usable values as the monitor will have them once the delays (n,), s, are taken off."""
-    z, received = block.z.copy(), block.delivered.copy()
-    still = np.isfinite(data.z) & (np.abs(delay) < NOT_SHIFTED)
-    z[:, active] = np.where(still, data.z, resampled(data, delay)[0])
-    # Where there is none for the instant, the value of another one is not it.
-    received[:, active] = np.isfinite(z[:, active])
-    return Block(block.stamp, z, received)
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:

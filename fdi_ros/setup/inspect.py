@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -166,43 +167,32 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     """Describe when it was recorded, how long it is and how large."""
+    figures = recording_figures(reports, bag, ())
     words = "no messages"
-    if (span := _span(reports)) is not None:
-        first, last = span
+    if (first := figures["start_ns"]) is not None:
         date = date_of(first)
         begun = f"{first * 1e-9:.1f} s after a start, date unknown" if date is None else f"{date:%Y-%m-%d %H:%M:%S} UTC"
-        words = f"{(last - first) * 1e-9:.1f} s from {begun}"
-    return f"{shown(bag.name)}: {words}, {_size(bag) / 1e6:.1f} MB\n\n"
+        words = f"{figures['duration_s']:.1f} s from {begun}"
+    return f"{shown(bag.name)}: {words}, {figures['size_bytes'] / 1e6:.1f} MB\n\n"
 
 
-def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, object]:
+def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, Any]:
     """All figures by name, SI units: for programs."""
-    span = _span(reports)
-    date = None if span is None else date_of(span[0])
+    recorded = [report for report in reports if report.received]
+    first = min((report.first for report in recorded), default=None)
+    last = max((report.last for report in recorded), default=None)
+    date = None if first is None else date_of(first)
+    files = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    topics = figures_of(topic_columns(reports))
     return {
         "bag": str(bag),
-        "start_ns": None if span is None else span[0],
+        "start_ns": first,
         "start": None if date is None else date.isoformat(),
-        "duration_s": None if span is None else (span[1] - span[0]) * 1e-9,
-        "size_bytes": _size(bag),
+        "duration_s": None if first is None or last is None else (last - first) * 1e-9,
+        "size_bytes": sum(path.stat().st_size for path in files),
         "damage": list(damage),
-        "topics": [
-            {name: value for name, value in row.items() if value is not None}
-            for row in figures_of(topic_columns(reports))
-        ],
+        "topics": [{name: value for name, value in row.items() if value is not None} for row in topics],
     }
-
-
-def _span(reports: Sequence[TopicReport]) -> tuple[int, int] | None:
-    """Return the times of recording of the first and the last message, ns."""
-    recorded = [report for report in reports if report.received]
-    return (min(report.first for report in recorded), max(report.last for report in recorded)) if recorded else None
-
-
-def _size(bag: Path) -> int:
-    """Bytes of all files."""
-    paths = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
-    return sum(path.stat().st_size for path in paths)
 
 
 def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:

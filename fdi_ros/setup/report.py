@@ -144,18 +144,6 @@ def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(Role.UNKNOWN, "topics", words, others)
 
 
-def next_lines(bag: str, config: str, usable: bool) -> list[str]:
-    """List what to do with the config."""
-    bag, config = shlex.quote(bag), shlex.quote(config)
-    steps = [
-        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
-        f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
-        f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
-        f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
-    ]
-    return steps if usable else steps[:1]
-
-
 # In tables ------------------------------------------------------------------------------------------------------------
 
 
@@ -221,7 +209,14 @@ def _sections(
         f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
         f" to be isolated within {WITHIN:g} s."
     )
-    steps = [shown(line, LINE) for line in next_lines(bag, config, first.severity is not Severity.BAD)]
+    bag, config = shlex.quote(bag), shlex.quote(config)
+    steps = [
+        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
+        f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
+        f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
+        f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
+    ]
+    steps = [shown(line, LINE) for line in (steps[:1] if first.severity is Severity.BAD else steps)]
     sections = [
         Section("Warnings", "", lines_of(findings, Role.WARNING)),
         Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),

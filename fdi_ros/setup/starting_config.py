@@ -111,22 +111,19 @@ def _turned_units(path: Path, config: Config) -> str:
     return ", ".join(turned)
 
 
-Known = dict[str, tuple[Any, str]]  # values of parameters, and remarks on them, by ``section.field``
-
-
 def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     """Make a config to start from, of the topics of gyros in a recording."""
     kind = chosen[0].kind
     assert kind is not None
     rate, largest = max(report.rate for report in chosen), max(report.largest for report in chosen)
-    at_rest = rate * _REST >= MIN_LEARNED and all(_starts_at_rest(report) for report in chosen)
+    at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
     largest_rate = _rounded_up(max(*PARAMETERS["health.max_rate"].default, 1.001 * largest))
-    guess = "a guess, for scale factors and axes that are not calibrated"
-    known: Known = {
+    # Values of parameters, and remarks on them.
+    known: dict[str, tuple[Any, str]] = {
         "input": (input_of(kind), ""),
         "sample_rate": (float(f"{rate:.4g}"), ""),
         "noise.noise_std": _noise_setting(chosen),
-        "noise.scale_std": ([0.01], guess),
+        "noise.scale_std": ([0.01], "a guess, for scale factors and axes that are not calibrated"),
         "noise.timing_std": ([float(f"{0.05 / chosen[0].rate:.2g}")], "a guess"),
         "bias.startup_bias_duration": (
             _REST if at_rest else 0.0,
@@ -136,15 +133,32 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         "detector.false_alarms_per_hour": (0.001, ""),
         "health.max_rate": ([largest_rate], "NOT KNOWN: put in what the data sheet says"),
     }
+    topics = [report.topic.name for report in chosen]
     if kind.stamped:
-        known |= _units(chosen, rate)
+        words = (
+            "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
+            " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
+            " three of them, isolate it"
+        )
+        numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
+        names = [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)]
+        known["imus.topics"], known["imus.names"] = (topics, ""), (names, "")
+        known["imus.mounts"] = np.tile(np.eye(3).ravel(), len(chosen)).tolist(), words
+        known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
+        if numbered:
+            words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+            known["decision.latch"] = False, words
+        if timeout := _longer(chosen, _BRIDGED, 10.0):
+            slowest, none = min(report.rate for report in chosen), "none would be aligned between two"
+            words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
+            known["imus.timeout"] = timeout, words
     else:
         words = (
             "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
             " but for those of three reference channels: these must be right"
         )
-        known["channels.topic"] = chosen[0].topic.name, ""
-        known["geometry.preset"], known["geometry.cone_channels"] = ("cone", words), (chosen[0].channels, "")
+        known["channels.topic"], known["geometry.preset"] = (topics[0], ""), ("cone", words)
+        known["geometry.cone_channels"] = chosen[0].channels, ""
     if silent := _longer(chosen, _SILENT, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
     parameters = {name: value for name, (value, _) in known.items()}
@@ -171,32 +185,6 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
     """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
     needed = max(max(intervals * report.interval, report.usual_longest) for report in chosen)
     return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
-
-
-def _units(chosen: Sequence[TopicReport], rate: float) -> Known:
-    """Parameters of three-axis units; rate in Hz."""
-    topics = [report.topic.name for report in chosen]
-    numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
-    names = [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)]
-    known: Known = {
-        "imus.topics": (topics, ""),
-        "imus.names": (names, ""),
-        "imus.mounts": (
-            np.tile(np.eye(3).ravel(), len(chosen)).tolist(),
-            "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
-            " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
-            " three of them, isolate it",
-        ),
-        "imus.max_skew": (_rounded_up(0.2 / rate), ""),
-    }
-    if numbered:
-        words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
-        known["decision.latch"] = False, words
-    if timeout := _longer(chosen, _BRIDGED, 10.0):
-        slowest = min(report.rate for report in chosen)
-        words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s none would be aligned between two"
-        known["imus.timeout"] = timeout, words
-    return known
 
 
 def _starts_at_rest(report: TopicReport) -> bool:
