@@ -236,7 +236,7 @@ class _Seen(Sink):
     @property
     def noise(self) -> tuple[float, ...]:
         """Of each channel at the quietest, rad/s."""
-        return tuple(self._segments.quiet_noise().tolist())
+        return tuple(self._segments.noise().quiet.tolist())
 
 
 def _row(known: Flight, summary: Summary) -> Flight:

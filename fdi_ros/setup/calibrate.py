@@ -231,9 +231,6 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
     return replace(data, z=z)
 
 
-# Settings -------------------------------------------------------------------------------------------------------------
-
-
 def _settings(config: Config, active: Int, step: float, found: StateEstimate) -> dict[str, object]:
     """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
     geometry = build_geometry(config)

@@ -297,12 +297,7 @@ class _Pass:
     def _beyond_vibration(self, moments: Array, count: Int) -> Array:
         """Find what (W, 7, 7) of the moments M (W, 7, 7) of the signals no vibration explains: M (M + K)^-1.
 
-        Vibration turns the whole body, and every unit sees it with a gain and a phase of its own: for as long as it
-        lasts, it looks like scale errors, misalignments and delays, and leaves no residual once these are fitted. With
-        e^2 the variance of a channel that rest does not show, and units that see vibration differently by `UNEQUAL` at
-        least, at most U = e^2 / UNEQUAL^2 of the mean square s^2 of a signal is vibration. The products with a channel
-        then are off by up to e sqrt(min(U, s^2)) each, alike in all windows: K = W count^2 min(U, s^2), in units of
-        e^2.
+        In docs/calibration.md, "What vibration explains", K is W count^2 min(U, s^2), in units of e^2.
         """
         variance, moving = self.variance, ~self.rest
         at_rest = np.median(variance[self.rest], axis=0) if self.rest.any() else np.zeros(len(self.axes))

@@ -188,7 +188,7 @@ def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: 
     groups = np.split(np.arange(len(names)), np.cumsum([one.channels for one in chosen])[:-1] if units else len(names))
     words = f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
     words += f" at {max(one.rate for one in chosen):.3g} Hz"
-    noise = np.concatenate([one.segments.moving_noise() for one in chosen])
+    noise = np.concatenate([one.segments.noise().moving for one in chosen])
     if noisy := noisier_words(names, noise, [group.tolist() for group in groups], unit.name, unit.factor):
         yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
     yield Finding(Role.WORTH, "ready", words, headline="READY")
@@ -248,7 +248,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
         largest = max(one.largest for one in chosen)
         why = f"{largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
     elif chosen and all(map(_no_gyro_at_rest, chosen)):
-        noise = max(float(one.segments.quiet_noise().max()) for one in chosen)
+        noise = max(float(one.segments.noise().quiet.max()) for one in chosen)
         why = f"no gyro at rest has a bias and noise of {noise:.2g} rad/s"
     else:
         return ""
@@ -267,10 +267,10 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
 
 def _no_gyro_at_rest(report: TopicReport) -> bool:
     """Whether it lies still, and with more noise and bias than any gyro in rad/s has."""
-    rest = report.segments.at_rest(largest_bias=FASTEST)
-    if not sum(rest) > STILL * len(rest) or not (report.segments.quiet_noise() > NOISIEST).all():
+    noise, segments = report.segments.noise(largest_bias=FASTEST), report.segments.all_segments()
+    if noise.share >= 1.0 - STILL or not (report.segments.noise().quiet > NOISIEST).all():
         return False
-    still = [one.means.mean(axis=0) for one, lies in zip(report.segments.all_segments(), rest, strict=True) if lies]
+    still = [one.means.mean(axis=0) for one, lies in zip(segments, noise.rest, strict=True) if lies]
     return bool(np.abs(np.median(still, axis=0)).max() > LARGEST_BIAS)
 
 

@@ -197,6 +197,7 @@ def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequenc
 
 def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
     """Figures of every topic; those of values only where they could be of gyros."""
+    gyros = [report.segments.noise() if report.could_be_gyros else None for report in reports]
 
     def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
         return [figure(report) if report.could_be_gyros else None for report in reports]
@@ -225,9 +226,9 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
         Column("largest", of_values(lambda report: report.largest)),
-        Column("quiet_noise", of_values(lambda report: report.segments.quiet_noise()), ("noise, quietest",), noise),
-        Column("moving_noise", of_values(lambda report: report.segments.moving_noise()), ("in motion",), noise),
-        Column("moving_share", of_values(lambda report: report.segments.moving_share())),
+        Column("quiet_noise", [one and one.quiet for one in gyros], ("noise, quietest",), noise),
+        Column("moving_noise", [one and one.moving for one in gyros], ("in motion",), noise),
+        Column("moving_share", [one and one.share for one in gyros]),
         Column("", [_gyros(report, unit) for report in reports], ("gyros?",)),
     ]
 
@@ -249,7 +250,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
     words += [f"gives the values of {shown(report.copy_of)}"] if report.copy_of else []
-    words += [f"in motion for {report.segments.moving_share():.0%}"] if report.complete else []
+    words += [f"in motion for {report.segments.noise().share:.0%}"] if report.complete else []
     return ", ".join([*words, *troubles(report, unit)])
 
 

@@ -36,9 +36,6 @@ from fdi_ros.report.layout import (
     told,
 )
 
-# Found by waiting ----------------------------------------------------------------------------------------------------
-
-
 WAITS = (0.02, 0.1, 0.5, 2.0)  # times within which a fault may be found, s
 VIBRATION = 5.0  # times by which vibration raises the noise, where noise_std is that at rest
 LEAST_SAMPLES = 1.5  # below so many samples a mean delay is not computed: it depends on single samples
@@ -89,9 +86,6 @@ def smallest_shift(samples: float, run_length: float) -> float:
         level = math.log(run_length * shift**2 / 2 + level + 1)
         shift = math.sqrt(2 * (math.exp(-level) + level - 1) / samples)
     return shift
-
-
-# The whole mounting --------------------------------------------------------------------------------------------------
 
 
 ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it

@@ -83,54 +83,55 @@ class NoiseSegments:
         """Means of blocks (B, c), rad/s."""
         return np.concatenate([one.means for one in self.all_segments()] or [np.zeros((1, self.channels))])
 
-    def _quietest(self) -> tuple[Array, Array]:
-        """Noise (c,) of a sample and of a block when quietest, rad/s.
-
-        The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
-        """
-        noise, block = (np.array(values) for values in list(zip(*self.all_segments(), strict=True))[-2:])
-        # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
-        for column in (*noise.T, *block.T):
-            if column.any():
-                column[column == 0.0] = np.median(column[column > 0.0])
-        quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
-        for _ in range(ROUNDS):
-            alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
-            if len(alike) <= len(quiet):
-                break
-            quiet = alike
-        return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
-
-    def quiet_noise(self) -> Array:
-        """Noise (c,) at rest, or else when quietest, rad/s; NaN: too little was recorded."""
-        if not (segments := self.all_segments()):
-            return np.full(self.channels, np.nan)
-        rests = [one.std for one, rest in zip(segments, self.at_rest(), strict=True) if rest]
-        return np.maximum(self._quietest()[0], np.median(rests, axis=0) if rests else 0.0)
-
-    def at_rest(self, largest_bias: float = LARGEST_BIAS) -> list[bool]:
-        """For each segment, whether nothing in it moves: by the monitor's own test, and as quiet as the quietest."""
-        if not (segments := self.all_segments()):
-            return []
-        noise, block = self._quietest()
+    def noise(self, largest_bias: float = LARGEST_BIAS) -> Noise:
+        """Work out the noise of all so far, of gyros with biases of so much, rad/s."""
+        segments, unknown = self.all_segments(), np.full(self.channels, np.nan)
+        if not segments:
+            return Noise(unknown, unknown, [])
+        least, block = _least_noise(segments)
         known = np.full(self.channels, largest_bias**2 / THREE_SIGMA)
-        return [
-            bool((one.noise <= QUIET * noise).all())
+        rest = [
+            bool((one.noise <= QUIET * least).all())
             and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
             for one in segments
         ]
+        still = [one.std for one, lies in zip(segments, rest, strict=True) if lies]
+        quiet = np.maximum(least, np.median(still, axis=0)) if still else least
+        moving = np.array([one.noise for one, lies in zip(segments, rest, strict=True) if not lies])
+        usual = [np.median(column[column > 0.0]) if column.any() else 0.0 for column in moving.T]
+        return Noise(quiet, np.array(usual) if len(moving) else unknown, rest)
 
-    def moving_noise(self) -> Array:
-        """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
-        noise = np.array([one.noise for one, rest in zip(self.all_segments(), self.at_rest(), strict=True) if not rest])
-        if not len(noise):
-            return np.full(self.channels, np.nan)
-        return np.array([np.median(column[column > 0.0]) if column.any() else 0.0 for column in noise.T])
 
-    def moving_share(self) -> float:
+class Noise(NamedTuple):
+    """Noise of a sample of each channel (c,), rad/s; NaN: not known."""
+
+    quiet: Array  # at rest, or else when quietest
+    moving: Array  # in motion, vibration included
+    rest: list[bool]  # whether nothing moves in a segment: by the monitor's own test, and as quiet as the quietest
+
+    @property
+    def share(self) -> float:
         """Share of the recording in motion."""
-        rest = self.at_rest()
-        return 1.0 - sum(rest) / len(rest) if rest else 0.0
+        return 1.0 - sum(self.rest) / len(self.rest) if self.rest else 0.0
+
+
+def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
+    """Noise (c,) of a sample and of a block when quietest, rad/s.
+
+    The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
+    """
+    noise, block = np.array([one.noise for one in segments]), np.array([one.block_noise for one in segments])
+    # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
+    for column in (*noise.T, *block.T):
+        if column.any():
+            column[column == 0.0] = np.median(column[column > 0.0])
+    quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
+    for _ in range(ROUNDS):
+        alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
+        if len(alike) <= len(quiet):
+            break
+        quiet = alike
+    return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
 
 
 def _segment(values: Array, first: int) -> NoiseSegment:

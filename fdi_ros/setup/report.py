@@ -48,9 +48,6 @@ NOISE_HINT = (
 BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
 
 
-# What was found -------------------------------------------------------------------------------------------------------
-
-
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
     """List everything: what the settings are from and are worth, what is not known, what to look at."""
     result, mounting, units = found.calibration, found.mounting, source_of(found.config).units
@@ -144,9 +141,6 @@ def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(Role.UNKNOWN, "topics", words, others)
 
 
-# In tables ------------------------------------------------------------------------------------------------------------
-
-
 def _mounts(found: SetupResult) -> list[Column]:
     """Figures of the mount of every unit."""
     mounts = found.mounts
@@ -195,9 +189,6 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
         "parameters": found.parameters,
         "proof": {"source": proof.source, "kept_aside": proof.apart, "seconds": proof.seconds, **tried},
     }
-
-
-# For a terminal, and as a page ----------------------------------------------------------------------------------------
 
 
 def _sections(

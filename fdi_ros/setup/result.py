@@ -150,9 +150,6 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     ]
 
 
-# What to say of it ----------------------------------------------------------------------------------------------------
-
-
 def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADIANS) -> Iterator[Finding]:
     """List what was found, what is not known, and what to look at."""
     yield from _found(result, unit)

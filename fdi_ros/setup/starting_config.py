@@ -167,11 +167,11 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
-    share = min(report.segments.moving_share() for report in chosen)
-    levels = np.concatenate([report.segments.moving_noise() for report in chosen])
+    noise = [report.segments.noise() for report in chosen]
+    share, levels = min(one.share for one in noise), np.concatenate([one.moving for one in noise])
     words = f"in motion ({share:.0%} of the recording), vibration included"
     if not (share > _MOSTLY and np.isfinite(levels).all() and (levels > 0).all()):
-        quiet = np.concatenate([report.segments.quiet_noise() for report in chosen])
+        quiet = np.concatenate([one.quiet for one in noise])
         usable = np.isfinite(quiet) & (quiet > 0)
         if not usable.any():
             return [0.0025], "a guess: the recording is too short to tell"
@@ -189,7 +189,7 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
 
 def _starts_at_rest(report: TopicReport) -> bool:
     """Whether nothing moves over the time in which biases could be learned."""
-    segments = zip(report.segments.all_segments(), report.segments.at_rest(), strict=True)
+    segments = zip(report.segments.all_segments(), report.segments.noise().rest, strict=True)
     begin = [rest for segment, rest in segments if segment.first - report.first < _REST * 1e9]
     return bool(begin) and all(begin)
 

@@ -29,7 +29,7 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     assert (first.received, first.gaps, second.received, second.gaps) == (2000, 0, 1960, 1)
     assert first.rate == pytest.approx(100)
     assert second.longest == pytest.approx(0.41, abs=1e-6)
-    np.testing.assert_allclose([one.segments.quiet_noise() for one in reports], 0.002, rtol=0.15)
+    np.testing.assert_allclose([one.segments.noise().quiet for one in reports], 0.002, rtol=0.15)
     assert first.largest == pytest.approx(1.4, abs=0.2)
 
 
@@ -92,9 +92,9 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mo
     messages = imu_messages(START + STEP * k[:, 0], z)
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     for report in reports:
-        np.testing.assert_allclose(report.segments.quiet_noise(), 0.002, rtol=0.2)
-        np.testing.assert_allclose(report.segments.moving_noise(), [0.05, 0.1, 0.05], rtol=0.1)
-        assert report.segments.moving_share() == pytest.approx(22 / 30, abs=0.04)
+        np.testing.assert_allclose(report.segments.noise().quiet, 0.002, rtol=0.2)
+        np.testing.assert_allclose(report.segments.noise().moving, [0.05, 0.1, 0.05], rtol=0.1)
+        assert report.segments.noise().share == pytest.approx(22 / 30, abs=0.04)
     assert "not finite: 1 of x" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
@@ -129,7 +129,7 @@ def test_units_that_repeat_their_values_for_a_while_keep_their_noise(second, tmp
     parameters = starting_config_of(bag, "refused").parameters
     np.testing.assert_allclose(parameters["noise.noise_std"], 0.002, rtol=0.15)
     for topic in inspect(bag)[0]:
-        moving = topic.segments.moving_noise()
+        moving = topic.segments.noise().moving
         assert np.isnan(moving).all() or set(moving) == {0.0}
     code, _, err = fdi("setup", bag, "--output", tmp_path / "found.yaml", "--quiet")
     # Where one stands as the other moves, nothing checks either.
