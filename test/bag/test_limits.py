@@ -298,8 +298,7 @@ YAML = {
 
 
 @pytest.mark.parametrize(
-    ("read", "error"),
-    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError)],
+    ("read", "error"), [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError)]
 )
 def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
     path = tmp_path / "hostile.yaml"

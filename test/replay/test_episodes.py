@@ -16,15 +16,7 @@ from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
-from fdi_ros.replay.episodes import (
-    GAP,
-    Stretches,
-    detail_words,
-    episode_words,
-    pieces,
-    size_words,
-    stretch_words,
-)
+from fdi_ros.replay.episodes import GAP, Stretches, detail_words, episode_words, pieces, size_words, stretch_words
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.size import Batches, Size
 
