@@ -68,19 +68,7 @@ def flight(rng, begins, lasts, rate):
 
 
 def vehicle(seed, kind, units=3, sample_rate=100.0):
-    """Simulate a vehicle with units on random mounts.
-
-    Parameters
-    ----------
-    seed
-        The same seed gives the same recording.
-    kind
-        One of `KINDS`.
-    units
-        2 to 4.
-    sample_rate
-        Hz.
-    """
+    """Simulate a vehicle with 2 to 4 units on random mounts, one of `KINDS`, at so many Hz; by a seed."""
     rng = np.random.default_rng([20, seed])
     # Drawn evenly: unit quaternions from four normal numbers, w first.
     turns = (np.roll(rng.standard_normal(4), -1) for _ in range(units - 1))

@@ -111,6 +111,10 @@ def test_a_packed_file_is_unpacked_as_far_as_its_size_explains(tmp_path):
     with bounded(), Recording(packed) as recording:
         assert "unpacks to more than it should" in recording.damage.lines[0]
         assert recording.topics[0].name == "/a"
+    whole = zstandard.compress(parts[0] + message(data=os.urandom(1 << 20)))
+    packed.write_bytes(whole[: len(whole) // 2] + b"\xff" * (len(whole) // 2))
+    with Recording(packed) as recording:
+        assert "cannot be unpacked to its end" in recording.damage.lines[0]
 
 
 def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):

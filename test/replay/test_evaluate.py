@@ -153,6 +153,8 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     words = "detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms."
     last = "No other channel was declared faulty by itself; under doubt with them: g4."
     assert sentences(told) == [f"bias on g1: {words}", f"bias on g6: {words}", last]
+    unjudged = summary_of(replace(told.scores, samples_judged=0))
+    assert sentences(unjudged)[-1].startswith("Of the others it cannot be told: ")
     table = fault_sections(told.scores)[0].content
     assert [row[-4:] for row in table[1]] == [("2000.0 ms", "AMBIGUOUS", "4000.0 ms", "g1, g4, g6")] * 2
     unnamed = summary_of(replace(scored(faults, *both), samples_judged=40))
