@@ -124,10 +124,8 @@ def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list
         "fdi_node": [*simulated, *(word for topic in config.topics for word in ("-r", f"{topic}:={topic}{SUFFIX}"))],
         "player_node": ["--params-file", str(CONFIG), "-p", f"bag:={BAG}", "-p", f"wait:={PATIENCE}"],
     }
-    print(
-        f"{end - begin:.0f} s of {BAG.relative_to(ROOT)} to fdi_node, ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}",
-        flush=True,
-    )
+    domain = os.environ["ROS_DOMAIN_ID"]
+    print(f"{end - begin:.0f} s of {BAG.relative_to(ROOT)} to fdi_node, ROS_DOMAIN_ID {domain}", flush=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         # One process compiles, and all find it done.

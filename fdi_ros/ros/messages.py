@@ -81,10 +81,11 @@ PERIOD = 1.0
 """s."""
 
 
-class BoundedLog:
+class BoundedLog(logging.Handler):
     """Logs so many lines a second at most, each of bounded length, and says how many were left out."""
 
     def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
         self._logger, self._clock = logger, clock
         self._since = clock()
         self._lines: Counter[str] = Counter()
@@ -124,18 +125,11 @@ class BoundedLog:
         self._left_out += not has_room
         return has_room
 
-
-class _Handler(logging.Handler):
-    def __init__(self, log: BoundedLog) -> None:
-        super().__init__()
-        self._log = log
-
     def emit(self, record: logging.LogRecord) -> None:
-        self._log.info(record.getMessage())
+        """Log what the package says; see `take_over`."""
+        self.info(record.getMessage())
 
-
-def log_through(log: BoundedLog) -> None:
-    """Send what the package logs to the log of a node, and nowhere else."""
-    package = logging.getLogger("fdi_ros")
-    package.handlers = [_Handler(log)]
-    package.propagate = False
+    def take_over(self) -> None:
+        """Take what the package logs, which then goes nowhere else."""
+        package = logging.getLogger("fdi_ros")
+        package.handlers, package.propagate = [self], False

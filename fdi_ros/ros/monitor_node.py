@@ -29,7 +29,7 @@ from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver, warm_detector
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.ros.messages import OVERRIDABLE, log_through
+from fdi_ros.ros.messages import OVERRIDABLE
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
@@ -52,7 +52,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         file, age = (self.values()[name] for name in ("state_file", "state_max_age"))
         self._state_file = StateFile(Path(file), age) if file else None
-        log_through(self.log)
+        self.log.take_over()
         self._running: Running | None = None
         self._checked_at = time.monotonic()
         """Steady time of the last check, s."""

@@ -108,12 +108,9 @@ class CheckedNode(Node):
 
     def _check_overrides(self, given: Mapping[str, Any], subscribes: Sequence[str], publishes: Sequence[str]) -> None:
         """Refuse QoS overrides that would have no effect, or would fail only when the topic is made."""
-        topics = [(topic, "subscription") for topic in subscribes] + [(topic, "publisher") for topic in publishes]
-        known = {
-            f"qos_overrides.{self.resolved(topic)}.{kind}.{policy}": choices
-            for topic, kind in topics
-            for policy, choices in _POLICIES.items()
-        }
+        topics = [f"{self.resolved(topic)}.subscription" for topic in subscribes]
+        topics += [f"{self.resolved(topic)}.publisher" for topic in publishes]
+        known = {f"qos_overrides.{topic}.{policy}": _POLICIES[policy] for topic in topics for policy in _POLICIES}
         for name in filter(lambda name: name.startswith("qos_overrides."), given):
             if name not in known:
                 raise ConfigError(f"unknown QoS override {name!r}, expected one of: {', '.join(known) or 'none'}")
@@ -139,8 +136,9 @@ class CheckedNode(Node):
 
     def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
         """Offer a service that answers every request; rclpy leaves one unanswered in which something is wrong."""
-        handlers = {SetParameters: self._on_set_parameters, SetParametersAtomically: self._on_set_parameters_atomically}
-        return super().create_service(kind, name, partial(self._answer, handlers.get(kind, callback)), **options)
+        if kind in (SetParameters, SetParametersAtomically):
+            callback = self._on_set_parameters
+        return super().create_service(kind, name, partial(self._answer, callback), **options)
 
     def _answer(self, callback: Any, request: Any, response: Any) -> Any:
         try:
@@ -150,14 +148,17 @@ class CheckedNode(Node):
             return type(response)()
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
-        for k, one in enumerate(request.parameters):
+        given, results = request.parameters, []
+        together = isinstance(request, SetParametersAtomically.Request)
+        for k, messages in enumerate([given] if together else [[one] for one in given]):
             self.keep_up()
-            response.results.append(self._set([one]) if k < MOST_PARAMETERS else _too_many(len(request.parameters)))
-        return response
-
-    def _on_set_parameters_atomically(self, request: Any, response: Any) -> Any:
-        count = len(request.parameters)
-        response.result = self._set(request.parameters) if count <= MOST_PARAMETERS else _too_many(count)
+            many = k + len(messages) > MOST_PARAMETERS
+            words = f"{len(given)} parameters in one request, expected at most {MOST_PARAMETERS}"
+            results.append(_refusal(words) if many else self._set(messages))
+        if together:
+            response.result = results[0]
+        else:
+            response.results = results
         return response
 
     def _set(self, messages: Sequence[Any]) -> SetParametersResult:
@@ -174,10 +175,6 @@ class CheckedNode(Node):
 
 def _refusal(reason: str) -> SetParametersResult:
     return SetParametersResult(successful=False, reason=reason)
-
-
-def _too_many(count: int) -> SetParametersResult:
-    return _refusal(f"{count} parameters in one request, expected at most {MOST_PARAMETERS}")
 
 
 def _checked(name: str, field: Field, value: Any) -> Any:

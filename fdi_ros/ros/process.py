@@ -103,15 +103,15 @@ def replace_executor(node: Any, executor: Any, flooded: bool) -> Any:
     executor.remove_node(node)
     # Nothing else empties its queue.
     executor.shutdown()
-    return _single_executor(node) if flooded else _events_executor(node)
+    return _executor(node, events=not flooded)
 
 
-def make_executor(node: Any, preferred: str = "events") -> Any:
-    """Choose the executor, add the node to it, and log which it is; preferred is what auto means."""
+def make_executor(node: Any, auto: str = "events") -> Any:
+    """Choose the executor, add the node to it, and log which it is; what auto means, the node says."""
     wanted = node.get_parameter("executor").value
-    if wanted == "events" or (wanted == "auto" and preferred == "events"):
+    if (auto if wanted == "auto" else wanted) == "events":
         try:
-            executor = _events_executor(node)
+            executor = _executor(node, events=True)
             executor.spin_once(timeout_sec=0.0)
             node.get_logger().info("executor: EventsExecutor")
         except (ImportError, RuntimeError) as error:
@@ -120,21 +120,15 @@ def make_executor(node: Any, preferred: str = "events") -> Any:
             node.get_logger().info(f"executor: SingleThreadedExecutor, EventsExecutor does not work here: {error}")
         else:
             return executor
-    return _single_executor(node)
+    return _executor(node, events=False)
 
 
-def _single_executor(node: Any) -> Any:
-    from rclpy.executors import SingleThreadedExecutor
-
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    return executor
-
-
-def _events_executor(node: Any) -> Any:
-    from rclpy.experimental import EventsExecutor
-
-    executor = EventsExecutor(context=node.context)
+def _executor(node: Any, events: bool) -> Any:
+    if events:
+        from rclpy.experimental import EventsExecutor as Executor
+    else:
+        from rclpy.executors import SingleThreadedExecutor as Executor
+    executor = Executor(context=node.context)
     executor.add_node(node)
     return executor
 

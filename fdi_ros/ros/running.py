@@ -49,17 +49,16 @@ SEVERITY = {
 
 
 @dataclass
-class _Reported:
-    """What the log says of a channel."""
+class _Line:
+    """The last line of the log about a channel."""
 
-    until: float = 0.0
-    """When the next line may come, s."""
-    worst: int = 0
-    """Severity of the worst state since the line before that."""
     state: ChannelState = ChannelState.UNCHECKED
-    """The present one, logged or not."""
+    until: float = 0.0
+    """When the next one may come, s."""
     left_out: int = 0
-    """Changes that were not logged."""
+    """Changes since that were not logged."""
+    present: ChannelState = ChannelState.UNCHECKED
+    """State after these."""
 
 
 class ChangeLog:
@@ -67,7 +66,7 @@ class ChangeLog:
 
     def __init__(self, log: BoundedLog, names: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
         self._log, self._names, self._clock = log, names, clock
-        self._reported = [_Reported() for _ in names]
+        self._last = [_Line() for _ in names]
 
     def add(self, events: Sequence[Event], shift: int, pair: ApartStatus | None) -> None:
         """Log the changes that one sample has brought.
@@ -78,11 +77,14 @@ class ChangeLog:
         now = self._clock()
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
-            if self._is_due(event, now):
-                words = format_reason(event, self._names)
-                words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
-                line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
-                lines.setdefault((event.after, f"{line}{words and ': '}{words}"), []).append(event.channel)
+            last = self._last[event.channel]
+            if now < last.until and SEVERITY[event.after] <= SEVERITY[last.state]:
+                last.left_out, last.present = last.left_out + 1, event.after
+                continue
+            words = format_reason(event, self._names)
+            words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
+            line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
+            lines.setdefault((event.after, f"{line}{words and ': '}{words}"), []).append(event.channel)
         for (state, words), channels in lines.items():
             self._write(state, channels, words)
 
@@ -90,26 +92,16 @@ class ChangeLog:
         """Log where the channels are now that have changed since their last line."""
         now = self._clock()
         lines: dict[ChannelState, list[int]] = {}
-        for channel, one in enumerate(self._reported):
-            if one.left_out and now >= one.until:
-                lines.setdefault(one.state, []).append(channel)
+        for channel, last in enumerate(self._last):
+            if last.left_out and now >= last.until:
+                lines.setdefault(last.present, []).append(channel)
         for state, channels in lines.items():
-            most = max(self._reported[channel].left_out for channel in channels)
+            most = max(self._last[channel].left_out for channel in channels)
             self._write(state, channels, f"{state.name} now, after {most} more change{'s' if most > 1 else ''}")
-            for channel in channels:
-                self._reported[channel] = _Reported(now + QUIET, SEVERITY[state], state)
-
-    def _is_due(self, event: Event, now: float) -> bool:
-        one, severity = self._reported[event.channel], SEVERITY[event.after]
-        one.state = event.after
-        if now < one.until and severity <= one.worst:
-            one.left_out += 1
-            return False
-        worst = severity if now >= one.until else max(one.worst, severity)
-        self._reported[event.channel] = _Reported(now + QUIET, worst, event.after)
-        return True
 
     def _write(self, state: ChannelState, channels: Sequence[int], words: str) -> None:
+        for channel in channels:
+            self._last[channel] = _Line(state, self._clock() + QUIET)
         line = f"{', '.join(self._names[channel] for channel in channels)}: {words}"
         if SEVERITY[state] >= SEVERITY[ChannelState.STALE]:
             self._log.error(line)
