@@ -14,63 +14,43 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 KINDS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
 BURST, FLOOD = 20, 2000
 """Packets sent at once."""
+NUMBERS = sorted(number for number in mavlink.mavlink_map if number >= 0)
 
 
 class Attacker:
-    """Sends packets to a port of this machine.
-
-    Parameters
-    ----------
-    port
-        UDP port of the node.
-    seed
-        Of all choices.
-    """
+    """Sends packets to a UDP port of this machine; seed: of all choices."""
 
     def __init__(self, port: int, seed: int = 0) -> None:
-        self._to = ("127.0.0.1", port)
-        self._draw = np.random.default_rng(seed)
+        self._port, self._draw = port, np.random.default_rng(seed)
         self._own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._codec = mavlink.MAVLink(None)
-        self._numbers = sorted(number for number in mavlink.mavlink_map if number >= 0)
 
     def burst(self, kind: str) -> int:
         """Send some packets of a kind; how many."""
         if kind == "strangers":
             # Each from a port of its own.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-                self._send(stranger, self._message(1))
-            return 1
-        packets = [self._packet(kind) for _ in range(BURST if kind != "flood" else FLOOD // 10)]
-        packets *= 1 if kind != "flood" else 10
-        for packet in packets:
-            self._send(self._own, packet)
-        return len(packets)
+                return self._send(stranger, [self._packet(kind)])
+        made = [self._packet(kind) for _ in range(BURST if kind != "flood" else FLOOD // 10)]
+        return self._send(self._own, made if kind != "flood" else 10 * made)
 
     def close(self) -> None:
         self._own.close()
 
-    def _send(self, source: socket.socket, packet: bytes) -> None:
-        with contextlib.suppress(OSError):
-            source.sendto(packet, self._to)
+    def _send(self, source: socket.socket, packets: list[bytes]) -> int:
+        for packet in packets:
+            with contextlib.suppress(OSError):
+                source.sendto(packet, ("127.0.0.1", self._port))
+        return len(packets)
 
     def _packet(self, kind: str) -> bytes:
-        draw = self._draw
+        """Make any message of the dialect, with any payload, of a system; or what is none."""
+        draw, codec = self._draw, self._codec
         if kind == "garbage":
             return draw.bytes(int(draw.integers(1, 400)))
-        if kind == "cut messages":
-            data = self._message(int(draw.integers(256)))
-            return data[: int(draw.integers(1, len(data)))]
-        if kind == "any message in its name":
-            return self._message(1)
-        return self._message(int(draw.integers(2, 256)))
-
-    def _message(self, system: int) -> bytes:
-        """Make any message of the dialect, with any payload, of a system."""
-        draw, codec = self._draw, self._codec
-        kind = mavlink.mavlink_map[int(draw.choice(self._numbers))]
-        payload = draw.bytes(kind.unpacker.size) if draw.random() < 0.7 else bytes(kind.unpacker.size)
-        codec.srcSystem, codec.srcComponent = system, int(draw.choice([1, 1, 1, draw.integers(256)]))
-        codec.seq = int(draw.integers(256))
-        made = mavlink.MAVLink_message(kind.id, kind.msgname)
-        return bytes(made._pack(codec, kind.crc_extra, payload))
+        message = mavlink.mavlink_map[int(draw.choice(NUMBERS))]
+        payload = draw.bytes(message.unpacker.size) if draw.random() < 0.7 else bytes(message.unpacker.size)
+        codec.srcSystem = 1 if kind in ("any message in its name", "strangers") else int(draw.integers(2, 256))
+        codec.srcComponent, codec.seq = int(draw.choice([1, 1, 1, draw.integers(256)])), int(draw.integers(256))
+        data = bytes(mavlink.MAVLink_message(message.id, message.msgname)._pack(codec, message.crc_extra, payload))
+        return data[: int(draw.integers(1, len(data)))] if kind == "cut messages" else data
