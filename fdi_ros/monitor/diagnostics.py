@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.states import ChannelState, Reason
-from fdi_ros.monitor.output import Message, Topic
+from fdi_ros.monitor.output import Topic
 from fdi_ros.sources import source_of
 from fdi_ros.system.text import plus_minus
 
@@ -455,11 +455,10 @@ def _figure(value: float) -> str:
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 
-def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> Message:
+def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> bytes:
     """Encode diagnostics, stamped at the clock time now, ns; what no header can hold is moved to its end."""
     # A simulator may say any time.
-    stamp = min(max(now, 0), LAST_STAMP)
-    out = bytearray(struct.pack("<4BiI", 0, 1, 0, 0, *divmod(stamp, 1_000_000_000)))
+    out = bytearray(struct.pack("<4BiI", 0, 1, 0, 0, *divmod(min(max(now, 0), LAST_STAMP), 1_000_000_000)))
 
     def add(content: str | int) -> None:
         data = b"" if isinstance(content, int) else content.encode() + b"\0"
@@ -475,4 +474,4 @@ def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> Message:
         add(len(line.values))
         for text in chain(*line.values):
             add(text)
-    return Message(DIAGNOSTICS, stamp, bytes(out))
+    return bytes(out)

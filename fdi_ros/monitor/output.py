@@ -240,16 +240,6 @@ OUTPUTS = (FUSED, INTEGRITY)
 """All that is said of samples, live and in an output bag."""
 
 
-class Message(NamedTuple):
-    """One message to be published or recorded."""
-
-    topic: Topic
-    stamp: int
-    """Of what it is about, ns."""
-    data: bytes
-    """Serialised."""
-
-
 class Encoder:
     """Makes messages of the output of a monitor of n channels, from the frame_id of the fused rate on."""
 
@@ -261,10 +251,10 @@ class Encoder:
         """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
         output.fill(self.templates[output], row, self.n, shift)
 
-    def encode(self, results: Output, shift: int = 0) -> Iterator[Message]:
-        """Encode what is said of samples; shift is taken off their stamps to have those of the messages, ns."""
+    def encode(self, results: Output, shift: int = 0) -> Iterator[tuple[Topic, int, bytes]]:
+        """Encode what is said of samples: topic, stamp of the sample, ns, and bytes, in which shift is taken off it."""
         for row in results.rows:
             for output, template in self.templates.items():
                 if row["valid"] or not output.needs_rate:
                     self.fill(output, row, shift)
-                    yield Message(output.topic, int(row["stamp"]), template.bytes.tobytes())
+                    yield output.topic, int(row["stamp"]), template.bytes.tobytes()

@@ -179,7 +179,7 @@ class OutputBag(Sink):
 
     def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
         lines = describe(pipeline.status(), inputs=inputs)
-        self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now).data)
+        self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now))
 
 
 def _full_name(name: str) -> str:

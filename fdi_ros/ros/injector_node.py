@@ -137,4 +137,4 @@ class InjectorNode(CheckedNode):
         level, words = (Level.WARN, self._injecting) if self._injecting else (Level.OK, "off")
         values = (("messages struck", str(self._struck)), ("malformed", str(self._malformed)))
         line = StatusLine(level, prefix_of(self) + "injector", words, self.config.hardware_id, values)
-        self._diagnostics.publish(encode_diagnostics([line], self._now()).data)
+        self._diagnostics.publish(encode_diagnostics([line], self._now()))

@@ -267,7 +267,7 @@ class AutopilotNode(CheckedNode):
         lines = self._reporter.lines(prefix_of(self), hardware, now)
         if self._failover is not None:
             lines.append(StatusLine(*self._failover.status(f"{prefix_of(self)}failover", now), hardware, ()))
-        self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
+        self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()))
 
     def destroy_node(self) -> None:
         """Close the link too."""

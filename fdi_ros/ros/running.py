@@ -290,7 +290,7 @@ class Running:
                 since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
                 warning=self._rate_check.words,
             )
-        self._diagnostics.publish(encode_diagnostics(lines, now).data)
+        self._diagnostics.publish(encode_diagnostics(lines, now))
 
     def _message_stamp(self, channel: int, since: int) -> int:
         """Return the stamp of the message, ns, that brought a channel into its state."""

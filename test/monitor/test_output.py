@@ -21,7 +21,7 @@ lines = st.builds(
 @settings(max_examples=60)
 @given(st.lists(lines, max_size=3), st.integers(0, 2**31 * 10**9 - 10**9))
 def test_diagnostics_are_the_bytes_of_rosbags(drawn: list[StatusLine], now: int) -> None:
-    data = encode_diagnostics(drawn, now).data
+    data = encode_diagnostics(drawn, now)
     message = STORE.deserialize_cdr(data, DIAGNOSTICS.type)
     assert bytes(STORE.serialize_cdr(message, DIAGNOSTICS.type)) == data
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == now
@@ -34,5 +34,5 @@ def test_diagnostics_are_the_bytes_of_rosbags(drawn: list[StatusLine], now: int)
 
 @pytest.mark.parametrize("now", [-5, 2**40 * 10**9])
 def test_a_time_that_no_header_holds_is_moved_to_its_end(now: int) -> None:
-    stamp = STORE.deserialize_cdr(encode_diagnostics([], now).data, DIAGNOSTICS.type).header.stamp
+    stamp = STORE.deserialize_cdr(encode_diagnostics([], now), DIAGNOSTICS.type).header.stamp
     assert stamp.sec == (0 if now < 0 else 2**31 - 1)

@@ -73,7 +73,7 @@ def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch
         if len(ear.integrity) > samples:
             live.append(ear.receiver.messages[ratio].tobytes())
     results = Pipeline(parallel(2)).process(block)
-    written = [said.data for said in Encoder("body", 6).encode(results) if said.topic is ratio.topic]
+    written = [data for topic, _, data in Encoder("body", 6).encode(results) if topic is ratio.topic]
     assert len(live) >= 38
     stamps = [float(stamp) for stamp in block.stamp]
     assert [ChannelsSource.parse(data, 2)[1][1] for data in written] == stamps
