@@ -104,7 +104,7 @@ class Tlog(FlightLog):
             reading = read(number, data[payload : payload + data[start + 1]])
             if reading is None or reading.unit >= MOST_UNITS:
                 continue
-            time = min(reading.time, _LATEST)
+            time = min(reading.stamp // 1000, _LATEST)
             row = (time, min(came, _LATEST), end, *reading.rate, *reading.acceleration)
             series.setdefault(Source(kind, reading.unit), array("d")).extend(row)
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))

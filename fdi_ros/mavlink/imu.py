@@ -88,21 +88,20 @@ def numbers(kind: str) -> tuple[int, ...]:
     return tuple(message.number for message in MESSAGES.values() if message.kind == kind)
 
 
-class Reading(NamedTuple):
-    """What one message says, in the body frame of REP-103: x to the front, y to the left, z up."""
+class ImuSample(NamedTuple):
+    """One sample of one IMU, in the body frame of REP-103: x to the front, y to the left, z up."""
 
-    message: ImuMessage
     unit: int
     """From 0."""
-    time: int
-    """us on the clock of the autopilot."""
+    stamp: int
+    """ns, as read on the clock of the autopilot."""
     rate: Vector
     """rad/s."""
     acceleration: Vector
     """m/s^2."""
 
 
-def read(number: int, payload: bytes) -> Reading | None:
+def read(number: int, payload: bytes) -> ImuSample | None:
     """Read the payload, as it came, of one of `MESSAGES`; None: it holds no new sample of a gyro."""
     message = MESSAGES[number]
     data = payload.ljust(message.size, b"\0")
@@ -116,7 +115,8 @@ def read(number: int, payload: bytes) -> Reading | None:
     ax, ay, az, gx, gy, gz = values
     a, g = message.acceleration, message.gyro
     unit = message.unit if message.unit_at < 0 else data[message.unit_at]
-    return Reading(message, unit, time * message.microseconds, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
+    stamp = 1000 * message.microseconds * time
+    return ImuSample(unit, stamp, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
 
 
 SCALED, RAW = 26, 27

@@ -21,7 +21,7 @@ import select
 import socket
 import stat
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.clock import NS
@@ -37,14 +37,6 @@ RETRY = NS
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN)
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
-
-
-class Received(NamedTuple):
-    """Bytes that came together."""
-
-    peer: Any
-    """From where; None: there is only one."""
-    data: bytes
 
 
 class Link(ABC):
@@ -79,9 +71,12 @@ class Link(ABC):
         """Write what there is room for, and return how much."""
         return os.write(self._handle.fileno(), data)
 
-    def receive(self, now: int) -> list[Received]:
-        """Return what has arrived, opening the link first if it is not open, and send what waits; now in ns."""
-        found: list[Received] = []
+    def receive(self, now: int) -> list[tuple[Any, bytes]]:
+        """Return what has arrived and from whom, opening the link first if it is not open; and send what waits.
+
+        The time now is in ns; where there is only one address it is None.
+        """
+        found: list[tuple[Any, bytes]] = []
         size = 0
         try:
             if self._handle is None:
@@ -92,8 +87,8 @@ class Link(ABC):
             if self.trouble and self._is_connected():
                 self.trouble, self.opened = "", self.opened + 1
             while not self.trouble and size < MOST_AT_ONCE:
-                found.append(Received(*self._read()))
-                size += len(found[-1].data)
+                found.append(self._read())
+                size += len(found[-1][1])
         except (BlockingIOError, InterruptedError):
             pass
         except OSError as error:

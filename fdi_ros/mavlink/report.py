@@ -12,7 +12,6 @@ alike are one text.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from fdi_ros.mavlink.clock import MS, NS
 from fdi_ros.mavlink.imu import MESSAGES, RESOLUTION, numbers
@@ -145,13 +144,6 @@ _FINE = ("OK", "UNCHECKED", "EXCLUDED")
 NOTHING_SEEN = "no further fault would be seen"
 
 
-class Text(NamedTuple):
-    """One STATUSTEXT."""
-
-    severity: int
-    text: str
-
-
 def _format_whole(line: StatusLine) -> str:
     """Say what of a monitor's own status is announced; empty: nothing."""
     if line.level == Level.STALE:
@@ -197,8 +189,8 @@ class Announcer:
             self._now[name] = found
             self._changed = now if self._changed is None else self._changed
 
-    def due(self, now: int) -> list[Text]:
-        """Return the texts to be sent now, ns."""
+    def due(self, now: int) -> list[tuple[int, str]]:
+        """Return the texts to be sent now, ns, each with its severity."""
         if self._heard and now - self._heard > SILENT:
             self._note(WHOLE, ("the monitor is silent", ""), now)
         self._tokens = min(AT_ONCE, self._tokens + (now - self._filled) / EVERY)
@@ -208,7 +200,7 @@ class Announcer:
         self._changed = None
         pending = [(self._text(names), names) for names in self._alike()]
         # The gravest first.
-        told = sorted(pending, key=lambda one: one[0].severity)[: int(self._tokens)]
+        told = sorted(pending, key=lambda one: one[0][0])[: int(self._tokens)]
         self._tokens -= len(told)
         self._said |= {name: self._now[name] for _, names in told for name in names}
         return [text for text, _ in told]
@@ -226,16 +218,16 @@ class Announcer:
         # What is wrong with the whole comes first of what is as grave.
         return sorted(found + [(name,) for name in left if name not in together], key=lambda names: names != (WHOLE,))
 
-    def _text(self, names: tuple[str, ...]) -> Text:
+    def _text(self, names: tuple[str, ...]) -> tuple[int, str]:
         """Return the text about channels that stand alike, or about the whole."""
         state, group = self._now[names[0]]
         if names == (WHOLE,):
-            return Text(CRITICAL, f"FDI: {state}") if state else Text(INFO, "FDI: all is judged again")
+            return (CRITICAL, f"FDI: {state}") if state else (INFO, "FDI: all is judged again")
         if state == "AMBIGUOUS":
-            return Text(CRITICAL, self._set_text(group))
+            return CRITICAL, self._set_text(group)
         severity, words = _STATES.get(state, (INFO, "in use again"))
         who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
-        return Text(severity, f"FDI: {who} {words}"[:LENGTH])
+        return severity, f"FDI: {who} {words}"[:LENGTH]
 
     def _set_text(self, group: str) -> str:
         """Text for a set of channels, their names separated by commas; of whole units those are named."""

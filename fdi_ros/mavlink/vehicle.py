@@ -16,9 +16,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
+from fdi_ros.mavlink.clock import MS, NS, BootClock, TimeSync
 from fdi_ros.mavlink.imu import (
     IMU_MESSAGES,
     MESSAGES,
@@ -26,14 +26,13 @@ from fdi_ros.mavlink.imu import (
     NO_AUTOPILOT,
     RAW,
     SCALED,
-    Reading,
-    Vector,
+    ImuSample,
     numbers,
     read,
     stands_in,
     understood,
 )
-from fdi_ros.mavlink.link import Received, Verifier, now_in_steps
+from fdi_ros.mavlink.link import Verifier, now_in_steps
 from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
 from fdi_ros.system.installation import require
 
@@ -79,18 +78,6 @@ class VehicleSettings:
     """Hz."""
     key: bytes = b""
     """For signing; empty: nothing is signed, and signatures are not looked at."""
-
-
-class ImuSample(NamedTuple):
-    """One sample of one IMU, in the body frame of REP-103."""
-
-    unit: int
-    stamp: int
-    """On the monotonic clock of this computer, ns."""
-    rate: Vector
-    """rad/s."""
-    acceleration: Vector
-    """m/s^2."""
 
 
 @dataclass
@@ -214,13 +201,13 @@ class Vehicle:
         self._parsers.clear()
         self.peer = self._behind_from = None
 
-    def feed(self, received: Received, now: int) -> list[ImuSample]:
-        """Take bytes, at the monotonic time now, ns, and return the samples in them."""
+    def feed(self, peer: Any, data: bytes, now: int) -> list[ImuSample]:
+        """Take bytes from an address, at the monotonic time now, ns, and return the samples in them, by that clock."""
         samples = []
-        for message in self._parsed(received):
+        for message in self._parsed(peer, data):
             if message.get_msgId() == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
                 self.counts["bad"] += 1
-            elif (sample := self._process(message, received.peer, now)) is not None:
+            elif (sample := self._process(message, peer, now)) is not None:
                 samples.append(sample)
         return samples
 
@@ -254,21 +241,21 @@ class Vehicle:
                 self.streams.acknowledged(message.result)
         return None
 
-    def _parsed(self, received: Received) -> list[Any]:
+    def _parsed(self, peer: Any, data: bytes) -> list[Any]:
         """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
-        parser = self._parsers.pop(received.peer, None)
+        parser = self._parsers.pop(peer, None)
         if parser is None:
             parser = self._mavlink.MAVLink(None)
             parser.robust_parsing = True
-        self._parsers[received.peer] = parser
+        self._parsers[peer] = parser
         if len(self._parsers) > _PEERS:
             # The address in use keeps its own; of the others the one that is silent the longest goes.
-            del self._parsers[next(peer for peer in self._parsers if peer != self.peer)]
+            del self._parsers[next(one for one in self._parsers if one != self.peer)]
         try:
-            messages = parser.parse_buffer(received.data) or []
+            messages = parser.parse_buffer(data) or []
         except Exception:  # pymavlink lets through what goes wrong with the bytes of others.
             self.counts["bad"] += 1
-            del self._parsers[received.peer]
+            del self._parsers[peer]
             return []
         if parser.buf_index > _LEFT:
             parser.buf, parser.buf_index = parser.buf[parser.buf_index :], 0
@@ -355,32 +342,31 @@ class Vehicle:
         return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
-        reading, message = read(number, payload), MESSAGES[number]
-        if reading is None:
+        sample, message = read(number, payload), MESSAGES[number]
+        if sample is None:
             if message.unit >= 0 and message.unit not in self.units:
                 self.magnetometers.add(message.unit)
             self.counts["without a gyro"] += 1
             return None
-        if reading.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
+        if sample.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
             self.counts["of no known unit"] += 1
             return None
         kind, self.gives_gyros = message.kind, True
         if number == SCALED:
             self._scaled_at = now
-        elif stands_in(number, self.autopilot) and reading.unit == 0 and now - self._scaled_at > STAND_IN:
+        elif stands_in(number, self.autopilot) and sample.unit == 0 and now - self._scaled_at > STAND_IN:
             # Unless it is in use itself.
             kind = kind if self.kind == kind else MESSAGES[SCALED].kind
-        if not self._chosen and not self._choose(kind, reading.unit, now):
+        if not self._chosen and not self._choose(kind, sample.unit, now):
             return None
-        return self._timed(reading, now) if kind == self.kind else None
+        return self._timed(sample, message.microseconds > 1, now) if kind == self.kind else None
 
-    def _timed(self, reading: Reading, now: int) -> ImuSample | None:
-        """Return a reading as a sample with its stamp, if it is new and its time can be."""
-        track = self.units.setdefault(reading.unit, UnitTrack())
-        self.magnetometers.discard(reading.unit)
+    def _timed(self, sample: ImuSample, milliseconds: bool, now: int) -> ImuSample | None:
+        """Return a sample with its stamp by the monotonic clock here, if it is new and its time can be."""
+        track = self.units.setdefault(sample.unit, UnitTrack())
+        self.magnetometers.discard(sample.unit)
         restarts, offset = self.clock.restarts, self.sync.offset(now)
-        about = None if offset is None else now + offset
-        time = self.clock.unwrap(reading.time * US, now, reading.message.microseconds > 1, about)
+        time = self.clock.unwrap(sample.stamp, now, milliseconds, None if offset is None else now + offset)
         if self.clock.restarts != restarts:
             self._restarted(now)
         if time is None:
@@ -400,7 +386,7 @@ class Vehicle:
             track.impossible += 1
             return None
         track.stamp = stamp
-        return ImuSample(reading.unit, stamp, reading.rate, reading.acceleration)
+        return sample._replace(stamp=stamp)
 
     def _choose(self, kind: str, unit: int, now: int) -> bool:
         """Choose the kind of messages with the most units, the finest of several; return whether that is done."""

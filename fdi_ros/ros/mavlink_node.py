@@ -30,9 +30,10 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
+from fdi_ros.mavlink.imu import ImuSample
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import Announcer, Reporter
-from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
+from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros.messages import (
@@ -188,7 +189,7 @@ class AutopilotNode(CheckedNode):
         self._due = now + _SEND_EVERY
         if self._announcer is not None and self._vehicle.in_reach:
             for text in self._announcer.due(now):
-                self._vehicle.send_text(text.severity, text.text)
+                self._vehicle.send_text(*text)
         if self._failover is not None:
             self._failover.turn(now)
         self._vehicle.tick(now)
@@ -205,9 +206,9 @@ class AutopilotNode(CheckedNode):
         if link.trouble not in ("", self._trouble):
             self.log.info(f"{link.url} is not open: {link.trouble}")
         self._trouble = link.trouble
-        for one in received:
+        for peer, data in received:
             now = time.monotonic_ns()
-            for sample in self._vehicle.feed(one, now):
+            for sample in self._vehicle.feed(peer, data, now):
                 # By the time of the system.
                 stamp = sample.stamp + self._time.ahead(now)
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:

@@ -13,8 +13,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.link import Received
-from fdi_ros.mavlink.vehicle import ImuSample, Vehicle, VehicleSettings
+from fdi_ros.mavlink.imu import ImuSample
+from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 
 UTC = 1_790_000_000
@@ -71,7 +71,7 @@ class Conversation:
 
     def inject(self, data: bytes, peer: Any = None) -> None:
         """Bytes from anybody reach us now."""
-        self.samples += [(self.now, sample) for sample in self.vehicle.feed(Received(peer, data), self.now)]
+        self.samples += [(self.now, sample) for sample in self.vehicle.feed(peer, data, self.now)]
 
     def run(self, seconds: float) -> Conversation:
         end = self.now + round(seconds * NS)

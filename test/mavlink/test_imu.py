@@ -46,7 +46,7 @@ def test_values_are_pymavlinks_in_our_units_and_axes(number: int, time: int, val
         assert reading is None
         return
     assert reading is not None
-    assert (reading.unit, reading.time) == (unit, time * (1000 if number in (26, 116, 129) else 1))
+    assert (reading.unit, reading.stamp) == (unit, 1000 * time * (1000 if number in (26, 116, 129) else 1))
     np.testing.assert_allclose(reading.rate, [g * rate[0], -g * rate[1], -g * rate[2]], atol=1e-12)
     np.testing.assert_allclose(reading.acceleration, np.array([1, -1, -1]) * a * np.array(acceleration), atol=1e-9)
 

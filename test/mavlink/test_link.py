@@ -29,7 +29,7 @@ class Clock:
         data = b""
         for _ in range(500):
             self.now += RETRY
-            data += b"".join(received.data for received in self.link.receive(self.now))
+            data += b"".join(received for _, received in self.link.receive(self.now))
             if until(data):
                 break
             self.link.wait(0.02)
@@ -52,15 +52,15 @@ def test_udp_listens_and_answers_to_where_it_came_from() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.sendto(b"hello", ("127.0.0.1", port))
         link.wait(5.0)
-        (received,) = link.receive(clock.now)
-        assert received.data == b"hello"
-        link.send(b"answer", received.peer)
+        ((peer, received),) = link.receive(clock.now)
+        assert received == b"hello"
+        link.send(b"answer", peer)
         one.settimeout(5.0)
         assert one.recv(100) == b"answer"
     # To nobody, and to one who is gone, nothing happens.
     link.send(b"x", None)
     for _ in range(5):
-        link.send(b"x", received.peer)
+        link.send(b"x", peer)
         assert link.receive(clock.now) == []
     assert not link.trouble
     # A second program on the same port is told so, and tries again.
