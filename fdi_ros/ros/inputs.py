@@ -33,10 +33,8 @@ ARRIVES = 0.1
 """A topic on which the last check but one found no message is silent, s."""
 FLOOD = 5000
 """Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
-FLOOD_END_RATE = 10_000.0
-"""Messages per second below which a flood is over: all that IMUs send."""
-FLOOD_END_TIME = 1.0
-"""Time over which they are counted, s."""
+FLOOD_TIME = 5.0
+"""So long after a flood has begun it is not looked whether it is over, s."""
 NAMED = 4
 """Publishers of one topic that are named at most."""
 
@@ -47,7 +45,7 @@ class InputQueue:
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond. But the EventsExecutor keeps an event for every message that arrives, without bound, also for those
     that were drained or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too
-    many events must be waiting, another kind of executor is to take over until the flood is over.
+    many events must be waiting, another kind of executor is to take over for some seconds.
     """
 
     def __init__(self, node: Node) -> None:
@@ -59,8 +57,8 @@ class InputQueue:
         self._node = node
         self._waiting = 0
         """Events of messages that were drained."""
-        self._count, self._since, self._full = 0, 0.0, False
-        """In a flood: messages since when, s, and whether a queue was full."""
+        self._until = 0.0
+        """Until when it counts as flooded, steady time, s."""
 
     def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> None:
         """Subscribe to the bytes of the messages of a topic."""
@@ -97,32 +95,23 @@ class InputQueue:
             heads[k] = _next(subscription) if taken < 2 * DEPTH and time.monotonic() < end else None
             taken += 1
             take(data)
-        self._count += taken
         self._waiting += taken
-        self._full |= taken >= DEPTH
         return taken
 
     def turn(self, now: float) -> None:
         """Take what waits after a turn of an executor, at the steady time now, s, and see whether it is a flood."""
         self.drain()
-        if self.flooded:
-            if now - self._since >= FLOOD_END_TIME:
-                lasts = self._full or self._count >= FLOOD_END_RATE * (now - self._since)
-                self._change(lasts, now)
-        else:
-            if self._waiting and not self.taken:
-                # The turn has used up the event of a message that was drained, or was a timer's.
-                self._waiting -= 1
-            self.taken = 0
-            if self._waiting > FLOOD:
-                self._change(True, now)
-
-    def _change(self, flooded: bool, now: float) -> None:
-        if flooded != self.flooded:
-            words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
-            self._node.get_logger().warning(words, throttle_duration_sec=10.0)
-        self.flooded, self._waiting = flooded, 0
-        self._count, self._since, self._full = 0, now, False
+        if self._waiting and not self.taken:
+            # The turn has used up the event of a message that was drained, or was a timer's.
+            self._waiting -= 1
+        self.taken = 0
+        if not self.flooded and self._waiting > FLOOD:
+            self.flooded, self._until = True, now + FLOOD_TIME
+            self._node.get_logger().warning(
+                "flooded with messages: inputs are polled while it lasts", throttle_duration_sec=10.0
+            )
+        elif self.flooded and now >= self._until:
+            self.flooded, self._waiting = False, 0
 
 
 def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:

@@ -19,7 +19,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.core.states import ChannelState
-from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, LONGEST
+from fdi_ros.ros import inputs
+from fdi_ros.ros.inputs import DEPTH, FLOOD, LONGEST
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import replace_executor
 
@@ -36,7 +37,8 @@ def flooded():
         node.destroy_node()
 
 
-def test_a_flood_is_polled_and_then_taken_by_events_again(flooded) -> None:
+def test_a_flood_is_polled_and_then_taken_by_events_again(flooded, monkeypatch) -> None:
+    monkeypatch.setattr(inputs, "FLOOD_TIME", 1.0)
     experimental = pytest.importorskip("rclpy.experimental", reason="no EventsExecutor here")
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     listener, node = flooded
@@ -71,7 +73,7 @@ def test_a_flood_is_polled_and_then_taken_by_events_again(flooded) -> None:
         assert isinstance(executor, SingleThreadedExecutor)
         got = len(node.got)
         assert wait(lambda: turn(1) or (len(node.got) > got and requests[0].done()))
-        assert wait(lambda: turn() or not node.inputs.flooded, 5 * FLOOD_END_TIME)
+        assert wait(lambda: turn() or not node.inputs.flooded)
         taken = by_event
         assert wait(lambda: turn(1) or (by_event > taken and requests[1].done()))
     finally:
