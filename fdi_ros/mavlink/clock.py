@@ -16,8 +16,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-NS, US, MS = 1_000_000_000, 1000, 1_000_000
-"""A second, a microsecond and a millisecond, ns."""
+NS, MS = 1_000_000_000, 1_000_000
+"""A second and a millisecond, ns."""
 DRIFT = 1e-4
 """Clocks drift from one another by less: 100 ppm."""
 SLEW = 1e-3

@@ -102,17 +102,16 @@ class Integrity:
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale = noise.scale_std * norm * settings.max_rate
         timing = noise.timing_std * norm * settings.max_acceleration
-        self.variance: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
-        """(n,) of the channels in the greatest motion, (rad/s)^2."""
-        self.scale = math.sqrt(float((self.variance / self._noise).max()))
-        """By how much their errors then exceed noise_std."""
+        greatest: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
+        self.scale = math.sqrt(float((greatest / self._noise).max()))
+        """By how much the errors of the channels exceed noise_std in the greatest motion."""
 
     def fill(self, subsets: NDArray[Any], *masks: int) -> None:
         """Write the levels for sets of channels, by their bits, into their records (2^n,), unless they are there."""
         n = len(self._axes)
         for mask in masks:
             if not subsets["has_level"][mask]:
-                known, subset = self._solved(flags_of(mask, n), self._noise), subsets[mask]
+                known, subset = self.of(flags_of(mask, n)), subsets[mask]
                 subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
                 subset["has_level"] = True
 
@@ -130,15 +129,11 @@ class Integrity:
         for left in (whole, *single_losses(whole)):
             self.fill(subsets, left, *single_losses(left))
 
-    def of(self, mask: Mask) -> ProtectionLevel:
-        """Level in the greatest motion when exactly the channels marked in mask (n,) are fused."""
-        return self._solved(mask, self.variance)
-
-    def _solved(self, mask: Mask, variances: Array) -> ProtectionLevel:
-        """Level for channels marked in mask (n,) with the given variances, (n,) (rad/s)^2."""
+    def of(self, mask: Mask, variances: Array | None = None) -> ProtectionLevel:
+        """Level when exactly the channels marked in mask (n,) are fused; variances (n,), (rad/s)^2, or noise_std^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
-        axes, variance = self._axes[kept], variances[kept]
+        axes, variance = self._axes[kept], (self._noise if variances is None else variances)[kept]
         nothing = ProtectionLevel(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
             return nothing

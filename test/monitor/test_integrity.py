@@ -143,8 +143,8 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
     own.fill(subsets, 63)
     level, growth = np.zeros(3), np.zeros(12)
     for ratio in (np.full(6, rng.uniform(1.0, 9.0)), rng.uniform(1.0, 9.0, 6)):
-        own.variance, growth[:6] = ratio * noise.noise_std**2, ratio
-        exact = own.of(ALL)
+        growth[:6] = ratio
+        exact = own.of(ALL, ratio * noise.noise_std**2)
         fill_level(subsets[63], 6, 63, growth, level)
         assert (level >= exact.level * (1 - 1e-9)).all()
         alike = ratio.min() == ratio.max()
