@@ -9,25 +9,15 @@ from hypothesis import strategies as st
 
 from fdi_ros.setup.smoother import NormalEquations, find_random_walk, smooth
 
-Given = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def given_evidence(rng: np.random.Generator, windows: int, n: int, m: int) -> Given:
-    rows, y = rng.standard_normal((windows, n + m + 2, n + m)), rng.standard_normal((windows, n + m + 2))
-    return (
-        np.einsum("kai,kaj->kij", rows, rows),
-        np.einsum("kai,ka->ki", rows, y),
-        rng.uniform(0.5, 2.0, windows),
-        np.concatenate([np.full(n, rng.uniform(0.5, 2.0)), rng.uniform(0.5, 2.0, m)]),
-        rng.standard_normal(n + m),
-    )
-
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 8), st.integers(1, 3), st.integers(1, 4), st.floats(0.05, 3.0))
 def test_it_solves_the_whole_system(seed: int, windows: int, n: int, m: int, walk: float) -> None:
-    normal, rights, apart, prior, start = given_evidence(np.random.default_rng(seed), windows, n, m)
-    size = windows * n + m
+    rng, size = np.random.default_rng(seed), windows * n + m
+    rows, y = rng.standard_normal((windows, n + m + 2, n + m)), rng.standard_normal((windows, n + m + 2))
+    normal, rights = np.einsum("kai,kaj->kij", rows, rows), np.einsum("kai,ka->ki", rows, y)
+    apart, start = rng.uniform(0.5, 2.0, windows), rng.standard_normal(n + m)
+    prior = np.concatenate([np.full(n, rng.uniform(0.5, 2.0)), rng.uniform(0.5, 2.0, m)])
     whole, right, constants = np.zeros((size, size)), np.zeros(size), np.arange(windows * n, size)
     for k in range(windows):
         own = np.concatenate([np.arange(k * n, k * n + n), constants])
