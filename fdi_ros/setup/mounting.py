@@ -8,7 +8,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,14 +92,12 @@ def smallest_shift(samples: float, run_length: float) -> float:
 ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it
 
 
-@dataclass(frozen=True)
-class Loss:
+class Loss(NamedTuple):
     """What is left after some channels are lost."""
 
     lost: tuple[int, ...]
     gdop: float = math.inf  # infinite where the rest does not span space
-    std: Array = field(default_factory=lambda: np.full(3, np.inf))
-    """(3,) of the rate about each body axis at rest, rad/s."""
+    std: Array = np.full(3, np.inf)  # (3,) of the rate about each body axis at rest, rad/s
     detectable: tuple[int, ...] = ()
     isolable: tuple[int, ...] = ()
 
@@ -110,8 +109,7 @@ class Mounting:
     geometry: Geometry
     noise: NoiseModel
     false_alarm_probability: float  # per sample
-    smallest: Array
-    """(n,) error of each channel that is seen in one sample with probability DETECTION, rad/s; infinite: never."""
+    smallest: Array  # (n,) error that one sample shows with probability DETECTION, rad/s; infinite: never
     waiting: dict[str, Array]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
     losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
 

@@ -264,15 +264,10 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
 
     def curves(names: Sequence[str], x: Array, y: Array, **more: object) -> list[dict[str, object]]:
         step = max(len(x) // MOST_POINTS, 1)
-        at = np.round(x[::step], 3).tolist()
-        return [
-            {
-                "type": "scatter", "mode": "lines", "name": name,
-                "x": at, "y": list(map(drawn, y[::step, i] * unit.factor)),
-                "line": {"color": colour_of(i), "width": 1.2}, **more,
-            }
-            for i, name in enumerate(names)
-        ]  # fmt: skip
+        at, look = np.round(x[::step], 3).tolist(), {"type": "scatter", "mode": "lines", **more}
+        lines = [{"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look} for i, name in enumerate(names)]
+        values = [list(map(drawn, column * unit.factor)) for column in y[::step].T]
+        return [{**line, "x": at, "y": column} for line, column in zip(lines, values, strict=True)]
 
     noise = curves(names, times, found.moment)
     noise += curves(names, times[:1], found.floor.std[None], mode="markers", showlegend=False)
