@@ -59,18 +59,13 @@ class TopicReport:
         """Take messages of so many values for gyros."""
         self.channels, self.repeats = channels, Repeats(channels)
         self.segments = NoiseSegments(channels)  # of messages in which every value can be a rate
-        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)  # (c,) values; and beyond all rates
+        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)  # (c,) values; beyond: all rates
         self.recent = np.zeros((0, channels))  # (K, c) values of the last messages, at most `RECENT`
 
     @property
     def rate(self) -> float:
         """Messages a second, usually."""
         return 1.0 / self.interval if self.interval > 0 else 0.0
-
-    @property
-    def repeated(self) -> Int:
-        """Values (c,) in long runs of exactly one value."""
-        return self.repeats.count
 
     @property
     def places(self) -> list[str]:
@@ -113,15 +108,10 @@ def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], 
         for batch in recording.batches([report.topic.name for report in reports]):
             for k in np.unique(batch.topic).tolist():
                 _update(reports[k], batch, np.flatnonzero(batch.topic == k))
-            _update_copies(reports)
+            possible = [one for one in reports if not one.copy_of and one.kind is not None and one.kind.stamped]
+            for first, second in copies_among([one.recent for one in possible]):
+                possible[second].copy_of = possible[second].copy_of or possible[first].topic.name
         return reports, recording.damage.report()
-
-
-def _update_copies(reports: Sequence[TopicReport]) -> None:
-    """Find topics that give what another one gives."""
-    possible = [one for one in reports if not one.copy_of and one.kind is not None and one.kind.stamped]
-    for first, second in copies_among([one.recent for one in possible]):
-        possible[second].copy_of = possible[second].copy_of or possible[first].topic.name
 
 
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
@@ -222,7 +212,7 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("values", of_values(lambda report: report.channels)),
         Column("not_finite", of_values(lambda report: report.not_finite)),
         Column("beyond_all_rates", of_values(lambda report: report.beyond)),
-        Column("repeated", of_values(lambda report: report.repeated)),
+        Column("repeated", of_values(lambda report: report.repeats.count)),
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
         Column("largest", of_values(lambda report: report.largest)),
@@ -258,7 +248,7 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """Say what is wrong with the values of a topic, by their places in the message."""
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words = []
-    for why, counts in (("not finite", report.not_finite), (beyond, report.beyond), ("frozen", report.repeated)):
+    for why, counts in (("not finite", report.not_finite), (beyond, report.beyond), ("frozen", report.repeats.count)):
         counted = zip(report.places, counts.tolist(), strict=True)
         words += [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"] if counts.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []

@@ -20,7 +20,7 @@ from fdi_ros.model.samples import Array
 
 WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
 NO_WALK = 1e-7  # rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
-SHOWN_GAIN = 4.0  # Log-likelihood that a walk must gain over none to be shown
+SHOWN_GAIN = 4.0  # log-likelihood that a walk must gain over none to be shown
 POSSIBLE = 2.0  # what one may lose against the best and be possible
 
 

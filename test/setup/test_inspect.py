@@ -59,7 +59,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
         rate = (0.5, 0.01 * k, 0.5) if k < 150 else (0.01 * k, 0.01 * k, 0.5)
         messages += [(TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))]
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
-    assert [report.repeated.tolist() for report in reports] == [[150, 0, 200], [0, 0, 0]]
+    assert [report.repeats.count.tolist() for report in reports] == [[150, 0, 200], [0, 0, 0]]
     text = topics_text(reports, damage)
     assert "frozen: 150 of x and 200 of z" in text
     assert "1 malformed" in text
