@@ -58,22 +58,14 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_KINDS = {
-    "bool": "bool",
-    "int": "int",
-    "float": "float",
-    "float | None": "float",
-    "str": "text",
-    "tuple[float, ...]": "numbers",
-    "tuple[str, ...]": "texts",
-}
-"""Annotations, as they are written."""
+_KINDS = {"float | None": "float", "str": "text", "tuple[float, ...]": "numbers", "tuple[str, ...]": "texts"}
+"""Kinds by annotations as they are written, where these are other words."""
 
 
 def fields_of(owner: Any) -> dict[str, Field]:
     """Fields of a dataclass that are declared with `setting`, by name."""
-    declared = (field for field in dataclasses.fields(owner) if "description" in field.metadata)
-    return {field.name: Field(_KINDS[str(field.type)], field.default, **field.metadata) for field in declared}
+    declared = [(str(field.type), field) for field in dataclasses.fields(owner) if "description" in field.metadata]
+    return {field.name: Field(_KINDS.get(kind, kind), field.default, **field.metadata) for kind, field in declared}
 
 
 def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
@@ -159,8 +151,7 @@ class ChannelsConfig:
         (),
         "name of the unit (chip, housing) that each channel belongs to and that may fail as a whole; empty: the triads"
         " of the preset, or by names with a point",
-        per="channel",
-        other_lengths=(0,),
+        **{**_PER_CHANNEL, "other_lengths": (0,)},
     )
 
 
@@ -171,13 +162,8 @@ class ImusConfig:
     topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
     names: tuple[str, ...] = setting((), "name of each triad; empty: imu_1, imu_2, ...", **_PER_TRIAD)
     mounts: tuple[float, ...] = setting(
-        (),
-        "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity",
-        "",
-        -1.001,
-        1.001,
-        each=9,
-        **_PER_TRIAD,
+        *((), "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001),
+        **{**_PER_TRIAD, "each": 9},
     )
     delays: tuple[float, ...] = setting(
         (), "delay of each triad: measured that much before its stamp; empty: none", "s", -0.1, 0.1, **_PER_TRIAD
@@ -213,13 +199,8 @@ class NoiseConfig:
         (0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0, **_PER_CHANNEL
     )
     bound: tuple[float, ...] = setting(
-        (),
-        "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std",
-        "rad/s",
-        1e-9,
-        100.0,
-        per="channel",
-        other_lengths=(0, 1),
+        *((), "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std", "rad/s", 1e-9, 100.0),
+        **{**_PER_CHANNEL, "other_lengths": (0, 1)},
     )
     bias_walk: tuple[float, ...] = setting(
         (5e-5,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0, **_PER_CHANNEL
@@ -234,7 +215,7 @@ class BiasConfig:
     """Bias subtracted before the channels are compared."""
 
     fixed: tuple[float, ...] = setting(
-        (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, per="channel", other_lengths=(0,)
+        (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, **{**_PER_CHANNEL, "other_lengths": (0,)}
     )
     turn_on_std: float = setting(
         0.02, "standard deviation of a bias from one start to the next, where it is not learned", "rad/s", 0.0, 1.0
@@ -250,45 +231,39 @@ class BiasConfig:
     )
 
 
+def _live(*about: Any, **more: Any) -> Any:
+    """Declare a field that may be changed while the node runs; parameters as of `setting`."""
+    return setting(*about, runtime=True, **more)
+
+
 @dataclass(frozen=True)
 class DetectorConfig:
     """The detector and its options; each detector takes its own."""
 
-    name: str = setting("sequential", "name of the detector", runtime=True)
-    false_alarms_per_hour: float = setting(
-        0.001, "alarms on healthy channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6, runtime=True
+    name: str = _live("sequential", "name of the detector")
+    false_alarms_per_hour: float = _live(
+        0.001, "alarms on healthy channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6
     )
-    false_alarm_probability: float = setting(
-        0.0, "alarms on healthy channels per sample; 0: use the rate per hour", "", 0.0, 0.5, runtime=True
+    false_alarm_probability: float = _live(
+        0.0, "alarms on healthy channels per sample; 0: use the rate per hour", "", 0.0, 0.5
     )
-    confidence: float = setting(
-        0.999,
-        "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out",
-        "",
-        0.5,
-        0.999999,
-        runtime=True,
+    confidence: float = _live(
+        *(0.999, "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out"),
+        *("", 0.5, 0.999999),
     )
-    tolerance: str = setting(
+    tolerance: str = _live(
         "calibrated",
         "residual searches: the paper's tolerance (8), or one derived from the false-alarm rate",
         choices=("paper", "calibrated"),
-        runtime=True,
     )
-    construction: str = setting("svd", "projector: construction", choices=("svd", "qr"), runtime=True)
-    norm: str = setting("l2", "projector: norm of the error estimate", choices=("l2", "l1"), runtime=True)
-    criterion: str = setting(
-        "determinant", "determinant: criterion", choices=("determinant", "condition_number"), runtime=True
-    )
-    max_faults: int = setting(2, "guaranteed: faulty channels at most", "", 0, 2, runtime=True)
-    threshold: float = setting(
-        10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6, runtime=True
-    )
-    shift: float = setting(
-        0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0, runtime=True
-    )
-    run_length: float = setting(
-        0.0, "sequential, cusum: samples to a false alarm; 0: the other rates", "samples", 0.0, 1e15, runtime=True
+    construction: str = _live("svd", "projector: construction", choices=("svd", "qr"))
+    norm: str = _live("l2", "projector: norm of the error estimate", choices=("l2", "l1"))
+    criterion: str = _live("determinant", "determinant: criterion", choices=("determinant", "condition_number"))
+    max_faults: int = _live(2, "guaranteed: faulty channels at most", "", 0, 2)
+    threshold: float = _live(10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6)
+    shift: float = _live(0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0)
+    run_length: float = _live(
+        0.0, "sequential, cusum: samples to a false alarm; 0: the other rates", "samples", 0.0, 1e15
     )
 
 
@@ -297,11 +272,7 @@ class HealthConfig:
     """Checks of each channel by itself."""
 
     max_rate: tuple[float, ...] = setting(
-        (34.9,),
-        "a value beyond this is out of range (saturated); one, or one per channel",
-        "rad/s",
-        1e-3,
-        1e4,
+        *((34.9,), "a value beyond this is out of range (saturated); one, or one per channel", "rad/s", 1e-3, 1e4),
         **_PER_CHANNEL,
     )
     range_recovery_time: float = setting(
@@ -350,72 +321,59 @@ class IntegrityConfig:
 # Parameters of the nodes that are no settings of the monitor ---------------------------------------------------------
 
 
+def _of_node(default: Any, description: str, low: float = -math.inf, high: float = math.inf, **about: Any) -> Field:
+    """Declare a parameter, whose type is that of its default; the rest as of `Field`."""
+    kind = "text" if isinstance(default, str) else type(default).__name__
+    return Field(kind, default, low, high, description=description, **about)
+
+
 ALL_NODES = {
-    "executor": Field(
-        "text",
-        "auto",
-        choices=("auto", "events", "single"),
-        description="executor; auto: events, or single where it does not work",
+    "executor": _of_node(
+        "auto", "executor; auto: events, or single where it does not work", choices=("auto", "events", "single")
     )
 }
 """Parameters that every node has."""
 MONITOR = {
-    "autostart": Field(
-        "bool", True, description="configure and activate at the start; false: wait for a lifecycle manager"
-    ),
-    "state_file": Field("text", "", description="file that keeps biases and declarations over a restart; empty: none"),
-    "state_max_age": Field("float", 3600.0, unit="s", description="a kept state older than this is not taken over"),
+    "autostart": _of_node(True, "configure and activate at the start; false: wait for a lifecycle manager"),
+    "state_file": _of_node("", "file that keeps biases and declarations over a restart; empty: none"),
+    "state_max_age": _of_node(3600.0, "a kept state older than this is not taken over", unit="s"),
 }
 INJECTOR = {
-    "enabled": Field("bool", False, description="inject; false: pass all on as it is", runtime=True),
-    "faults": Field(
-        "text",
+    "enabled": _of_node(False, "inject; false: pass all on as it is", runtime=True),
+    "faults": _of_node(
         "",
-        description="faults, separated by semicolons, each as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10';"
+        "faults, separated by semicolons, each as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10';"
         " times count from when the injector is switched on",
         runtime=True,
     ),
-    "scenario": Field("text", "", description="scenario file with faults, besides those in 'faults'", runtime=True),
-    "suffix": Field("text", "_faulty", description="added to the name of each input topic for that of the output"),
+    "scenario": _of_node("", "scenario file with faults, besides those in 'faults'", runtime=True),
+    "suffix": _of_node("_faulty", "added to the name of each input topic for that of the output"),
 }
 PLAYER = {
-    "bag": Field("text", "", description="rosbag2 folder, .mcap or .db3 file"),
-    "rate": Field("float", 1.0, 1e-3, 1e3, description="speed; 2.0: twice as fast as recorded"),
-    "loop": Field("bool", False, description="begin anew at the end of the recording"),
-    "clock": Field("bool", True, description="publish /clock, the time of recording"),
-    "wait": Field("float", 10.0, unit="s", description="wait at most this long for a subscriber to every topic"),
+    "bag": _of_node("", "rosbag2 folder, .mcap or .db3 file"),
+    "rate": _of_node(1.0, "speed; 2.0: twice as fast as recorded", 1e-3, 1e3),
+    "loop": _of_node(False, "begin anew at the end of the recording"),
+    "clock": _of_node(True, "publish /clock, the time of recording"),
+    "wait": _of_node(10.0, "wait at most this long for a subscriber to every topic", unit="s"),
 }
 MAVLINK = {
-    "url": Field(
-        "text",
-        "udpin:0.0.0.0:14540",
-        description="the link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD",
+    "url": _of_node(
+        "udpin:0.0.0.0:14540", "the link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
     ),
-    "system_id": Field(
-        "int", 0, 0, 255, description="system id of the autopilot; 0: the first that gives gyros, until it is lost"
-    ),
-    "component_id": Field("int", 191, 1, 255, description="own component id; 191: onboard computer"),
-    "messages": Field(
-        "text",
+    "system_id": _of_node(0, "system id of the autopilot; 0: the first that gives gyros, until it is lost", 0, 255),
+    "component_id": _of_node(191, "own component id; 191: onboard computer", 1, 255),
+    "messages": _of_node(
         "auto",
+        "messages to be used; auto: all are asked for, and those that show the most units are kept",
         choices=("auto", "highres", "raw", "scaled"),
-        description="messages to be used; auto: all are asked for, and those that show the most units are kept",
     ),
-    "rate": Field("float", 0.0, 0.0, 1e3, unit="Hz", description="rate to ask for, 1 or more; 0: sample_rate"),
-    "monitor": Field("text", "fdi_node", description="name of the monitor whose declarations are sent"),
-    "statustext": Field("bool", True, description="send declarations as STATUSTEXT"),
-    "named_values": Field(
-        "bool", False, description="send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"
-    ),
-    "signing_key": Field(
-        "text", "", description="file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"
-    ),
-    "failover": Field(
-        "text", "off", choices=("off", "ardupilot"), description="take an IMU that is declared faulty out of use"
-    ),
-    "failover_limit": Field("int", 1, 1, 3, description="at most so many IMUs are out of use by failover at a time"),
-    "failover_file": Field(
-        "text", "", description="holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"
-    ),
+    "rate": _of_node(0.0, "rate to ask for, 1 or more; 0: sample_rate", 0.0, 1e3, unit="Hz"),
+    "monitor": _of_node("fdi_node", "name of the monitor whose declarations are sent"),
+    "statustext": _of_node(True, "send declarations as STATUSTEXT"),
+    "named_values": _of_node(False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"),
+    "signing_key": _of_node("", "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"),
+    "failover": _of_node("off", "take an IMU that is declared faulty out of use", choices=("off", "ardupilot")),
+    "failover_limit": _of_node(1, "at most so many IMUs are out of use by failover at a time", 1, 3),
+    "failover_file": _of_node("", "holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"),
 }
 NODES = {"fdi_node": MONITOR, "injector_node": INJECTOR, "player_node": PLAYER, "mavlink_node": MAVLINK}
