@@ -99,7 +99,7 @@ class CsvLog(FlightLog):
                 samples = _samples(table[good], ends[used][good], columns)
             self.counts["lines"] += len(used)
             offset, rest = offset + size, b"" if final else data[size:]
-            yield Portion(samples, offset / self.end)
+            yield samples, offset / self.end
             if final:
                 break
         if bad:

@@ -30,13 +30,13 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import FlightLog
-from fdi_ros.bag.log_parts import FLU, Field, ImuSamples, Portion, Source, per_time, possible_start, row_type
+from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, per_time, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
@@ -48,29 +48,11 @@ _FMT = 128
 _FMT_SIZE = 89
 _HEAD = 3
 """Bytes of a record before its values."""
-_TYPES = {
-    "a": "S64",
-    "b": "i1",
-    "B": "u1",
-    "c": "<i2",
-    "C": "<u2",
-    "d": "<f8",
-    "e": "<i4",
-    "E": "<u4",
-    "f": "<f4",
-    "g": "<f2",
-    "h": "<i2",
-    "H": "<u2",
-    "i": "<i4",
-    "I": "<u4",
-    "L": "<i4",
-    "M": "u1",
-    "n": "S4",
-    "N": "S16",
-    "q": "<i8",
-    "Q": "<u8",
-    "Z": "S64",
-}
+_TYPES = (
+    {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
+    | {"i": "<i4", "I": "<u4", "e": "<i4", "E": "<u4", "L": "<i4", "q": "<i8", "Q": "<u8"}
+    | {"g": "<f2", "f": "<f4", "d": "<f8", "n": "S4", "N": "S16", "Z": "S64", "a": "S64"}
+)
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"
 """Types that are the number itself."""
@@ -85,37 +67,19 @@ _VALUES = {
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
-_OTHERS = {
-    "MSG": {"Message"},
-    "ERR": {"Subsys", "ECode"},
-    "FMTU": {"FmtType", "UnitIds", "MultIds"},
-    "UNIT": {"Id", "Label"},
-    "MULT": {"Id", "Mult"},
-}
+_TABLES = {"FMTU": ("FmtType", "UnitIds", "MultIds"), "UNIT": ("Id", "Label"), "MULT": ("Id", "Mult")}
+"""Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
+_OTHERS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode"), **_TABLES}
 """Columns of further messages that are read."""
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
-_SUBSYSTEMS = {
-    2: "radio",
-    3: "compass",
-    5: "radio failsafe",
-    6: "battery failsafe",
-    8: "ground station failsafe",
-    9: "fence failsafe",
-    10: "flight mode",
-    11: "GPS",
-    12: "crash check",
-    16: "EKF check",
-    17: "EKF failsafe",
-    18: "barometer",
-    25: "thrust loss",
-    29: "vibration failsafe",
-    30: "internal error",
-}
-"""Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
-_FIRMWARE = re.compile(
-    r"(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Blimp|AntennaTracker)\b.* V[0-9]", re.IGNORECASE
+_SUBSYSTEMS: dict[Any, str] = (
+    {2: "radio", 3: "compass", 5: "radio failsafe", 6: "battery failsafe", 8: "ground station failsafe"}
+    | {9: "fence failsafe", 10: "flight mode", 11: "GPS", 12: "crash check", 16: "EKF check", 17: "EKF failsafe"}
+    | {18: "barometer", 25: "thrust loss", 29: "vibration failsafe", 30: "internal error"}
 )
+"""Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
+_FIRMWARE = re.compile(r"(?i)(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Blimp|AntennaTracker)\b.* V[0-9]")
 """What a MSG record says of the vehicle, as in ``APM:Copter V3.2`` or ``ArduPlane V4.5.7``."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
@@ -173,8 +137,8 @@ class _Message(NamedTuple):
     name: str
     fields: np.dtype[np.void]
     """Columns that are read, within a whole record."""
-    columns: Mapping[str, str]
-    """Types of all columns, in their order."""
+    columns: Sequence[tuple[str, str]]
+    """Names and types of all columns, in their order."""
 
 
 class DataflashLog(FlightLog):
@@ -205,7 +169,7 @@ class DataflashLog(FlightLog):
             with np.errstate(all="ignore"):
                 samples, size, beside = self._read(data, final)
             lost += beside
-            yield Portion([one._replace(end=one.end + offset) for one in samples], (offset + size) / self.end)
+            yield [one._replace(end=one.end + offset) for one in samples], (offset + size) / self.end
             offset += size
             if final or not size:
                 break
@@ -223,10 +187,7 @@ class DataflashLog(FlightLog):
         self._messages: dict[int, _Message] = {}
         self._unknown: dict[int, str] = {}
         """Of messages of IMUs that cannot be read: why."""
-        self._units: dict[int, str] = {}
-        self._multipliers: dict[int, float] = {}
-        self._of_columns: dict[int, tuple[bytes, bytes]] = {}
-        """Units and multipliers of the columns of a message."""
+        self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _TABLES}
 
     def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:
         """Read a portion; return its samples, where its last record ends, and the bytes before that in no record."""
@@ -235,31 +196,26 @@ class DataflashLog(FlightLog):
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
-        starts = self._sorted(number, offset)
+        order = np.argsort(number.astype(np.uint8), kind="stable")
+        there, begins = np.unique(number[order], return_index=True)
+        starts = dict(zip(there.tolist(), np.split(offset[order], begins[1:]), strict=False))
+        for k, of_message in starts.items():
+            self.counts[self._names.get(k, "unknown")] += len(of_message)
+            if k in self._unknown:
+                self.unread[self._names[k]] = self._unknown[k]
         rows = {k: _rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
         # Units before the samples: in a short log both are in one portion.
-        for k, of_message in rows.items():
-            self._learn(self._messages[k].name, of_message)
+        for k, of_kind in rows.items():
+            self._learn(self._messages[k].name, of_kind)
         samples: list[ImuSamples] = []
-        for k, of_message in rows.items():
+        for k, of_kind in rows.items():
             name, kind, _ = self._messages[k]
             if (sensor := _SENSORS.fullmatch(name)) is not None:
                 source = Source(sensor[1], int(sensor[2] or 1) - 1)
-                samples += _samples(source, of_message, self._factors(k), starts[k] + kind.itemsize)
+                samples += _samples(source, of_kind, self._factors(k), starts[k] + kind.itemsize)
             elif _GPS.fullmatch(name) and self.start_utc is None:
-                self.start_utc = _start_utc(of_message)
+                self.start_utc = _start_utc(of_kind)
         return samples, int(end), int(lost)
-
-    def _sorted(self, number: Int, offset: Int) -> dict[int, Int]:
-        """Count the records of a portion, and return where those of each message begin."""
-        order = np.argsort(number.astype(np.uint8), kind="stable")
-        count = np.bincount(number, minlength=256)
-        for k in np.flatnonzero(count).tolist():
-            self.counts[self._names.get(k, "unknown")] += int(count[k])
-            if k in self._unknown:
-                self.unread[self._names[k]] = self._unknown[k]
-        parts = np.split(offset[order], np.cumsum(count)[:-1])
-        return {k: parts[k] for k in np.flatnonzero(count).tolist()}
 
     def _describe(self, content: bytes) -> None:
         """Take in a FMT record, if it is the first of its message."""
@@ -280,43 +236,34 @@ class DataflashLog(FlightLog):
 
     def _learn(self, name: str, rows: Rows) -> None:
         """Take in what records (k,) of a message say of flight, vehicle and units of columns; the first counts."""
-        if name == "UNIT":
-            for one in rows:
-                self._units.setdefault(int(one["Id"]), one["Label"].decode("ascii", "replace"))
-        elif name == "MULT":
-            for one in rows:
-                self._multipliers.setdefault(int(one["Id"]), float(one["Mult"]))
-        elif name == "FMTU":
-            for one in rows:
-                self._of_columns.setdefault(int(one["FmtType"]), (one["UnitIds"], one["MultIds"]))
-        elif name in ("MSG", "ERR"):
-            self._listen(name, rows)
-
-    def _listen(self, name: str, rows: Rows) -> None:
-        """Take in the texts and errors in records (k,)."""
+        if name in _TABLES:
+            number, *columns = (rows[column] for column in _TABLES[name])
+            for k, *told in zip(number.astype(np.int64).tolist(), *(one.tolist() for one in columns), strict=True):
+                self._told[name].setdefault(k, told)
+            return
         if name == "MSG":
             texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
             vehicles = (match[1].title() for one in texts if (match := _FIRMWARE.match(one)))
             self.vehicle = self.vehicle or next(vehicles, "")
-        else:
-            texts = [_error_text(*error) for error in zip(rows["Subsys"].tolist(), rows["ECode"].tolist(), strict=True)]
-        if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
+        elif name == "ERR":
+            texts = list(map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist()))
+        if name in _OTHERS and {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
 
     def _factors(self, number: int) -> dict[str, float]:
         """Return what values of each column are to be multiplied by, for rad, m and s."""
-        units, multipliers = self._of_columns.get(number, (b"", b""))
-        factors = {}
-        for k, (column, kind) in enumerate(self._messages[number].columns.items()):
+        units, multipliers = self._told["FMTU"].get(number, (b"", b""))
+        factors: dict[str, float] = {}
+        for k, (column, kind) in enumerate(self._messages[number].columns):
             factor = 0.01 if kind in _HUNDREDTHS else 1.0
             if k < len(multipliers) and kind not in _HUNDREDTHS:
-                said = self._multipliers.get(multipliers[k], 1.0)
+                (said,) = self._told["MULT"].get(multipliers[k], (1.0,))
                 # 0 stands for none.
                 factor *= said if math.isfinite(said) and said > 0 else 1.0
-            if k < len(units) and self._units.get(units[k], "").startswith("deg"):
+            if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[0].startswith(b"deg"):
                 factor *= math.pi / 180.0
-            factors[column] = factor
+            factors.setdefault(column, factor)
         return factors
 
 
@@ -324,24 +271,24 @@ def _error_text(subsystem: float, code: float) -> str:
     """Say what an ERR record says."""
     if subsystem == _EKF_PRIMARY:
         return f"EKF lane switched to {code:g}"
-    name = _SUBSYSTEMS.get(int(subsystem), f"subsystem {subsystem:g}")
+    name = _SUBSYSTEMS.get(subsystem, f"subsystem {subsystem:g}")
     return f"{name}: error {code:g}" if code else f"{name}: resolved"
 
 
 def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message | None, str]:
     """Return what is read of the records of a message; None: it lacks what is needed, and what that is."""
-    names = tuple(columns.split(","))
+    names = columns.split(",")
     if len(names) != len(types) or set(types) - _TYPES.keys():
         return None, "its FMT record is damaged"
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
-    needed = _OTHERS.get(name, set(rate) | ({"DelaT"} if sensor and sensor[1] == "IMT" else set()))
-    fields: dict[str, Field] = {}
+    needed = {*_OTHERS.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
+    fields: dict[str, tuple[str, int]] = {}
     at = _HEAD
     for column, kind in zip(names, types, strict=True):
         allowed = _TYPES_OF.get(column, _NUMBERS + _HUNDREDTHS * (column in (*rate, *acceleration)))
         if column in (*needed, *acceleration, *_OPTIONAL) and kind in allowed:
-            fields.setdefault(column, Field(_TYPES[kind], at))
+            fields.setdefault(column, (_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
     if at != size:
         return None, f"its records have {size} bytes, its columns {at}"
@@ -349,7 +296,9 @@ def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message |
         return None, f"it has no column {lacking[0]}"
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
         return None, "it has no column of times"
-    return _Message(name, row_type(fields, size), dict(zip(names, types, strict=True))), ""
+    formats, offsets = ([field[k] for field in fields.values()] for k in (0, 1))
+    layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
+    return _Message(name, np.dtype(layout), list(zip(names, types, strict=True))), ""
 
 
 def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int) -> list[ImuSamples]:

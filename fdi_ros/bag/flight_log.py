@@ -14,29 +14,17 @@ log whose stamps are dates (a simulation by the clock of its computer) is read a
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import (
-    FEWEST,
-    Clock,
-    Field,
-    ImuSamples,
-    LogText,
-    Portion,
-    Source,
-    Track,
-    copies_of,
-    medians,
-    row_type,
-)
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
+from fdi_ros.bag.log_parts import FEWEST, ImuSamples, LogText, Portion, Source, Track, copies_of, medians
+from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
@@ -62,11 +50,10 @@ _MOST_TEXTS = 1000
 """Texts of a log that are kept: the first ones."""
 
 
-class FlightLog(ABC):
+class FlightLog(BagFile):
     """An open log of a flight stack, read as a recording of Imu topics; each format derives from this.
 
-    ``damage`` takes what cannot be read. `BagError` if the file cannot be opened, is no such log, or has no two IMUs
-    that are logged fast enough.
+    `BagError` if it has no two IMUs that are logged fast enough.
     """
 
     stack: ClassVar[str]
@@ -91,7 +78,9 @@ class FlightLog(ABC):
     """Bytes of a log that is read whole; 0: it is read in portions, and may have any size."""
 
     def __init__(self, path: Path, damage: Damage) -> None:
-        self.path, self._damage = path, damage
+        super().__init__(path, damage, self.magic, f"is no log of {self.stack}")
+        self.end = self.size
+        """The log is read up to there, bytes."""
         self.unread: dict[str, str] = {}
         """Messages of IMUs that are there and cannot be read, by name, and why."""
         self.counts: Counter[str] = Counter()
@@ -102,8 +91,6 @@ class FlightLog(ABC):
         """UTC of the start of the autopilot, us since 1970; None: not known."""
         self.said: list[LogText] = []
         """What the autopilot said up to the place that was read, us."""
-        self.file, self.end = open_file(path, self.magic, f"is no log of {self.stack}")
-        """`end`: the log is read up to there, bytes."""
         try:
             if self.most and self.end > self.most:
                 raise BagError(
@@ -127,27 +114,21 @@ class FlightLog(ABC):
     def portions(self) -> Iterator[Portion]:
         """Read the log from its start up to `end`, in the order of the file."""
 
-    def note(self, line: str) -> None:
-        """Note what cannot be read, or what a reader must know."""
-        self._damage.add(f"{self.path.name}: {line}")
-
     def add_text(self, stamp: int, kind: str, text: str) -> None:
         """Take in what the autopilot said at a time, us."""
         if len(self.said) < _MOST_TEXTS and (line := " ".join(text.split())):
             self.said.append(LogText(stamp, kind, line))
-
-    def close(self) -> None:
-        """Close the file."""
-        self.file.close()
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics, those of a portion in the order of their stamps."""
         sources = [source for source in self._sources if _topic(source) in topics]
         if not sources:
             return
-        encoder, number = _Encoder(sources), np.array([topics.index(_topic(source)) for source in sources])
-        for portion, later in zip(self.portions(), [*self._starts[1:], NO_HORIZON], strict=False):
-            found = [self._possible(one) for one in portion.samples if one.source in sources]
+        # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
+        templates = np.stack([ImuTemplate(_topic(source).removeprefix("/")).bytes for source in sources])
+        number = np.array([topics.index(_topic(source)) for source in sources])
+        for (samples, progress), later in zip(self.portions(), [*self._starts[1:], NO_HORIZON], strict=False):
+            found = [self._possible(one) for one in samples if one.source in sources]
             if not found:
                 continue
             place = np.concatenate([np.full(len(one.stamp), sources.index(one.source)) for one in found])
@@ -157,7 +138,7 @@ class FlightLog(ABC):
             order, horizon = np.argsort(stamp, kind="stable"), self._log_time(later)
             for k in range(0, len(order), _TOGETHER):
                 rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
-                data = encoder.encode(place[rows], stamp[rows], rate[rows], acceleration[rows])
+                data = _encoded(templates[place[rows]], stamp[rows], rate[rows], acceleration[rows])
                 count, size = data.shape
                 yield Batch(
                     buffer=data.reshape(-1),
@@ -166,7 +147,7 @@ class FlightLog(ABC):
                     offset=np.arange(count) * size,
                     length=np.full(count, size),
                     horizon=min(horizon, int(stamp[rest[0]])) if len(rest) else horizon,
-                    progress=portion.progress,
+                    progress=progress,
                 )
 
     # What a first walk finds -----------------------------------------------------------------------------------------
@@ -177,14 +158,18 @@ class FlightLog(ABC):
         self._shared: Counter[tuple[Source, Source]] = Counter()
         """Samples that two sources, in order, have at the same time."""
         starts: list[int] = []
-        clocks: dict[Source, Clock] = {}
-        for portion in self.portions():
-            found = [self._possible(samples) for samples in portion.samples]
-            if self._ends_within(found, clocks):
+        for samples, _ in self.portions():
+            found = [self._possible(one) for one in samples]
+            ends = [0, *(int(track.end[-1]) for track in self._tracks.values() if len(track.end))]
+            for kind, instance in (one.source for one in found):
+                slowest = _COARSE_RATE if kind == self.coarse else self.slowest
+                self._tracks.setdefault(Source(kind, instance), Track(slowest))
+            if first := min(filter(None, [self._tracks[one.source].first_behind(one) for one in found]), default=0):
+                ends += [int(one.end[one.end < first].max(initial=0)) for one in found]
+                self._end_at(max(end for end in ends if end < first))
                 return False
-            for samples in found:
-                slowest = _COARSE_RATE if samples.source.kind == self.coarse else self.slowest
-                self._tracks.setdefault(samples.source, Track(slowest)).add(samples.stamp)
+            for one in found:
+                self._tracks[one.source].add(one.stamp)
             others = [one for one in found if self.counted_by not in ("", one.source.kind)]
             for one, other in combinations(sorted(others, key=lambda one: one.source)[:_MOST_COMPARED], 2):
                 if one.source != other.source:
@@ -194,21 +179,13 @@ class FlightLog(ABC):
         """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
         return True
 
-    def _ends_within(self, found: Sequence[ImuSamples], clocks: dict[Source, Clock]) -> bool:
-        """Leave out what lies behind the place in the file where the time of a source steps back in a portion."""
-        ends = [0, *(int(clock.end[-1]) for clock in clocks.values() if len(clock.end))]
-        behind = [clocks.setdefault(samples.source, Clock()).first_behind(samples) for samples in found]
-        first = min(filter(None, behind), default=0)
-        if not first:
-            return False
-        ends += [int(one.end[one.end < first].max(initial=0)) for one in found]
-        step, size = max(end for end in ends if end < first), self.end
+    def _end_at(self, step: int) -> None:
+        """Leave out what lies behind a place in the file."""
         self.note(
-            f"the time steps back at byte {step}, as where a second log begins in the file: "
-            f"the {size - step} bytes behind it ({100 * (size - step) / size:.3g} % of the file) were left out"
+            f"the time steps back at byte {step}, as where a second log begins in the file: the {self.end - step}"
+            f" bytes behind it ({100 * (self.end - step) / self.end:.3g} % of the file) were left out"
         )
         self.end = step
-        return True
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
@@ -304,31 +281,20 @@ def _topic(source: Source) -> str:
     return f"/imu_{source.instance}"
 
 
-class _Encoder:
-    """Makes serialised sensor_msgs/msg/Imu messages of some sources in bulk."""
-
-    def __init__(self, sources: Sequence[Source]) -> None:
-        # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
-        templates = [ImuTemplate(_topic(source).removeprefix("/")) for source in sources]
-        self._templates = np.stack([template.bytes for template in templates])
-        rate = templates[0].at
-        acceleration = rate + 8 * (3 + 9)
-        fields = {
-            "sec": Field("<i4", 4),
-            "nanosec": Field("<u4", 8),
-            "rate": Field("<f8", rate, 3),
-            "acceleration": Field("<f8", acceleration, 3),
-            "absent": Field("<f8", acceleration + 8 * 3),
-        }
-        self._fields = row_type(fields, self._templates.shape[1])
-
-    def encode(self, place: Int, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
-        """Return k messages, (k, size), of sources (k,); stamp in ns, rate and acceleration (k, 3) in FLU."""
-        data = self._templates[place]
-        fields = data.view(self._fields)[:, 0]
-        fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
-        fields["rate"] = rate
-        fields["acceleration"] = np.where(np.isnan(acceleration), 0.0, acceleration)
-        # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
-        fields["absent"] = -1.0 * np.isnan(acceleration).any(axis=1)
-        return data
+def _encoded(data: Bytes, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
+    """Fill in k messages of sensor_msgs/msg/Imu (k, size); stamp in ns, rate and acceleration (k, 3) in FLU."""
+    at = ImuTemplate("imu_0").at
+    layout: Any = {
+        "names": ("sec", "nanosec", "rate", "acceleration", "absent"),
+        "formats": ("<i4", "<u4", ("<f8", 3), ("<f8", 3), "<f8"),
+        # Behind rate and acceleration stand their covariances.
+        "offsets": (4, 8, at, at + 8 * 12, at + 8 * 15),
+        "itemsize": data.shape[1],
+    }
+    fields = data.view(np.dtype(layout))[:, 0]
+    fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
+    fields["rate"] = rate
+    fields["acceleration"] = np.where(np.isnan(acceleration), 0.0, acceleration)
+    # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
+    fields["absent"] = -1.0 * np.isnan(acceleration).any(axis=1)
+    return data

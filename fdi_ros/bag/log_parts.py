@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples of flight logs: where they come from, how often and when they were logged, records by field."""
+"""Samples of flight logs: where they come from, how often and when they were logged."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -66,17 +66,17 @@ class LogText(NamedTuple):
     text: str
 
 
-class Portion(NamedTuple):
-    """What one portion of a log holds."""
+Portion = tuple[list[ImuSamples], float]
+"""Samples in one portion of a log, and the share of the log that is read up to its end, 0 to 1."""
 
-    samples: list[ImuSamples]
-    progress: float
-    """Share of the log read up to its end, 0 to 1."""
+
+def _nothing() -> Int:
+    return np.zeros(0, dtype=np.int64)
 
 
 @dataclass
 class Track:
-    """What was seen of one source."""
+    """What was seen of one source: how fast it is logged, and where its time steps back for good."""
 
     slowest: float
     """Samples per second that it must be logged at."""
@@ -88,6 +88,12 @@ class Track:
     first: int = 0
     last: int = 0
     """Stamps of the first and the last, us."""
+    come: int | None = None
+    """Stamp up to which the log has come, us; None: at its start."""
+    stamp: Int = field(default_factory=_nothing)
+    """Of the last samples, us."""
+    end: Int = field(default_factory=_nothing)
+    """Where the records of these end, bytes."""
 
     def add(self, stamp: Int) -> None:
         """Take in the stamps (k,) of further samples."""
@@ -101,20 +107,28 @@ class Track:
         self.last = int(stamp[-1])
         self.count += len(stamp)
 
+    def first_behind(self, samples: ImuSamples) -> int:
+        """Return where the record of the first sample behind a step of time ends, bytes; 0: there is none.
+
+        There a second log begins in the file.
+        """
+        stamp, end = np.append(self.stamp, samples.stamp), np.append(self.end, samples.end)
+        self.stamp, self.end = stamp[1 - _BESIDE :], end[1 - _BESIDE :]
+        if not len(stamp):
+            return 0
+        steady = bool((np.abs(np.diff(stamp)) <= _MAX_STEP_BACK).all())
+        come = stamp if steady else medians(stamp, _BESIDE)
+        first = int(come[0]) if self.come is None else self.come
+        before = np.maximum.accumulate(np.append(first, come[:-1]))
+        self.come = max(first, int(come.max()))
+        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+        behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
+        return int(end[np.argmax(behind)]) if behind.any() else 0
+
     @property
     def steady(self) -> bool:
         """Whether most samples follow one another without gaps."""
         return 2 * self.fast > self.count
-
-    @property
-    def usable(self) -> bool:
-        """Whether it is mostly logged fast enough; gaps do not count against it."""
-        return self.count >= FEWEST and self.fast_enough
-
-    @property
-    def fast_enough(self) -> bool:
-        """Whether it is logged fast enough, as far as its samples tell."""
-        return (self.steady or self.count < FEWEST) and self.rate >= _TOLERANCE * self.slowest
 
     @property
     def rate(self) -> float:
@@ -124,41 +138,23 @@ class Track:
         return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
 
     @property
+    def fast_enough(self) -> bool:
+        """Whether its rate can be judged and is high enough, in bursts at least."""
+        return self.count >= FEWEST and self.rate >= _TOLERANCE * self.slowest
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return self.fast_enough and self.steady
+
+    @property
     def figures(self) -> str:
         """Words for how fast it is logged."""
         if self.count < 2:
             return "once"
         if self.last <= self.first:
             return "at times that do not advance"
-        bursts = " in bursts" if not self.fast_enough and self.rate >= _TOLERANCE * self.slowest else ""
-        return f"at {self.rate:.3g} Hz{bursts}"
-
-
-@dataclass
-class Clock:
-    """Follows the time of one source to find where it steps back for good: there a second log begins in the file."""
-
-    latest: int | None = None
-    """Stamp up to which the log has come, us; None: at its start."""
-    stamp: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Of the last samples, us."""
-    end: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Where the records of these end, bytes."""
-
-    def first_behind(self, samples: ImuSamples) -> int:
-        """Take in samples; return where the record of the first one behind a step ends, bytes; 0: there is none."""
-        stamp, end = np.append(self.stamp, samples.stamp), np.append(self.end, samples.end)
-        self.stamp, self.end = stamp[1 - _BESIDE :], end[1 - _BESIDE :]
-        if not len(stamp):
-            return 0
-        steady = bool((np.abs(np.diff(stamp)) <= _MAX_STEP_BACK).all())
-        come = stamp if steady else medians(stamp, _BESIDE)
-        first = int(come[0]) if self.latest is None else self.latest
-        before = np.maximum.accumulate(np.append(first, come[:-1]))
-        self.latest = max(first, int(come.max()))
-        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
-        behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
-        return int(end[np.argmax(behind)]) if behind.any() else 0
+        return f"at {self.rate:.3g} Hz{' in bursts' if self.fast_enough and not self.steady else ''}"
 
 
 def medians(stamp: Int, window: int) -> Int:
@@ -194,31 +190,14 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 
 
-class Field(NamedTuple):
-    """Where a value lies in a record."""
+def parts(sizes: Sequence[int], together: int) -> Iterator[tuple[list[slice], float]]:
+    """Yield which rows of each of several tables, read whole, come together, and the share that then was read.
 
-    kind: str
-    """Name of its NumPy type."""
-    offset: int
-    """Bytes."""
-    length: int = 0
-    """Of an array of such values; 0: a single one."""
-
-
-def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
-    """Return the NumPy type of a record of so many bytes, of which these fields are read."""
-    layout: Any = {
-        "names": list(fields),
-        "formats": [(field.kind, (field.length,) if field.length else ()) for field in fields.values()],
-        "offsets": [field.offset for field in fields.values()],
-        "itemsize": size,
-    }
-    return np.dtype(layout)
-
-
-def part(size: int, k: int, count: int) -> slice:
-    """Return part k of so many equal ones of a log that was read whole."""
-    return slice(size * k // count, size * (k + 1) // count)
+    The largest hands on about so many at once.
+    """
+    count = max(sizes, default=0) // together + 1
+    for k in range(count):
+        yield [slice(size * k // count, size * (k + 1) // count) for size in sizes], (k + 1) / count
 
 
 def per_time(change: Array, seconds: NDArray[Any]) -> Array:

@@ -15,9 +15,9 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -26,7 +26,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, Schema, Statistics
 
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
+from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.model.samples import Bytes, Int
@@ -74,23 +74,23 @@ def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, byt
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     # How many there are is counted first.
-    k, described, _ = find_records(buffer, outside, np.empty((4, 0), np.int64), np.empty((0, 3), np.int64))
-    messages, topics = np.empty((4, k), np.int64), np.empty((described, 3), np.int64)
-    _, _, end = find_records(buffer, outside, messages, topics)
-    contents = [(opcode, data[start:stop]) for opcode, start, stop in topics.tolist()]
-    channel, log_time, offset, length = messages
+    count, _ = find_records(buffer, outside, np.empty((5, 0), np.int64))
+    found = np.empty((5, count), np.int64)
+    _, end = find_records(buffer, outside, found)
+    sent = found[0] == MESSAGE
+    contents = [(kind, data[at : at + size]) for kind, _, _, at, size in found[:, ~sent].T.tolist()]
+    _, channel, log_time, offset, length = found if sent.all() else found[:, sent]
     return Batch(buffer, channel, log_time, offset, length, NO_HORIZON, 1.0), contents, int(end)
 
 
 @compiled
-def find_records(data: Bytes, outside: bool, messages: Int, topics: Int) -> tuple[int, int, int]:
-    """Find the records in a run of bytes as `walk` does; those beyond the room that is there are only counted.
+def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
+    """Find the messages, schemas and channels in a run of bytes as `walk` does; return their number, and where it ends.
 
-    ``messages`` (4, room) takes channel, log time, offset and length of each message, as in `Batch`; ``topics`` (room,
-    3) opcode, first byte and end of the content of each schema and channel record. Returned are their numbers, and
-    where the walk ended.
+    ``found`` (5, room) takes of each opcode, channel and log time (of a message), offset and length; those beyond the
+    room that is there are only counted.
     """
-    found = described = position = 0
+    count = position = 0
     while position + _PREFIX <= len(data):
         opcode, length = data[position], read_bits(data, position + 1, 8, True)
         start = position + _PREFIX
@@ -99,19 +99,16 @@ def find_records(data: Bytes, outside: bool, messages: Int, topics: Int) -> tupl
             break
         if outside and opcode in (CHUNK, STATISTICS, FOOTER):
             break
-        if opcode == MESSAGE and length >= _HEAD:
-            if found < messages.shape[1]:
-                messages[0, found] = read_bits(data, start, 2, True)
-                messages[1, found] = read_bits(data, start + 6, 8, True)
-                messages[2, found] = start + _HEAD
-                messages[3, found] = length - _HEAD
-            found += 1
-        elif opcode in (SCHEMA, CHANNEL):
-            if described < len(topics):
-                topics[described, 0], topics[described, 1], topics[described, 2] = opcode, start, start + length
-            described += 1
+        head = _HEAD if opcode == MESSAGE else 0
+        if length >= head and opcode in (MESSAGE, SCHEMA, CHANNEL):
+            if count < found.shape[1]:
+                found[0, count], found[3, count], found[4, count] = opcode, start + head, length - head
+                if head:
+                    found[1, count] = read_bits(data, start, 2, True)
+                    found[2, count] = read_bits(data, start + 6, 8, True)
+            count += 1
         position = start + length
-    return found, described, position
+    return count, position
 
 
 T = TypeVar("T")
@@ -125,8 +122,7 @@ _TOGETHER = 1 << 16
 """Pieces are handed on together until they hold so many bytes: each batch has its cost."""
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """A chunk, or a run of messages outside chunks: what is read at once."""
 
     start_time: int
@@ -136,99 +132,61 @@ class Piece:
     """Bytes in the file."""
     raw_size: int
     """Bytes when decompressed."""
-    crc: int
-    compression: str
-    cut: bool
+    crc: int = 0
+    compression: str = ""
+    cut: bool = False
     """The file ends within it."""
 
 
-class McapFile:
-    """An open MCAP file, whose chunks may unpack to ``most`` bytes; ``damage`` takes what cannot be read.
-
-    `BagError` if the file cannot be opened, is empty, or is no MCAP file.
-    """
+class McapFile(BagFile):
+    """An open MCAP file, whose chunks may unpack to ``most`` bytes."""
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
-        self.path = path
-        self.damage = damage
-        self._most = most
+        super().__init__(path, damage, MAGIC, "is not an MCAP file")
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {}
         self._counts: dict[int, int] = {}
-        self._pieces: list[Piece] = []
-        self._ends: Int | None = None
-        self._file, self.size = open_file(path, MAGIC, "is not an MCAP file")
+        self._found: list[Piece] = []
         self._scan()
-        self._pieces.sort(key=lambda piece: piece.start_time)
+        self._found.sort(key=lambda piece: piece.start_time)
+        self.start_time = self._found[0].start_time if self._found else NO_HORIZON
+        ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._found])
+        self._pieces = self._found[: np.searchsorted(ends, most, side="right")]
+        """In the order of time, those that unpack to no more than they may."""
+        if len(self._pieces) < len(self._found):
+            self.note(f"it unpacks to more than {most} bytes: read up to there")
         if not self._counts or not self._counts.keys() <= self._channels.keys():
-            self._count()
+            # Without a summary everything is read once: the topics stand inside the chunks alone.
+            counts: Counter[int] = Counter()
+            for piece in self._pieces:
+                numbers, found = np.unique(self._messages(piece).topic, return_counts=True)
+                counts.update(dict(zip(numbers.tolist(), found.tolist(), strict=True)))
+            self._counts = dict(counts)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """The topics of the file; one that several publishers wrote comes several times."""
-        topics = []
-        for number, channel in self._channels.items():
-            kind = self._schemas.get(channel.schema_id, "")
-            topics.append(Topic(channel.topic, kind, channel.message_encoding, self._counts.get(number, 0)))
-        return tuple(topics)
-
-    @property
-    def start_time(self) -> int:
-        """Time of recording of the first message, ns; of a file without messages the latest there is."""
-        return self._pieces[0].start_time if self._pieces else NO_HORIZON
+        self.topics = tuple(
+            Topic(one.topic, self._schemas.get(one.schema_id, ""), one.message_encoding, self._counts.get(number, 0))
+            for number, one in self._channels.items()
+        )
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        place = {name: k for k, name in enumerate(topics)}
-        read, whole, known = 0, sum(piece.size for piece in self._pieces), -1
+        read, whole, held, known = 0, sum(piece.size for piece in self._pieces), 0, -1
         waiting: list[Batch] = []
-        held = 0
-        for k, piece in enumerate(self._pieces):
-            if not self._may_read(k):
-                break
+        following = [*(piece.start_time for piece in self._pieces[1:]), NO_HORIZON]
+        for k, (piece, horizon) in enumerate(zip(self._pieces, following, strict=False), 1):
             read += piece.size
             waiting.append(self._messages(piece))
             held += len(waiting[-1].buffer)
-            last = k + 1 == len(self._pieces) or not self._may_read(k + 1)
-            if held < _TOGETHER and not last:
+            if held < _TOGETHER and k < len(self._pieces):
                 continue
             found, waiting, held = Batch.joined(waiting), [], 0
             if len(self._channels) != known:
                 # Reading describes channels as it goes on.
-                known, number = len(self._channels), self._numbers(place)
-            horizon = self._pieces[k + 1].start_time if not last else NO_HORIZON
+                known, number = len(self._channels), np.full(1 << 16, -1)
+                for channel in self._channels.values():
+                    number[channel.id] = topics.index(channel.topic) if channel.topic in topics else -1
             batch = replace(found, topic=number[found.topic], horizon=horizon, progress=read / whole)
             yield batch if (batch.topic >= 0).all() else batch.at(batch.topic >= 0)
-
-    def _may_read(self, k: int) -> bool:
-        """Whether all up to piece k unpacks to no more than it may."""
-        if self._ends is None:
-            self._ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._pieces])
-        if self._ends[k] <= self._most:
-            return True
-        self.damage.add(f"{self.path.name} unpacks to more than {self._most} bytes: read up to there")
-        return False
-
-    def _numbers(self, place: dict[str, int]) -> Int:
-        """Index into topics of every channel number there can be, (2^16,); -1: none of them."""
-        number = np.full(1 << 16, -1)
-        for channel in self._channels.values():
-            number[channel.id] = place.get(channel.topic, -1)
-        return number
-
-    def _count(self) -> None:
-        """Read everything once: without a summary, the topics stand inside the chunks alone."""
-        counts: Counter[int] = Counter()
-        for k, piece in enumerate(self._pieces):
-            if not self._may_read(k):
-                break
-            numbers, found = np.unique(self._messages(piece).topic, return_counts=True)
-            counts.update(dict(zip(numbers.tolist(), found.tolist(), strict=True)))
-        self._counts = dict(counts)
 
     def _scan(self) -> None:
         position, left = len(MAGIC), RECORDS + self.size // RECORD_BYTES
@@ -240,35 +198,25 @@ class McapFile:
             if opcode == FOOTER:
                 # Bytes of damage may look like a footer: what is behind it is not left out without a word.
                 if end + len(MAGIC) != self.size:
-                    self.damage.add(
-                        f"{self.path.name} has a footer at byte {position} of {self.size}: read up to there"
-                    )
+                    self.note(f"it has a footer at byte {position} of {self.size}: read up to there")
                 return
             if left < 0:
-                self.damage.add(f"{self.path.name} has more records than its size explains: read up to byte {position}")
+                self.note(f"it has more records than its size explains: read up to byte {position}")
                 return
             if end > self.size:
-                self.damage.add(
-                    f"{self.path.name} breaks off in the record at byte {position} of {self.size}: read up to there"
-                )
-            position = self._scan_record(opcode, position, end)
+                self.note(f"it breaks off in the record at byte {position} of {self.size}: read up to there")
+            start = position + _RECORD.size
+            if opcode == CHUNK:
+                self._scan_chunk(start, end)
+            elif opcode == MESSAGE and end <= self.size:
+                end = self._scan_run(position, end)
+            elif opcode in (SCHEMA, CHANNEL, STATISTICS) and end <= self.size:
+                # One that is too long is noted as damaged by its length.
+                self._describe(opcode, self._read(start, min(length, DESCRIPTION_BYTES + 1)))
             if end > self.size:
                 return
-        self.damage.add(f"{self.path.name} has no footer: the recording was cut off, all there is was read")
-
-    def _scan_record(self, opcode: int, position: int, end: int) -> int:
-        """Take in one record, or the messages that begin with it; return where they end."""
-        start = position + _RECORD.size
-        if opcode == CHUNK:
-            self._scan_chunk(start, end)
-        elif end > self.size:
-            return end
-        elif opcode == MESSAGE:
-            return self._scan_run(position, end)
-        elif opcode in (SCHEMA, CHANNEL, STATISTICS):
-            # One that is too long is noted as damaged by its length.
-            self._note(opcode, self._read(start, min(end - start, DESCRIPTION_BYTES + 1)))
-        return end
+            position = end
+        self.note("it has no footer: the recording was cut off, all there is was read")
 
     def _scan_chunk(self, offset: int, end: int) -> None:
         head = self._read(offset, _CHUNK.size + 16)
@@ -278,14 +226,14 @@ class McapFile:
             data = offset + _CHUNK.size + length + 8
             if length <= 16 and data <= min(end, self.size) and start_time < NO_HORIZON:
                 size = min(end, self.size) - data
-                self._pieces.append(Piece(start_time, data, size, raw_size, crc, compression, end > self.size))
+                self._found.append(Piece(start_time, data, size, raw_size, crc, compression, end > self.size))
                 return
-        self.damage.add(f"{self.path.name}: the chunk at byte {offset} has a damaged header and was left out")
+        self.note(f"the chunk at byte {offset} has a damaged header and was left out")
 
     def _scan_run(self, position: int, end: int) -> int:
         """Note the run of messages outside chunks whose first one stands here; return where the run ends."""
         if end - position > CHUNK_BYTES:
-            self.damage.add(f"{self.path.name}: the message at byte {position} is too long and was left out")
+            self.note(f"the message at byte {position} is too long and was left out")
             return end
         for size in (_FIRST, _RUN):
             data = self._read(position, max(size, end - position))
@@ -294,36 +242,31 @@ class McapFile:
             if position + len(data) == self.size or data[stop : stop + 1] in _STOPS:
                 break
         if len(found):
-            start_time = max(0, int(found.log_time.min()))
-            self._pieces.append(Piece(start_time, position, stop, stop, 0, "", False))
+            self._found.append(Piece(max(0, int(found.log_time.min())), position, stop, stop))
         for opcode, content in topics:
-            self._note(opcode, content)
+            self._describe(opcode, content)
         return position + max(stop, 1)
 
     def _read(self, position: int, size: int) -> bytes:
-        self._file.seek(position)
-        return self._file.read(size)
+        self.file.seek(position)
+        return self.file.read(size)
 
     def _messages(self, piece: Piece) -> Batch:
         """Read a piece, topics as numbers of channels; what is wrong is noted, what cannot be read left out."""
         stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
         data, wrong = decompress(stored, piece.compression, piece.raw_size, piece.crc, piece.cut)
         found, topics, end = walk(data)
-        if wrong:
-            self.damage.add(f"{self.path.name}: the chunk at byte {piece.offset} {wrong}")
-        elif end < len(data):
-            self.damage.add(
-                f"{self.path.name}: the chunk at byte {piece.offset} is damaged after byte {end} of {len(data)}"
-            )
+        if wrong or end < len(data):
+            self.note(f"the chunk at byte {piece.offset} {wrong or f'is damaged after byte {end} of {len(data)}'}")
         for opcode, content in topics:
-            self._note(opcode, content)
+            self._describe(opcode, content)
         return found
 
-    def _note(self, opcode: int, content: bytes) -> None:
+    def _describe(self, opcode: int, content: bytes) -> None:
         """Take in a description of a topic; the first of each number counts."""
         what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(opcode, "summary")
         if len(content) > DESCRIPTION_BYTES:
-            self.damage.add(f"{self.path.name}: a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out")
+            self.note(f"a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out")
             return
         stream = ReadDataStream(io.BytesIO(content))
         try:
@@ -336,15 +279,15 @@ class McapFile:
             else:
                 self._counts = dict(Statistics.read(stream).channel_message_counts)
         except (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError):
-            self.damage.add(f"{self.path.name}: a {what} is damaged and was left out")
+            self.note(f"a {what} is damaged and was left out")
 
     def _keep(self, known: dict[int, T], number: int, what: T, name: str) -> None:
         """Keep a description, if it is the first of its number and within the limits."""
         if number in known:
             return
         if len(name) > NAME:
-            self.damage.add(f"{self.path.name}: the name {name[:NAME]!r} is longer than {NAME} and was left out")
+            self.note(f"the name {name[:NAME]!r} is longer than {NAME} and was left out")
         elif len(known) == CHANNELS:
-            self.damage.add(f"{self.path.name} describes more than {CHANNELS} topics: the others were left out")
+            self.note(f"it describes more than {CHANNELS} topics: the others were left out")
         else:
             known[number] = what

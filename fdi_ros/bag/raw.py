@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from fdi_ros.system.yaml_file import read_yaml
 
 MOST_SHOWN = 400
 """Characters of what is said of one place."""
+_COLUMNS = ("topic", "log_time", "offset", "length")
 NO_HORIZON = 2**63 - 1
 """Horizon of the last batch: nothing comes after it."""
 
@@ -63,28 +65,20 @@ class Batch:
 
     def at(self, rows: NDArray[np.bool_]) -> Batch:
         """Return some of the messages; rows (k,) says which."""
-        return replace(
-            self,
-            topic=self.topic[rows],
-            log_time=self.log_time[rows],
-            offset=self.offset[rows],
-            length=self.length[rows],
-        )
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        return replace(self, **columns)
 
     @classmethod
     def joined(cls, parts: Sequence[Batch]) -> Batch:
         """Return the messages of several batches, with horizon and progress of the last."""
         if len(parts) == 1:
             return parts[0]
-        ends = np.cumsum([len(part.buffer) for part in parts]).tolist()
-        return replace(
-            parts[-1],
-            buffer=np.concatenate([part.buffer for part in parts]),
-            topic=np.concatenate([part.topic for part in parts]),
-            log_time=np.concatenate([part.log_time for part in parts]),
-            offset=np.concatenate([p.offset + end - len(p.buffer) for p, end in zip(parts, ends, strict=True)]),
-            length=np.concatenate([part.length for part in parts]),
-        )
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in ("buffer", *_COLUMNS)
+        }
+        sizes = [len(part.buffer) for part in parts]
+        columns["offset"] += np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
+        return replace(parts[-1], **columns)
 
     @classmethod
     def of_messages(cls, topics: Sequence[int], times: Sequence[int], data: Sequence[bytes], progress: float) -> Batch:
@@ -104,22 +98,6 @@ class Batch:
         """Return the bytes of message k."""
         start = int(self.offset[k])
         return self.buffer[start : start + int(self.length[k])].tobytes()
-
-
-def open_file(path: Path, magic: bytes, refusal: str) -> tuple[BinaryIO, int]:
-    """Open a file that begins with some bytes, and read these; return it with its size, bytes.
-
-    `BagError` if it cannot be opened, is empty, or begins otherwise, for which the refusal is said.
-    """
-    try:
-        file = open_regular(path)
-    except OSError as error:
-        raise BagError(f"cannot open {path}: {error.strerror}") from error
-    begin = file.read(len(magic))
-    if begin != magic:
-        file.close()
-        raise BagError(f"{path} {refusal}: it starts with {begin!r}" if begin else f"{path} is empty")
-    return file, os.fstat(file.fileno()).st_size
 
 
 @dataclass
@@ -150,12 +128,58 @@ class Damage:
         return (*self.lines, *([f"{self.more} more places"] if self.more else []))
 
 
+class BagFile(ABC):
+    """One open file of a recording; ``damage`` takes what of it cannot be read.
+
+    `BagError` if it cannot be opened, is empty, or does not begin with ``magic``, for which the refusal is said.
+    """
+
+    topics: tuple[Topic, ...]
+    """One that several publishers wrote may come several times."""
+    start_time: int
+    """Time of recording of the first message, ns; without messages `NO_HORIZON`."""
+
+    def __init__(self, path: Path, damage: Damage, magic: bytes, refusal: str) -> None:
+        self.path, self._damage = path, damage
+        try:
+            self.file = open_regular(path)
+        except OSError as error:
+            raise BagError(f"cannot open {path}: {error.strerror}") from error
+        self.size = os.fstat(self.file.fileno()).st_size
+        begin = self.file.read(max(len(LFS), len(magic)))
+        if begin == LFS:
+            refusal = "is a git-lfs pointer, not the recording: run git lfs pull"
+        elif not begin:
+            refusal = "is empty"
+        elif begin.startswith(magic):
+            self.file.seek(len(magic))
+            return
+        else:
+            refusal = f"{refusal}: it starts with {begin[: len(magic)]!r}"
+        self.file.close()
+        raise BagError(f"{path} {refusal}")
+
+    @abstractmethod
+    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+        """Read the messages of the topics."""
+
+    def note(self, line: str) -> None:
+        """Note what cannot be read, or what a reader must know."""
+        self._damage.add(f"{self.path.name}: {line}")
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
 """Of flight logs, tables and bags of ROS 1, in capitals too: each is a recording of its own, never part of a folder."""
 EXPECTED = "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
 LFS = b"version https://git-lfs."
 """What a file begins with that git has put in the place of a large one."""
+MADE_BY_FDI = "fdi_ros"
+"""Key in the custom data of the metadata.yaml of an output bag."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +191,6 @@ class RecordingFiles:
     """Each message is compressed by itself."""
     made_by_fdi: bool = False
     """The folder is one that ``fdi replay --output`` has written."""
-
-
-MADE_BY_FDI = "fdi_ros"
-"""Key in the custom data of the metadata.yaml of an output bag."""
 
 
 def find_files(path: Path, damage: Damage) -> RecordingFiles:

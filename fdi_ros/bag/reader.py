@@ -8,7 +8,6 @@ Damaged, it is read as far as it goes.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +22,7 @@ from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.log_parts import LogText
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.raw import LFS, MADE_BY_FDI, Batch, Damage, Topic, find_files
+from fdi_ros.bag.raw import MADE_BY_FDI, BagFile, Batch, Damage, Topic, find_files
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import Tlog
@@ -37,7 +36,6 @@ from fdi_ros.system.trusted_file import open_regular
 
 LOGS: dict[str, type[FlightLog]] = {".bin": DataflashLog, ".csv": CsvLog, ".tlog": Tlog, ".ulg": Ulog, ".ulog": Ulog}
 """Formats of flight logs, and tables of text."""
-_File = McapFile | SqliteFile | Ros1File | FlightLog
 
 
 class Recording:
@@ -61,7 +59,7 @@ class Recording:
         self._left = 0
         """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
-        self._files: list[_File] = []
+        self._files: list[BagFile] = []
         found = find_files(self.path, self.damage)
         self._compressed = found.compressed
         try:
@@ -120,12 +118,11 @@ class Recording:
             if topic is None:
                 listed = ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in there.values()) or "none at all"
                 raise BagError(f"{self.path} has no topic {name!r}, it has: {listed}")
+            called = f"topic {name!r} in {self.path}"
             if topic.type != type_name:
-                kind = shown(topic.type) or "untyped"
-                raise BagError(f"topic {name!r} in {self.path} is {kind}, expected {type_name}")
+                raise BagError(f"{called} is {shown(topic.type) or 'untyped'}, expected {type_name}")
             if topic.encoding != "cdr":
-                encoding = shown(topic.encoding)
-                raise BagError(f"topic {name!r} in {self.path} is serialised as {encoding!r}, expected 'cdr'")
+                raise BagError(f"{called} is serialised as {shown(topic.encoding)!r}, expected 'cdr'")
 
     def batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of topics, the files in the order of time."""
@@ -146,16 +143,14 @@ class Recording:
         """Open a file; why it cannot be is noted and returned: of several files the others are read."""
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
-            _refuse_pointer(plain)
             suffix = plain.suffix.lower()
             if suffix in LOGS:
-                self._files.append(LOGS[suffix](plain, self.damage))
-            elif suffix == ".mcap":
-                self._files.append(McapFile(plain, self.damage, self._left))
-            elif suffix == ".bag":
-                self._files.append(Ros1File(plain, self.damage, self._left))
+                file: BagFile = LOGS[suffix](plain, self.damage)
+            elif suffix in (".mcap", ".bag"):
+                file = (McapFile if suffix == ".mcap" else Ros1File)(plain, self.damage, self._left)
             else:
-                self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))
+                file = SqliteFile(plain, self.damage, self._compressed, self._left)
+            self._files.append(file)
         except BagError as error:
             self.damage.add(str(error))
             return error
@@ -182,13 +177,6 @@ class Recording:
             self.damage.add(f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes")
         self._left = max(0, self._left - plain.stat().st_size)
         return plain
-
-
-def _refuse_pointer(path: Path) -> None:
-    """Refuse a file that git has put in the place of a large one (`BagError`)."""
-    with contextlib.suppress(OSError), open_regular(path) as file:
-        if file.read(len(LFS)) == LFS:
-            raise BagError(f"{path} is a git-lfs pointer, not the recording: run git lfs pull")
 
 
 def convert(recording: Recording, path: Path, progress: Callable[[float], None]) -> dict[str, int]:

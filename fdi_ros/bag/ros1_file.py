@@ -23,7 +23,7 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.bag.raw import Batch, Damage, Topic, open_file
+from fdi_ros.bag.raw import BagFile, Batch, Damage, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import source_of_type
 from fdi_ros.system.limits import CHUNK_BYTES, PORTION_BYTES, ROS1_INDEX_BYTES
@@ -69,16 +69,13 @@ class _Place:
         return self.file
 
 
-class Ros1File:
-    """An open bag of ROS 1, whose chunks may unpack to ``most`` bytes; ``damage`` takes what cannot be read.
-
-    `BagError` if the file cannot be opened, is no such bag, has no index, or one that is too large.
-    """
+class Ros1File(BagFile):
+    """An open bag of ROS 1, whose chunks may unpack to ``most`` bytes; it must have an index, of bounded size."""
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
-        self.path, self.damage, self._left = path, damage, most
-        self._file, size = open_file(path, MAGIC, "is not a bag of ROS 1")
-        place: Any = _Place(self._file)
+        super().__init__(path, damage, MAGIC, "is not a bag of ROS 1")
+        self._left = most
+        place: Any = _Place(self.file)
         self._reader = Reader(place)
         self._store = get_typestore(Stores.ROS2_JAZZY)
         try:
@@ -86,11 +83,11 @@ class Ros1File:
             self.topics = tuple(Topic(one.topic, one.msgtype, "cdr", one.msgcount) for one in self._reader.connections)
             self.start_time = self._reader.start_time
         except _WRONG as error:
-            self._file.close()
+            self.file.close()
             if "not indexed" in str(error):
                 raise BagError(f"{path} has no index, its recording was cut off: run rosbag reindex") from error
             raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
-        place.file.left = most + size
+        place.file.left = most + self.size
         for number, chunk in self._reader.chunks.items():
             unpack = partial(self._unpacked, _UNPACKERS.get(chunk.decompressor))
             self._reader.chunks[number] = chunk._replace(decompressor=unpack)
@@ -99,7 +96,7 @@ class Ros1File:
         """Close the file."""
         if self._reader.bio is not None:
             self._reader.close()
-        self._file.close()
+        self.file.close()
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics in the order of recording, up to the first that cannot be read."""
@@ -119,7 +116,7 @@ class Ros1File:
             for connection, time, data in self._reader.messages(connections):
                 yield connection.id, time, self._converted(data, connection.msgtype)
         except _WRONG as error:
-            self.damage.add(f"{self.path.name} is damaged ({error}): read up to there")
+            self.note(f"it is damaged ({error}): read up to there")
 
     def _converted(self, data: bytes, kind: str) -> bytes:
         """Return a message as ROS 2 has it; a damaged one comes out empty, and is counted as malformed later."""

@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch
 from fdi_ros.bag.reader import Recording
@@ -31,6 +30,8 @@ RATE_TOLERANCE = 0.2
 """Share by which a recording may be faster or slower than configured: beyond, every threshold and time is wrong."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
 """Samples from which the rate of a recording is told, and steps between samples that this takes at least."""
+Rows = NDArray[Any]
+"""Decoded messages, by field."""
 Tap = Callable[[Batch, Int], None]
 """Is shown each batch and the numbers of the messages in it that are used."""
 
@@ -42,35 +43,6 @@ class Newest(NamedTuple):
     log_time: int = 0
     """Of its last message, ns; 0 before the first."""
     stamp: int = 0
-
-
-@dataclass(frozen=True)
-class Messages:
-    """M decoded messages."""
-
-    topic: Int
-    """(M,) index of the input topic."""
-    log_time: Int
-    """(M,) ns."""
-    stamp: Int
-    """(M,) ns; the time of recording where messages carry none."""
-    values: Array
-    """(M, c) rad/s."""
-
-    def __len__(self) -> int:
-        return len(self.topic)
-
-    def at(self, rows: slice | Int) -> Messages:
-        """Return some of the messages."""
-        return Messages(self.topic[rows], self.log_time[rows], self.stamp[rows], self.values[rows])
-
-    @classmethod
-    def joined(cls, parts: list[Messages]) -> Messages:
-        """Return all messages of the parts."""
-        if len(parts) == 1:
-            return parts[0]
-        columns = zip(*((p.topic, p.log_time, p.stamp, p.values) for p in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
 
 
 class Samples:
@@ -116,12 +88,16 @@ class Samples:
         first = self.source.channels_of(0, channels)
         self._width = first.stop - first.start
         """Values in a message."""
+        columns = [("topic", "i8"), ("log_time", "i8"), ("stamp", "i8"), ("values", "f8", (self._width,))]
+        self._row = np.dtype(columns)
+        """Of a decoded message: index of the input topic, times, ns (the time of recording where it carries no stamp),
+        rates, rad/s."""
         self._span = (start, end)
         self._tap = tap
         self.period = period
         self._configured = config.sample_rate
         self._first: list[Int] | None = []
-        """Stamps of the first samples; None: their rate was checked."""
+        """Stamps of the first samples, ns; None: their rate was checked."""
         self._last = -1
         self.origin: int | None = None
         """Stamp of the first message, ns: the times of faults, start and end count from here."""
@@ -166,30 +142,26 @@ class Samples:
             first, self._first = self._first, None
             check_sample_rate(self.recording.path, np.concatenate(first) if first else np.zeros(0), self._configured)
 
-    def _portions(self) -> Iterator[Messages]:
+    def _portions(self) -> Iterator[Rows]:
         """Put messages together, or apart, into what becomes a block."""
-        together: list[Messages] = []
+        together = np.empty(0, self._row)
         for messages in self._ordered():
-            together.append(messages)
+            together = np.concatenate([together, messages])
             if self.period:
-                joined = Messages.joined(together)
-                cuts = np.flatnonzero(np.diff(joined.log_time // self.period)) + 1
-                for first, last in itertools.pairwise([0, *cuts.tolist()]):
-                    yield joined.at(slice(first, last))
-                together = [joined.at(slice(int(cuts[-1]), None))] if len(cuts) else [joined]
-            elif sum(map(len, together)) >= _TOGETHER:
-                yield Messages.joined(together)
-                together = []
-        if together:
-            yield Messages.joined(together)
+                *whole, together = np.split(together, np.flatnonzero(np.diff(together["log_time"] // self.period)) + 1)
+                yield from whole
+            elif len(together) >= _TOGETHER:
+                yield together
+                together = together[:0]
+        if len(together):
+            yield together
 
-    def _note_newest(self, messages: Messages) -> None:
-        for k in range(len(self.topics)):
-            rows = np.flatnonzero(messages.topic == k)
-            if len(rows):
-                last = rows[-1]
-                received = self.newest[k].received + len(rows)
-                self.newest[k] = Newest(received, int(messages.log_time[last]), int(messages.stamp[last]))
+    def _note_newest(self, messages: Rows) -> None:
+        for k, before in enumerate(self.newest):
+            of_topic = messages[messages["topic"] == k]
+            if len(of_topic):
+                last = of_topic[-1]
+                self.newest[k] = Newest(before.received + len(of_topic), int(last["log_time"]), int(last["stamp"]))
 
     def _why(self) -> str:
         wrong = sum(self.malformed.values())
@@ -198,77 +170,65 @@ class Samples:
             return f" ({wrong} malformed, expected {self._width} {words} in each)"
         return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
 
-    def _block(self, messages: Messages) -> Block:
+    def _block(self, messages: Rows) -> Block:
+        stamp, values = (np.ascontiguousarray(messages[name]) for name in ("stamp", "values"))
         if self.source.stamped:
-            return self.alignment.push_block(messages.topic, messages.stamp, messages.values)
+            return self.alignment.push_block(np.ascontiguousarray(messages["topic"]), stamp, values)
         # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
         count = np.arange(len(messages))
-        free = messages.stamp - count
+        free = stamp - count
         free[0] = max(free[0], self._last + 1)
         stamp = np.maximum.accumulate(free) + count
         self._last = int(stamp[-1])
-        return Block(stamp, messages.values)
+        return Block(stamp, values)
 
-    def _ordered(self) -> Iterator[Messages]:
+    def _ordered(self) -> Iterator[Rows]:
         """Put the messages into the order of recording, as a player would publish them."""
-        held: list[Messages] = []
+        held = np.empty(0, self._row)
         done = -1
         for batch in self.recording.batches(self.topics):
-            held.append(self._decoded(batch))
-            messages = Messages.joined(held)
-            if (np.diff(messages.log_time) < 0).any():
-                messages = messages.at(np.argsort(messages.log_time, kind="stable"))
-            ready = int(np.searchsorted(messages.log_time, batch.horizon)) if batch.horizon < NO_HORIZON else None
-            if len(messages) > _HELD:
-                ready = None
-            first, held = messages.at(slice(ready)), [messages.at(slice(ready, None))] if ready is not None else []
+            held = np.concatenate([held, self._decoded(batch)])
+            if (np.diff(held["log_time"]) < 0).any():
+                held = held[np.argsort(held["log_time"], kind="stable")]
+            all_ready = batch.horizon == NO_HORIZON or len(held) > _HELD
+            ready = len(held) if all_ready else int(np.searchsorted(held["log_time"], batch.horizon))
+            messages, held = held[:ready], held[ready:]
             self.progress = batch.progress
-            if len(first) and not self.source.stamped and first.log_time[0] < done:
-                self.disordered += int((first.log_time < done).sum())
-                first = first.at(np.flatnonzero(first.log_time >= done))
-            if len(first):
-                done = int(first.log_time[-1])
-                yield first
-        if held and len(held[0]):
-            yield held[0]
+            if len(messages) and not self.source.stamped and messages["log_time"][0] < done:
+                late = messages["log_time"] < done
+                self.disordered += int(late.sum())
+                messages = messages[~late]
+            if len(messages):
+                done = int(messages["log_time"][-1])
+                yield messages
+        if len(held):
+            yield held
 
-    def _decoded(self, batch: Batch) -> Messages:
+    def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages are counted and left out, and so is what lies outside the span."""
         decoded = self.source.decode(batch.buffer, batch.offset, batch.length, self._width)
         stamp = decoded.stamp if self.source.stamped else batch.log_time
         keep = decoded.good
-        if not keep.all():
-            for topic in batch.topic[~keep].tolist():
-                self.malformed[self.topics[topic]] += 1
+        for topic in batch.topic[~keep].tolist():
+            self.malformed[self.topics[topic]] += 1
         if self.origin is None and keep.any():
             self.origin = int(stamp[np.argmax(keep)])
         if self._span != (0.0, math.inf):
             seconds = (stamp - (self.origin or 0)) * 1e-9
             keep = keep & (seconds >= self._span[0]) & (seconds < self._span[1])
-        rows = np.flatnonzero(keep)
         if self._tap is not None:
-            self._tap(batch, rows)
-        messages = Messages(batch.topic, batch.log_time, stamp, decoded.values)
-        return messages if len(rows) == len(keep) else messages.at(rows)
+            self._tap(batch, np.flatnonzero(keep))
+        messages = np.empty(len(batch), self._row)
+        messages["topic"], messages["log_time"] = batch.topic, batch.log_time
+        messages["stamp"], messages["values"] = stamp, decoded.values
+        return messages[keep]
 
 
 def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:
-    """Check that the samples of a recording come about as often as configured.
+    """Check that samples of a recording, stamped (k,) ns, come about as often as configured, Hz.
 
-    Parameters
-    ----------
-    path
-        Of the recording, for the message.
-    stamp
-        (k,) stamps of its samples, ns; of fewer than 51 nothing is known.
-    configured
-        Sample rate, Hz.
-
-    Raises
-    ------
-    BagError
-        If both the median and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples that
-        are lost nor samples that come in bursts are a wrong rate.
+    `BagError` if both the median and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples
+    that are lost nor samples that come in bursts are a wrong rate. Of fewer than 51 nothing is known.
     """
     steps = np.sort(np.diff(stamp)) * 1e-9
     if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
@@ -283,13 +243,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
 
 
 def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:
-    """Read all samples of a part of a recording, aligned as in a replay.
-
-    Raises
-    ------
-    FdiError
-        If there is no such recording, or it lacks a topic of the configuration.
-    """
+    """Read all samples of a part of a recording, aligned as in a replay; `BagError` as of `Recording` and `Samples`."""
     with Recording(bag) as recording:
         return joined(list(Samples(recording, config, build_geometry(config).n, start, end).blocks()))
 

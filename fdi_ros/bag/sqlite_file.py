@@ -23,7 +23,7 @@ from typing import Any
 
 import zstandard
 
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
+from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE
 
@@ -31,32 +31,27 @@ _ROWS = 4096
 """Messages read at once."""
 _TICK = 10_000
 """Steps of SQLite from one look at the clock of signals and steps to the next."""
-Row = tuple[int, int, bytes]
-"""Number of the topic, time of recording, message."""
 
 
-class SqliteFile:
-    """An open sqlite3 file, whose messages may come to ``most`` bytes; ``damage`` takes what cannot be read.
+class SqliteFile(BagFile):
+    """An open sqlite3 file, whose messages may come to ``most`` bytes.
 
-    ``compressed``: each message is, by zstd, by itself. `BagError` if the file cannot be opened or is no rosbag2
-    database.
+    ``compressed``: each message is, by zstd, by itself.
     """
 
     def __init__(self, path: Path, damage: Damage, compressed: bool, most: int) -> None:
-        self.path = path
-        self.damage = damage
+        super().__init__(path, damage, b"SQLite format 3\0", "is not a readable rosbag2 database")
+        # SQLite opens the file itself.
+        self.file.close()
         self.compressed = compressed
-        size = path.stat().st_size
-        if size == 0:
-            raise BagError(f"{path} is empty")
         self._open = contextlib.ExitStack()
         """What is to be closed: the database, then the folder of its copy."""
         self._left = most
-        self._steps = STEPS + STEPS_PER_BYTE * size
+        self._steps = STEPS + STEPS_PER_BYTE * self.size
         try:
             self._base = self._opened()
             self._check_tables()
-            self._ids = self._topics()
+            ids = self._topics()
             start = next(self._query("SELECT MIN(timestamp) FROM messages"))[0]
         except BaseException as error:
             self.close()
@@ -64,12 +59,15 @@ class SqliteFile:
                 raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
             raise
         self.start_time = start if isinstance(start, int) else NO_HORIZON
-        counts = self._count()
+        counts: dict[Any, int] = {}
+        try:
+            counts = dict(self._query("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
+        except sqlite3.Error as error:
+            self.note(f"it is damaged ({error}): its messages could not be counted")
+        self._ids = {number: name for number, (name, _, _) in ids.items()}
+        self._total = sum(counts.get(number, 0) for number in ids)
         self._broken = False
-        self._total = sum(counts.values())
-        self.topics = tuple(
-            Topic(name, kind, encoding, counts.get(number, 0)) for number, (name, kind, encoding) in self._ids.items()
-        )
+        self.topics = tuple(Topic(*about, counts.get(number, 0)) for number, about in ids.items())
 
     def close(self) -> None:
         """Close the file."""
@@ -77,15 +75,18 @@ class SqliteFile:
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        wanted = {name: k for k, name in enumerate(topics)}
-        chosen = {number: wanted[name] for number, (name, _, _) in self._ids.items() if name in wanted}
+        chosen = {number: topics.index(name) for number, name in self._ids.items() if name in topics}
         read, last = 0, -1
         # A damaged database may not be sorted by time any more and still be read in the order in which it was written.
         for order in ("timestamp", "id"):
             self._broken = False
             for rows in self._rows(tuple(chosen), last, order):
                 read += len(rows)
-                batch = self._batch(rows, chosen, min(1.0, read / max(1, self._total)))
+                # Only a damaged database holds anything else.
+                sound = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
+                numbers, times, data = zip(*sound, strict=True) if sound else ((), (), ())
+                progress = min(1.0, read / max(1, self._total))
+                batch = Batch.of_messages([chosen[number] for number in numbers], times, data, progress)
                 last = max(last, batch.horizon)
                 yield batch
             if not self._broken:
@@ -94,7 +95,7 @@ class SqliteFile:
     def _opened(self) -> sqlite3.Connection:
         log, journal = (Path(f"{self.path}{end}") for end in ("-wal", "-journal"))
         if journal.is_file() and journal.stat().st_size:
-            self.damage.add(f"{self.path.name}: its last transaction was not finished, and was read as far as it goes")
+            self.note("its last transaction was not finished, and was read as far as it goes")
         waits = log.is_file() and log.stat().st_size > 0
         place, how = (self._copied(log), "rw") if waits else (self.path, "ro&immutable=1")
         base = self._open.enter_context(
@@ -158,18 +159,18 @@ class SqliteFile:
         for number, *about in self._query("SELECT id, name, type, serialization_format FROM topics"):
             words = tuple(map(str, about))
             if not isinstance(number, int) or max(map(len, words)) > NAME:
-                self.damage.add(f"{self.path.name}: a topic description is damaged and was left out")
+                self.note("a topic description is damaged and was left out")
             elif len(ids) == CHANNELS:
-                self.damage.add(f"{self.path.name} has more than {CHANNELS} topics: the others were left out")
+                self.note(f"it has more than {CHANNELS} topics: the others were left out")
                 break
             else:
                 ids[number] = (words[0], words[1], words[2])
         return ids
 
-    def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[Row]]:
-        """Read messages in portions, up to the first that cannot be read."""
+    def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[tuple[int, Any, Any]]]:
+        """Read messages in portions, up to the first that cannot be read: number of the topic, time, content."""
         which = f"topic_id IN ({','.join('?' * len(topics))}) AND timestamp > ? ORDER BY {order}"
-        rows: list[Row] = []
+        rows: list[tuple[int, Any, Any]] = []
         held = 0
         try:
             # What is sorted is in memory, and so comes without the messages themselves.
@@ -182,47 +183,26 @@ class SqliteFile:
                 if len(rows) == _ROWS or held >= PORTION_BYTES:
                     self._left -= held
                     if self._left < 0:
-                        self.damage.add(f"{self.path.name} comes to more bytes than it should: read up to there")
+                        self.note("it comes to more bytes than it should: read up to there")
                         return
                     yield rows
                     rows, held = [], 0
         except sqlite3.Error as error:
             # What was read before an error is handed on.
             self._broken = self._steps >= 0
-            what = f"not all messages could be read in order of {order}"
-            self.damage.add(f"{self.path.name} is damaged ({error}): {what}")
+            self.note(f"it is damaged ({error}): not all messages could be read in order of {order}")
         if rows:
             yield rows
 
     def _message(self, number: int) -> Any:
-        """Return a message as it was sent."""
+        """Return a message as it was sent; a damaged one comes out empty, and is counted as malformed later."""
         one = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
         (content,) = next(self._query(one, (number, CHUNK_BYTES)), (None,))
         if content is None:
-            self.damage.add(f"{self.path.name}: messages of none or more than {CHUNK_BYTES} bytes were left out")
-        return _unpacked(content) if self.compressed and isinstance(content, bytes) else content
-
-    def _count(self) -> dict[int, int]:
-        """Return the number of messages of each topic; a damaged database may not say it and still be readable."""
-        counts = "SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"
+            self.note(f"messages of none or more than {CHUNK_BYTES} bytes were left out")
+        if not self.compressed or not isinstance(content, bytes):
+            return content
         try:
-            return {number: count for number, count in self._query(counts) if number in self._ids}
-        except sqlite3.Error as error:
-            self.damage.add(f"{self.path.name} is damaged ({error}): its messages could not be counted")
-            return {}
-
-    def _batch(self, rows: list[Row], chosen: dict[int, int], progress: float) -> Batch:
-        topics, times, data = zip(*rows, strict=True)
-        if set(map(type, times)) != {int} or set(map(type, data)) != {bytes}:
-            # Only a damaged database holds anything else.
-            rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
-            topics, times, data = zip(*rows, strict=True) if rows else ((), (), ())
-        return Batch.of_messages([chosen[topic] for topic in topics], times, data, progress)
-
-
-def _unpacked(data: bytes) -> bytes:
-    """Decompress a message; a damaged one comes out empty, and is counted as malformed later."""
-    try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(CHUNK_BYTES)
-    except (zstandard.ZstdError, MemoryError):
-        return b""
+            return zstandard.ZstdDecompressor().stream_reader(content).read(CHUNK_BYTES)
+        except (zstandard.ZstdError, MemoryError):
+            return b""

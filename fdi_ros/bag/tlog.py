@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fdi_ros.bag.flight_log import FlightLog
-from fdi_ros.bag.log_parts import ImuSamples, Portion, Source, part, possible_start
+from fdi_ros.bag.log_parts import ImuSamples, Portion, Source, parts, possible_start
 from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Int
@@ -78,9 +78,8 @@ class Tlog(FlightLog):
             ImuSamples(source, times[source][:, 0], values[:, 3:6], values[:, 6:], times[source][:, 2])
             for source, values in rows.items()
         ]
-        count = max(map(len, rows.values()), default=0) // _TOGETHER + 1
-        for k in range(count):
-            yield Portion([one.at(part(len(one.stamp), k, count)) for one in found], (k + 1) / count)
+        for chosen, share in parts([len(one.stamp) for one in found], _TOGETHER):
+            yield [one.at(k) for one, k in zip(found, chosen, strict=True)], share
 
     def _load(self, data: bytes) -> dict[Source, array[float]]:
         """Read the messages of IMUs of the first autopilot that says that it is one."""

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import count, takewhile
 from typing import Any, ClassVar
 
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import SETTINGS, FlightLog
-from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, part, per_time, possible_start
+from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, parts, per_time, possible_start
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.installation import require
@@ -46,8 +46,11 @@ _DEEPEST = 16
 _TOGETHER = 1 << 14
 """Messages handed on at once, about."""
 _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
+_KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
+_WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+"""What pyulog raises of a damaged file."""
 _MEAN_TIME = 100_000
 """us over which PX4 takes the means of vehicle_imu_status."""
 _FIX = 3
@@ -102,16 +105,13 @@ class Ulog(FlightLog):
         """Return the samples, some of each topic together; where they end in the file is not known."""
         if self._topics is None:
             self._topics = self._load()
-        parts = max(map(_size, self._topics.values()), default=0) // _TOGETHER + 1
-        for k in range(parts):
+        for chosen, share in parts([*map(_size, self._topics.values())], _TOGETHER):
             samples = []
-            for source, columns in self._topics.items():
-                rows = part(_size(columns), k, parts)
+            for (source, columns), rows in zip(self._topics.items(), chosen, strict=True):
                 read = _read(source.kind, {name: column[rows] for name, column in columns.items()})
                 if read is not None:
-                    stamp, rate, acceleration = read
-                    samples.append(ImuSamples(source, stamp, rate, acceleration, np.zeros(len(stamp), dtype=np.int64)))
-            yield Portion(samples, (k + 1) / parts)
+                    samples.append(ImuSamples(source, *read, np.zeros(len(read[0]), dtype=np.int64)))
+            yield samples, share
 
     def _load(self) -> dict[Source, Columns]:
         """Read the file with pyulog, and tell what of it could not be read."""
@@ -135,7 +135,7 @@ class Ulog(FlightLog):
             self._take(topics, Source(one.name, one.multi_id), one.data)
         topics |= _simultaneous({source: columns for source, columns in topics.items() if source.kind == _STATUS})
         if log.file_corruption:
-            self.unread |= dict.fromkeys(_READERS.keys() & log.message_formats.keys() - self.counts.keys(), _LACKS)
+            self.unread |= dict.fromkeys(set(_KINDS) & log.message_formats.keys() - self.counts.keys(), _LACKS)
         return topics
 
     def _note_gaps(self, log: Any) -> None:
@@ -152,7 +152,7 @@ class Ulog(FlightLog):
         self.counts[source.kind] += _size(columns)
         if source.kind in _GPS and self.start_utc is None:
             self.start_utc = _start_utc(columns)
-        if source.kind not in _READERS:
+        if source.kind not in _KINDS:
             return
         if source in topics:
             # What was appended to a file begins with the topics anew.
@@ -179,16 +179,7 @@ def _parsed(file: _Bounded, path: str) -> Any:
             return ULog(file)
     except ULogIncompatibleFlagException as error:
         raise BagError(f"{path} is a ULog of a later version, whose flags say that it must not be read") from error
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        MemoryError,
-        RuntimeError,
-        TypeError,
-        ULogException,
-        ValueError,
-    ) as error:
+    except (ULogException, *_WRONG) as error:
         raise BagError(f"{path} cannot be read by pyulog: {error}") from error
 
 
@@ -257,57 +248,50 @@ def _stamp(columns: Columns) -> Int:
     return np.where(sampled > 0, sampled, stamp)
 
 
-Read = tuple[Int, Array, Array]
-"""Stamps (k,), us, rates and accelerations (k, 3), NaN where they are not logged."""
+def _read(kind: str, columns: Columns) -> tuple[Int, Array, Array] | None:
+    """Return stamps (k,), us, rates and accelerations (k, 3) in messages of a kind, in FLU, NaN where not logged.
 
-
-def _read(kind: str, columns: Columns) -> Read | None:
-    """Return the samples in messages of a kind, in FLU; None: they lack a field, or have another form."""
+    None: the messages lack a field, or have another form.
+    """
+    acceleration = None
     try:
         # Numbers of a damaged log may be anything.
         with np.errstate(all="ignore"):
-            stamp, rate, acceleration = _READERS[kind](columns)
+            stamp = _stamp(columns)
+            if kind == "vehicle_imu":
+                # Changes of angle and velocity over the time of each sample.
+                rate = per_time(_array(columns, "delta_angle").astype(np.float64), columns["delta_angle_dt"] * 1e-6)
+                change = _array(columns, "delta_velocity").astype(np.float64)
+                acceleration = per_time(change, columns["delta_velocity_dt"] * 1e-6)
+            elif kind == "sensor_gyro_fifo":
+                stamp, rate = _unpacked(stamp, columns)
+            elif kind == _STATUS:
+                # Means of the last 0.1 s: at the middle of these.
+                stamp, rate = stamp - _MEAN_TIME // 2, _array(columns, "mean_gyro")
+            elif kind == _SELECTED:
+                rate = _array(columns, "gyro_rad")
+            else:
+                rate = np.stack([columns[axis] for axis in "xyz"], axis=1)
     except (KeyError, ValueError):
         return None
     rate = rate.astype(np.float64)
-    acceleration = np.full(rate.shape, np.nan) if acceleration is None else acceleration.astype(np.float64)
+    acceleration = np.full(rate.shape, np.nan) if acceleration is None else acceleration
     if not rate.shape == acceleration.shape == (len(stamp), 3):
         return None
     return stamp, rate * FLU, acceleration * FLU
 
 
-def _sensor_gyro(columns: Columns) -> tuple[Int, Array, None]:
-    return _stamp(columns), np.stack([columns[axis] for axis in "xyz"], axis=1), None
-
-
-def _vehicle_imu(columns: Columns) -> Read:
-    """Mean rates over the time of each sample, and accelerations likewise."""
-    rate = per_time(_array(columns, "delta_angle").astype(np.float64), columns["delta_angle_dt"] * 1e-6)
-    change = _array(columns, "delta_velocity").astype(np.float64)
-    return _stamp(columns), rate, per_time(change, columns["delta_velocity_dt"] * 1e-6)
-
-
-def _sensor_combined(columns: Columns) -> tuple[Int, Array, None]:
-    return _stamp(columns), _array(columns, "gyro_rad"), None
-
-
-def _sensor_gyro_fifo(columns: Columns) -> tuple[Int, Array, None]:
-    """All samples of each message: equally spaced, the last at its time."""
+def _unpacked(last: Int, columns: Columns) -> tuple[Int, Array]:
+    """Return all samples of k messages of sensor_gyro_fifo: equally spaced, the last (k,) of each at its time."""
     raw = np.stack([_array(columns, axis) for axis in "xyz"], axis=-1).astype(np.float64)
     room = raw.shape[1]
     size = np.minimum(columns["samples"].astype(np.int64), room)
     before = size[:, None] - 1 - np.arange(room)
     spacing = columns["dt"].astype(np.float64)
     spacing = np.where((spacing > 0) & (spacing < 1e6), spacing, 0.0)
-    stamp = _stamp(columns)[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
+    stamp = last[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
     rate = raw * columns["scale"].astype(np.float64)[:, None, None]
-    filled = before >= 0
-    return stamp[filled], rate[filled], None
-
-
-def _vehicle_imu_status(columns: Columns) -> tuple[Int, Array, None]:
-    """Mean rates of the last 0.1 s before each message, at the middle of these."""
-    return _stamp(columns) - _MEAN_TIME // 2, _array(columns, "mean_gyro"), None
+    return stamp[before >= 0], rate[before >= 0]
 
 
 def _start_utc(columns: Columns) -> int | None:
@@ -317,13 +301,3 @@ def _start_utc(columns: Columns) -> int | None:
     fixed = columns["fix_type"] >= _FIX if "fix_type" in columns else np.ones(_size(columns), dtype=bool)
     utc, stamp = (columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp"))
     return possible_start(utc, stamp)
-
-
-_READERS: dict[str, Callable[[Columns], tuple[Int, Array, Array | None]]] = {
-    "vehicle_imu": _vehicle_imu,
-    "sensor_gyro": _sensor_gyro,
-    "sensor_gyro_fifo": _sensor_gyro_fifo,
-    _SELECTED: _sensor_combined,
-    _STATUS: _vehicle_imu_status,
-}
-"""Stamp, rate and acceleration in FRD of the messages of each kind; None: that is not logged."""

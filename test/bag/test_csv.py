@@ -138,7 +138,7 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("", "has no line with the names of its columns"),
+        ("", "is empty"),
         ("1.0,2.0,3.0,4.0\n" * 50, "has no names of columns: its first line holds numbers"),
         ("t,gyro_x [LSB],gyro_y,gyro_z\n", "column 'gyro_x [LSB]' has the unit 'lsb', expected one of"),
         ("t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50, "has columns of 2 IMUs at times that do not advance"),
