@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,70 +37,47 @@ class Followed:
     def __init__(self, fault: Fault, channels: Sequence[int], names: Sequence[str]) -> None:
         self.fault, self.channels = fault, channels
         struck = tuple(names[i] for i in channels)
-        size, stop = fault.size, finite(fault.stop)
-        self.outcome = Outcome(fault.channel, struck, fault.kind.name, size, fault.start, stop)
-        self.begun = False
+        self._asked = Outcome(fault.channel, struck, fault.kind.name, fault.size, fault.start, finite(fault.stop))
+        self._found: dict[str, Any] = {}
+        """What is to be changed of that."""
+        self.declared_before: bool | None = None
+        """Whether all its channels were declared when it began; None: it has not begun."""
         self.detected_stamp: int | None = None
         """Of the first declaration that names one of its channels, ns."""
-        self._alone: set[str] = set()
-        """Channels that were declared by themselves."""
-        self._false: set[str] = set()
+        self._declared: dict[str, bool] = {}
+        """Channels that were declared, and whether by themselves."""
+        self.false: set[str] = set()
         """States in which healthy channels were declared while it lasted."""
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
         """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
-        return self.is_active(since) and not set(channels).isdisjoint(self.outcome.channels)
+        return self.is_active(since) and not set(channels).isdisjoint(self._asked.channels)
 
     def is_active(self, since: float) -> bool:
         """Whether what is declared at a time, s, may come of the fault."""
         return self.fault.start <= since < self.fault.stop + GRACE
 
-    def add_false(self, change: StateChange) -> None:
-        """Take in a declaration that no fault explains, from the time of this one."""
-        self._false.add(change.state)
-        self._conclude()
-
     def add(self, stamp: int, change: StateChange) -> None:
         """Take in a declaration that this fault explains."""
-        outcome, named, delay = self.outcome, change.named, round(change.at_s - self.fault.start, 9)
+        at, delay = change.at_s, round(change.at_s - self.fault.start, 9)
         if self.detected_stamp is None:
             self.detected_stamp = stamp
-            outcome = replace(outcome, detected_at_s=change.at_s, delay_s=delay, detected_as=change.state)
-        elif stamp != self.detected_stamp:
+            self._found |= {"detected_at_s": at, "delay_s": delay, "detected_as": change.state}
+        for name in change.named:
             # Other channels that are named later have reasons of their own.
-            named = tuple(name for name in named if name in outcome.channels)
-        outcome = replace(outcome, declared_channels=tuple(dict.fromkeys((*outcome.declared_channels, *named))))
+            if stamp == self.detected_stamp or name in self._asked.channels:
+                self._declared.setdefault(name, False)
         if change.state != "AMBIGUOUS":
-            self._alone.add(change.channel)
-            if not outcome.isolated and self._alone >= set(outcome.channels):
-                outcome = replace(outcome, isolated=True, isolated_at_s=change.at_s, isolation_delay_s=delay)
-        self.outcome = outcome
-        self._conclude()
+            self._declared[change.channel] = True
+            if "isolated" not in self._found and all(self._declared.get(name) for name in self._asked.channels):
+                self._found |= {"isolated": True, "isolated_at_s": at, "isolation_delay_s": delay}
 
-    def _conclude(self) -> None:
-        one, false = self.outcome, self._false
-        found = one.detected_at_s is not None
-        outcome = outcome_of("FAULTY" in false, one.isolated, found, "AMBIGUOUS" in false)
-        self.outcome = replace(one, outcome=outcome.value)
-
-
-@dataclass
-class Rms:
-    """Root mean square of the length of a vector."""
-
-    squares: float = 0.0
-    count: int = 0
-
-    def add(self, vectors: Array) -> None:
-        """Take in vectors (k, 3); one that is not finite, or too large to be squared, does not count."""
-        vectors = vectors[(np.abs(vectors) < SQUARED).all(axis=1)]
-        self.squares += float((vectors**2).sum())
-        self.count += len(vectors)
-
-    @property
-    def value(self) -> float | None:
-        """The root mean square; None of nothing."""
-        return math.sqrt(self.squares / self.count) if self.count else None
+    def outcome(self) -> Outcome:
+        """Return what has become of it."""
+        isolated, found, false = "isolated" in self._found, self.detected_stamp is not None, self.false
+        came_of_it = outcome_of("FAULTY" in false, isolated, found, "AMBIGUOUS" in false)
+        own = replace(self._asked, declared_channels=tuple(self._declared), outcome=came_of_it.value)
+        return replace(own, declared_before=bool(self.declared_before), **self._found)
 
 
 class Evaluation:
@@ -123,7 +101,8 @@ class Evaluation:
         self._first: int | None = None
         self.last = 0
         """Stamp of the last sample, ns."""
-        self._before_detection, self._after_detection, self._without_monitor = Rms(), Rms(), Rms()
+        self._effects = np.zeros((2, 3))
+        """Of the faults before and after detection, and without a monitor: sum of the squares, and their number."""
 
     def add(self, output: Output, clean: Array | None = None) -> None:
         """Take in the next samples.
@@ -132,11 +111,12 @@ class Evaluation:
         """
         if len(output) == 0:
             return
+        judged = np.isfinite(output.threshold)
         self.samples += len(output)
         self._with_rate += int(output.valid.sum())
-        self._judged += int(np.isfinite(output.threshold).sum())
+        self._judged += int(judged.sum())
         self._alarms += int(output.alarm.sum())
-        self._unchecked += (_UNCHECKED[output.state] | ~np.isfinite(output.threshold)[:, None]).sum(axis=0)
+        self._unchecked += (_UNCHECKED[output.state] | ~judged[:, None]).sum(axis=0)
         fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
         self._residuals += (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0), fine.sum(axis=0)
         self._first = int(output.stamp[0]) if self._first is None else self._first
@@ -147,7 +127,15 @@ class Evaluation:
             self._add_event(event, round(time, 9))
         self._begin(self.time(self.last))
         if clean is not None:
-            self._add_effect(output, clean)
+            undetected = np.zeros(len(output), dtype=bool)
+            active = self.injector.active(output.stamp)
+            for one, rows in zip(self._faults, active.T, strict=True):
+                if not one.declared_before:
+                    until = self.last if one.detected_stamp is None else one.detected_stamp
+                    undetected |= rows & (output.stamp <= until)
+            effect = output.rate - clean
+            self._add_effect(0, effect[undetected])
+            self._add_effect(1, effect[active.any(axis=1) & ~undetected])
 
     def add_unmonitored(self, faulty: Block, healthy: Block) -> None:
         """Take in what the faults do to the plain least-squares rate of all channels; NaN: not to be compared."""
@@ -156,18 +144,22 @@ class Evaluation:
             # What is recorded may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):
                 effect = (faulty.z[rows] - healthy.z[rows]) @ self._least_squares.T
-            self._without_monitor.add(effect)
+            self._add_effect(2, effect)
+
+    def _add_effect(self, which: int, effect: Array) -> None:
+        """Take in errors (k, 3) of the rate; one that is not finite, or too large to be squared, does not count."""
+        effect = effect[(np.abs(effect) < SQUARED).all(axis=1)]
+        self._effects[:, which] += float((effect**2).sum()), len(effect)
 
     def channel_at(self, end: float, i: int, status: ChannelStatus) -> ChannelResult:
         """Return a channel as it was at a time near the end, s, with what its status at the end says beside."""
         changes = [one for one in self._events if one.channel == self.names[i]]
         before = [one for one in changes if one.at_s <= end]
-        state, since, reason = (
-            (changes[0].before, None, "") if changes else (status.state.name, None, status.reason.value)
-        )
+        state, since, reason = status.state.name, None, status.reason.value
         if before:
             state, since, reason = before[-1].state, before[-1].at_s, before[-1].reason
-        squares, count = self._residuals[:, i].tolist()
+        elif changes:
+            state, reason = changes[0].before, ""
         return ChannelResult(
             name=self.names[i],
             state=state,
@@ -176,7 +168,7 @@ class Evaluation:
             bias_followed=status.drift,
             noise=status.noise or None,
             unchecked=float(self._unchecked[i]) / max(1, self.samples),
-            residual_rms_rad_s=math.sqrt(squares / count) if count else None,
+            residual_rms_rad_s=_rms(*self._residuals[:, i].tolist()),
         )
 
     def time(self, stamp: int) -> float:
@@ -194,31 +186,18 @@ class Evaluation:
 
     def explained(self, story: Story) -> Story:
         """Return the story with the injected faults that explain each episode."""
-        episodes = tuple(replace(one, injected=self._explaining(one)) for one in story.episodes)
-        return replace(story, episodes=episodes)
 
-    def _explaining(self, one: Episode) -> tuple[str, ...]:
-        known = [followed.fault for followed in self._faults if followed.explains(one.start_s, one.ever)]
-        return tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
+        def explaining(one: Episode) -> tuple[str, ...]:
+            known = [followed.fault for followed in self._faults if followed.explains(one.start_s, one.ever)]
+            return tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
+
+        return replace(story, episodes=tuple(replace(one, injected=explaining(one)) for one in story.episodes))
 
     def _begin(self, time: float) -> None:
         """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
         for one in self._faults:
-            if not one.begun and one.fault.start <= time:
-                one.begun = True
-                before = all(self._state[i] in ALONE for i in one.channels)
-                one.outcome = replace(one.outcome, declared_before=before)
-
-    def _add_effect(self, output: Output, clean: Array) -> None:
-        undetected = np.zeros(len(output), dtype=bool)
-        active = self.injector.active(output.stamp)
-        for one, rows in zip(self._faults, active.T, strict=True):
-            if not one.outcome.declared_before:
-                until = self.last if one.detected_stamp is None else one.detected_stamp
-                undetected |= rows & (output.stamp <= until)
-        effect = output.rate - clean
-        self._before_detection.add(effect[undetected])
-        self._after_detection.add(effect[active.any(axis=1) & ~undetected])
+            if one.declared_before is None and one.fault.start <= time:
+                one.declared_before = all(self._state[i] in ALONE for i in one.channels)
 
     def _add_event(self, event: Event, time: float) -> None:
         self._state[event.channel] = event.after
@@ -246,7 +225,7 @@ class Evaluation:
             self._unexplained.append(change)
             for one in self._faults:
                 if one.is_active(time):
-                    one.add_false(change)
+                    one.false.add(change.state)
 
     def scores(self) -> Scores:
         """Return the figures."""
@@ -254,14 +233,17 @@ class Evaluation:
         return Scores(
             samples=self.samples,
             duration_s=round((self.last - first) * 1e-9, 9),
-            faults=tuple(one.outcome for one in self._faults),
+            faults=tuple(one.outcome() for one in self._faults),
             declared=tuple(self._unexplained),
-            fault_effect_rad_s=FaultEffect(
-                self._before_detection.value, self._after_detection.value, self._without_monitor.value
-            ),
+            fault_effect_rad_s=FaultEffect(*(_rms(*one) for one in self._effects.T.tolist())),
             start_s=0.0 if self._first is None else round(self.time(first), 9),
             samples_judged=self._judged,
             samples_with_rate=self._with_rate,
             alarms=self._alarms,
             events=tuple(self._events),
         )
+
+
+def _rms(squares: float, count: float) -> float | None:
+    """Root mean square of a sum of squares; None of nothing."""
+    return math.sqrt(squares / count) if count else None

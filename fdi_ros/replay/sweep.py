@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -126,39 +126,7 @@ class Plan:
     """Of signs and of the random kinds."""
 
 
-# One fault, from the monitor as it stood before -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """All that a monitor remembers."""
-
-    core: NDArray[Any]
-    """(1,) `fdi_ros.core.records.Core`."""
-    states: dict[int, NDArray[Any]]
-    """Memory of the detector for each set of channels, by its bits."""
-
-    @classmethod
-    def of(cls, pipeline: Pipeline) -> Snapshot:
-        """Keep what a monitor remembers after its last sample."""
-        detector = pipeline.detector
-        rows = detector.bank["row"][0]
-        states = {int(mask): detector.states[rows[mask]].copy() for mask in np.flatnonzero(rows >= 0)}
-        return cls(pipeline.core.copy(), states)
-
-    def restore(self, pipeline: Pipeline) -> None:
-        """Put a monitor with the same settings to this moment, whatever it has seen since."""
-        detector = pipeline.detector
-        # Sets that were met later are as if they had just been prepared.
-        detector.states[: int(detector.bank["rows"][0])] = np.zeros((), dtype=detector.states.dtype)
-        for mask, state in self.states.items():
-            detector.prepare(mask)
-            detector.states[int(detector.bank["row"][0, mask])] = state
-        pipeline.core[:] = self.core
-
-
-LEAD = 1000
-"""Samples before a fault that kinds with a memory may look back on."""
+# The recording as it is -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -200,26 +168,56 @@ class Baseline:
             return f"biases not learned: {monitor.bias.state}"
         return f"no sample of {samples} has values of enough channels"
 
-    def doubted(self, rows: slice) -> bool:
-        """Whether something stands declared somewhere in these samples, or right before them."""
-        return bool(self.doubtful[max(0, rows.start - 1) : rows.stop].any())
 
-    def speeds(self, rows: slice) -> tuple[float, float]:
-        """Median and largest rate in these samples, rad/s; NaN: none."""
-        known = self.speed[rows][np.isfinite(self.speed[rows])]
-        return (float(np.median(known)), float(known.max())) if len(known) else (np.nan, np.nan)
+def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
+    """Judge a recording as it is; `BagError` if there is not a single sample."""
+    if not len(block):
+        raise BagError("its topics have no time in common: there is no sample of all channels")
+    kept = Kept(_what_counts)
+    judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
+    judge.take(block)
+    judged, doubtful, speed = kept.columns
+    seconds = _seconds(block)
+    begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
+    return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
+
+
+def _what_counts(output: Output) -> tuple[Mask, Mask, Array]:
+    """Of each sample: whether it is judged, whether a channel stands declared or gives nothing, fused rate, rad/s."""
+    alone, among = standing(output)
+    doubtful = np.asarray((alone | among).any(axis=1))
+    return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
+
+
+def _seconds(block: Block) -> Array:
+    """Return the times (N,) of the samples, s from the first."""
+    return np.asarray((block.stamp - block.stamp[0]) * 1e-9)
+
+
+def _rows_at(block: Block, at: float, watch: float) -> slice:
+    """Find the samples from a time on, s from the first, for so long."""
+    return slice(*np.searchsorted(_seconds(block), (at, at + watch)).tolist())
+
+
+# One fault, from the monitor as it stood before -----------------------------------------------------------------------
+
+
+LEAD = 1000
+"""Samples before a fault that kinds with a memory may look back on."""
 
 
 @dataclass(frozen=True)
 class Onset:
-    """A time from which faults are injected."""
+    """A time from which faults are injected, and all that the monitor remembers right before."""
 
     at: float
     """s from the first sample."""
     origin: int
     """Stamp of the first sample, ns."""
-    snapshot: Snapshot
-    """The monitor right before."""
+    core: NDArray[Any]
+    """(1,) `fdi_ros.core.records.Core`."""
+    states: dict[int, NDArray[Any]]
+    """Memory of the detector for each set of channels, by its bits."""
     block: Block
     """Samples from some before the onset to the end of the watch."""
     row: int
@@ -236,58 +234,33 @@ class Trial:
     scored: Scored
 
 
-def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Judge a recording as it is; `BagError` if there is not a single sample."""
-    if not len(block):
-        raise BagError("its topics have no time in common: there is no sample of all channels")
-    kept = Kept(_what_counts)
-    judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
-    judge.take(block)
-    judged, doubtful, speed = kept.columns
-    seconds = (block.stamp - block.stamp[0]) * 1e-9
-    begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
-    return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
-
-
-def _what_counts(output: Output) -> tuple[Mask, Mask, Array]:
-    """Of each sample: whether it is judged, whether a channel stands declared or gives nothing, fused rate, rad/s."""
-    alone, among = standing(output)
-    doubtful = np.asarray((alone | among).any(axis=1))
-    return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
-
-
-def rows_at(block: Block, at: float, watch: float) -> slice:
-    """Find the samples from a time on, s from the first, for so long."""
-    seconds = (block.stamp - block.stamp[0]) * 1e-9
-    return slice(*np.searchsorted(seconds, (at, at + watch)).tolist())
-
-
-def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[tuple[float, float]]:
-    """Find the first and last times, s, of pieces in which samples come for so long (``watch``, s) without a hole.
-
-    It is judged from ``begins`` to ``ends``; all times are from the first sample.
-    """
-    seconds = (block.stamp - block.stamp[0]) * 1e-9
-    spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
-    found = ((max(low, begins), min(high, ends) - watch) for low, high in spans)
-    return [(low, high) for low, high in found if high > low]
-
-
 def onsets_of(
     pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
 ) -> Iterator[Onset]:
     """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
-    walk, done = Walk(pipeline), 0
+    walk, detector, done = Walk(pipeline), pipeline.detector, 0
     for at in times:
-        rows = rows_at(block, at, watch)
+        rows = _rows_at(block, at, watch)
         walk.take(block[done : rows.start])
         done, first = rows.start, max(0, rows.start - lead)
-        yield Onset(at, int(block.stamp[0]), Snapshot.of(pipeline), block[first : rows.stop], rows.start - first)
+        own = detector.bank["row"][0]
+        states = {int(mask): detector.states[own[mask]].copy() for mask in np.flatnonzero(own >= 0)}
+        part, row = block[first : rows.stop], rows.start - first
+        yield Onset(at, int(block.stamp[0]), pipeline.core.copy(), states, part, row)
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
-    """Go on from an onset with one fault: what the monitor says of its samples from there on."""
-    onset.snapshot.restore(pipeline)
+    """Go on from an onset with one fault, whatever the monitor, one with the same settings, has seen since.
+
+    Returned is what it says of the samples from there on.
+    """
+    detector = pipeline.detector
+    # Sets that were met later are as if they had just been prepared.
+    detector.states[: int(detector.bank["rows"][0])] = np.zeros((), dtype=detector.states.dtype)
+    for mask, state in onset.states.items():
+        detector.prepare(mask)
+        detector.states[int(detector.bank["row"][0, mask])] = state
+    pipeline.core[:] = onset.core
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
     return pipeline.process(injected[onset.row :])
 
@@ -317,37 +290,25 @@ def monitor_of(config: Config) -> Pipeline:
 # All faults with all monitors -----------------------------------------------------------------------------------------
 
 
-Job = tuple[Config, Onset, int, Plan]
-"""Arguments of `try_faults`."""
-
-
-@dataclass(frozen=True)
+@dataclass
 class Subject:
-    """A monitor to be tried, and the samples as it aligns them."""
+    """A monitor to be tried, on the samples as it aligns them; `sweep` fills in what came of all faults."""
 
     name: str
     config: Config
     block: Block
-
-
-@dataclass(frozen=True)
-class SweepResult:
-    """What came of all faults with one monitor."""
-
-    name: str
-    config: Config
-    channels: tuple[str, ...]
+    channels: tuple[str, ...] = ()
     """Names of all channels; those excluded are tried with no fault."""
-    baseline: Baseline | None
+    baseline: Baseline | None = None
     """None: the monitor does not run."""
-    refused: str
+    refused: str = ""
     """Why it does not run, or judges nothing; empty: it does."""
     times: tuple[float, ...] = ()
     """At which faults began, s."""
-    speeds: tuple[tuple[float, float], ...] = ()
-    """Median and largest fused rate while they are watched, rad/s; NaN: none."""
     skipped: tuple[float, ...] = ()
     """At which none did, as something stands declared without one, or a channel gives nothing, s."""
+    speeds: tuple[float, ...] = ()
+    """Largest fused rate while the faults of each time are watched, rad/s; 0: none."""
     trials: tuple[Trial, ...] = ()
 
     @property
@@ -356,13 +317,59 @@ class SweepResult:
         return tuple(i for i, name in enumerate(self.channels) if name not in self.config.excluded_channels)
 
 
-def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[float, ...]:
+def sweep(
+    subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
+) -> Sequence[Subject]:
+    """Try every monitor, all with the same channels, with every fault of the plan, at the same times; return them.
+
+    ``workers``: processes; 1: this one alone. ``progress`` is called with the share done. `FdiError` if no monitor
+    judges the recording for long enough.
+    """
+    for one in subjects:
+        _watch(one)
+    baselines = [(one, one.baseline) for one in subjects if one.baseline is not None and not one.refused]
+    if not baselines:
+        raise FaultError(f"no fault can be tried: {subjects[0].refused}")
+    times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
+    jobs: list[tuple[Config, Onset, int, Plan]] = []
+    owners: list[Subject] = []
+    for one, baseline in baselines:
+        _take_times(one, baseline, times, plan.within)
+        jobs += _jobs_of(one, plan)
+        owners += [one] * (len(jobs) - len(owners))
+    found: dict[int, list[Trial]] = {}
+    for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
+        found[job] = trials
+        if progress is not None:
+            progress(done / len(jobs))
+    for job, owner in enumerate(owners):
+        owner.trials += tuple(found[job])
+    return subjects
+
+
+def _watch(one: Subject) -> None:
+    """Judge the recording as it is, or note why that cannot be done."""
+    try:
+        one.channels = build_geometry(one.config).channel_names
+        pipeline = monitor_of(one.config)
+        pipeline.restart()
+        one.baseline = watch_baseline(pipeline, one.block)
+    except FdiError as error:
+        one.refused = str(error)
+        return
+    one.refused = "" if one.baseline.judged else f"it judges nothing of this recording: {one.baseline.note}"
+
+
+def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[float]:
     """Spread the times of the faults evenly over what all of the monitors judge, s; none of them meets a gap.
 
     `FaultError` if that is too short to watch a fault.
     """
-    begins, end = max(one.begins for one in baseline), min(one.duration for one in baseline)
-    windows = windows_of(block, begins, end, plan.within)
+    begins, end = max(one.begins for one in baselines), min(one.duration for one in baselines)
+    seconds = _seconds(block)
+    spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
+    windows = [(max(low, begins), min(high, end) - plan.within) for low, high in spans]
+    windows = [(low, high) for low, high in windows if high > low]
     if not windows:
         gaps = ", in no piece of it without a gap long enough" if end - begins > plan.within else ": too short"
         raise FaultError(
@@ -374,67 +381,26 @@ def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[fl
     ends = np.cumsum(high - low)
     after = ends[-1] * (np.arange(plan.times) + 0.5) / plan.times
     place = np.searchsorted(ends, after)
-    return tuple((low[place] + (after - (ends - (high - low))[place])).tolist())
+    times: list[float] = (low[place] + (after - (ends - (high - low))[place])).tolist()
+    return times
 
 
-def sweep(
-    subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
-) -> tuple[SweepResult, ...]:
-    """Try every monitor, all with the same channels, with every fault of the plan, at the same times.
-
-    ``workers``: processes; 1: this one alone. ``progress`` is called with the share done. `FdiError` if no monitor
-    judges the recording for long enough.
-    """
-    tried = [_watched(subject) for subject in subjects]
-    able = [k for k, one in enumerate(tried) if not one.refused]
-    if not able:
-        raise FaultError(f"no fault can be tried: {tried[0].refused}")
-    baselines = [one.baseline for one in tried if one.baseline is not None and not one.refused]
-    times = times_of(baselines, subjects[able[0]].block, plan)
-    jobs: list[Job] = []
-    owners: list[int] = []
-    for k, baseline in zip(able, baselines, strict=True):
-        tried[k] = _timed(tried[k], baseline, times, subjects[k].block, plan.within)
-        jobs += _jobs_of(subjects[k], tried[k], plan)
-        owners += [k] * (len(jobs) - len(owners))
-    found: dict[int, list[Trial]] = {}
-    for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
-        found[job] = trials
-        if progress is not None:
-            progress(done / len(jobs))
-    for k in able:
-        trials_of = (trial for job, owner in enumerate(owners) if owner == k for trial in found[job])
-        tried[k] = replace(tried[k], trials=tuple(trials_of))
-    return tuple(tried)
+def _take_times(one: Subject, baseline: Baseline, times: Sequence[float], within: float) -> None:
+    """Take the times at which nothing stands declared, nothing injected, and no sample is missing."""
+    for at in times:
+        rows = _rows_at(one.block, at, within)
+        doubted = baseline.doubtful[max(0, rows.start - 1) : rows.stop].any()
+        if doubted or len(pieces(one.block.stamp[rows])) != 1:
+            one.skipped += (at,)
+            continue
+        speed = baseline.speed[rows]
+        one.times, one.speeds = (*one.times, at), (*one.speeds, float(speed.max(initial=0.0, where=np.isfinite(speed))))
 
 
-def _watched(subject: Subject) -> SweepResult:
-    names: tuple[str, ...] = ()
-    try:
-        names = build_geometry(subject.config).channel_names
-        pipeline = monitor_of(subject.config)
-        pipeline.restart()
-        baseline = watch_baseline(pipeline, subject.block)
-    except FdiError as error:
-        return SweepResult(subject.name, subject.config, names, None, str(error))
-    refused = "" if baseline.judged else f"it judges nothing of this recording: {baseline.note}"
-    return SweepResult(subject.name, subject.config, names, baseline, refused)
-
-
-def _jobs_of(subject: Subject, one: SweepResult, plan: Plan) -> list[Job]:
-    """One job per time and channel."""
-    pipeline = monitor_of(subject.config)
+def _jobs_of(one: Subject, plan: Plan) -> list[tuple[Config, Onset, int, Plan]]:
+    """Arguments of `try_faults`, for each time and channel."""
+    pipeline = monitor_of(one.config)
     pipeline.restart()
     lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
-    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead)
-    return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
-
-
-def _timed(one: SweepResult, baseline: Baseline, times: Sequence[float], block: Block, within: float) -> SweepResult:
-    """Take the times at which nothing stands declared, nothing injected."""
-    rows = {at: rows_at(block, at, within) for at in times}
-    # No sample is missing while a fault is watched.
-    whole = {at: len(pieces(block.stamp[own])) == 1 for at, own in rows.items()}
-    good = tuple(at for at in times if whole[at] and not baseline.doubted(rows[at]))
-    skipped = tuple(at for at in times if at not in good)
-    return replace(one, times=good, speeds=tuple(baseline.speeds(rows[at]) for at in good), skipped=skipped)
+    onsets = onsets_of(pipeline, one.block, one.times, plan.within, lead)
+    return [(one.config, onset, channel, plan) for onset in onsets for channel in one.used]

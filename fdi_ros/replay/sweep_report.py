@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import IO, Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi_ros.replay.episodes import episode_words
 from fdi_ros.replay.outcomes import Estimate, OutcomeKind, share
-from fdi_ros.replay.sweep import Baseline, Plan, SweepResult, Swept, Trial
+from fdi_ros.replay.sweep import Baseline, Plan, Subject, Swept
 from fdi_ros.report.layout import (
     PALETTE,
     Columns,
@@ -47,17 +47,13 @@ class Line:
     """What came of one kind in one size, over channels and times."""
 
     swept: Swept
+    trials: int
     counts: dict[str, int]
     """Trials by outcome."""
     named_after: Delays
     """Until the channel was declared by itself."""
     found_after: Delays
     """Until it was, or was one of a set."""
-
-    @property
-    def trials(self) -> int:
-        """How many."""
-        return sum(self.counts.values())
 
     def count(self, named: bool) -> int:
         """Trials in which the channel was named; otherwise also those in which it was in a set."""
@@ -79,24 +75,24 @@ class Line:
         return self.counts[OutcomeKind.FALSE_ISOLATION] + self.counts[OutcomeKind.FALSE_GROUP]
 
 
-def lines_of(tried: SweepResult, plan: Plan, channel: int | None = None) -> list[Line]:
+def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Line]:
     """Sum up by kind and size, over all channels or of one."""
-    own = [trial for trial in tried.trials if channel in (None, trial.channel)]
-    return [_line(swept, [trial for trial in own if trial.swept == swept], plan.within) for swept in plan.faults]
+    lines = []
+    for swept in plan.faults:
+        scored = [one.scored for one in tried.trials if one.swept == swept and channel in (None, one.channel)]
+        counts = {str(kind.value): sum(one.outcome is kind for one in scored) for kind in OutcomeKind}
+        # A fault that went with a false isolation was not found in any useful way.
+        good = [one for one in scored if one.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)]
+        named, found = [one.isolated_after for one in good], [one.detected_after for one in good]
+        delays = (_quantiles(after, len(scored), plan.within) for after in (named, found))
+        lines.append(Line(swept, len(scored), counts, *delays))
+    return lines
 
 
-def _line(swept: Swept, trials: Sequence[Trial], within: float) -> Line:
-    counts = {str(outcome.value): sum(trial.scored.outcome is outcome for trial in trials) for outcome in OutcomeKind}
-    # A fault that went with a false isolation was not found in any useful way.
-    good = [trial.scored for trial in trials if trial.scored.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)]
-    named = [one.isolated_after for one in good if one.isolated_after <= within]
-    found = [one.detected_after for one in good if one.detected_after <= within]
-    return Line(swept, counts, _quantiles(named, len(trials)), _quantiles(found, len(trials)))
-
-
-def _quantiles(delays: Sequence[float], trials: int) -> Delays:
-    """Quantiles of the delays of all trials; those without a delay are beyond all others."""
-    every = np.sort([*delays, *[math.inf] * (trials - len(delays))])
+def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
+    """Quantiles of the delays of all trials; those without a delay in time are beyond all others."""
+    known = [delay for delay in delays if delay <= within]
+    every = np.sort([*known, *[math.inf] * (trials - len(known))])
     if not trials:
         return Delays(math.nan, math.nan)
     return Delays(*(float(every[math.ceil(level * trials) - 1]) for level in (0.5, WANTED)))
@@ -126,13 +122,13 @@ def _smallest(lines: Sequence[Line], named: bool) -> Line | None:
     return found
 
 
-def sweep_figures(results: Sequence[SweepResult], plan: Plan, bag: str) -> dict[str, Any]:
+def sweep_figures(results: Sequence[Subject], plan: Plan, bag: str) -> dict[str, Any]:
     """Return all figures of a sweep: what its JSON file holds."""
     monitors = [_monitor_figures(tried, plan) for tried in results]
     return {"bag": bag, "within_s": plan.within, "times": plan.times, "seed": plan.seed, "monitors": monitors}
 
 
-def _monitor_figures(tried: SweepResult, plan: Plan) -> dict[str, Any]:
+def _monitor_figures(tried: Subject, plan: Plan) -> dict[str, Any]:
     lines, baseline = lines_of(tried, plan), tried.baseline
     return {
         "name": tried.name,
@@ -174,7 +170,7 @@ def _line_figures(line: Line) -> dict[str, Any]:
     }
 
 
-def write_csv(file: IO[str], results: Iterable[SweepResult], plan: Plan) -> None:
+def write_csv(file: IO[str], results: Iterable[Subject], plan: Plan) -> None:
     """Write one line for every fault."""
     writer = csv.writer(file)
     head = ("monitor", "channel", "kind", "size", "fault", "at_s", "outcome", "named_after_s", "found_after_s")
@@ -182,13 +178,9 @@ def write_csv(file: IO[str], results: Iterable[SweepResult], plan: Plan) -> None
     for tried in results:
         for trial in tried.trials:
             size = "" if trial.fault.size is None else f"{trial.fault.size:g}"
+            what = tried.name, tried.channels[trial.channel], trial.swept.kind, size, trial.swept.words
             after = ["" if math.isinf(value) else f"{value:.6f}" for value in trial.scored[1:]]
-            writer.writerow(
-                (
-                    *(tried.name, tried.channels[trial.channel], trial.swept.kind, size, trial.swept.words),
-                    *(f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after),
-                )
-            )
+            writer.writerow((*what, f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after))
 
 
 # In words and tables --------------------------------------------------------------------------------------------------
@@ -206,7 +198,7 @@ def smallest_hint(plan: Plan) -> str:
     )
 
 
-def figures_table(tried: SweepResult, plan: Plan) -> Rows:
+def figures_table(tried: Subject, plan: Plan) -> Rows:
     """One row per kind and size."""
     columns: Columns = {
         "fault": lambda line: line.swept.words,
@@ -222,7 +214,7 @@ def figures_table(tried: SweepResult, plan: Plan) -> Rows:
     return head_and_rows(columns, lines_of(tried, plan))
 
 
-def sound_lines(tried: SweepResult) -> list[str]:
+def sound_lines(tried: Subject) -> list[str]:
     """Say what the monitor makes of the recording as it is, and what follows for the rest."""
     baseline = tried.baseline
     if baseline is None or tried.refused:
@@ -251,7 +243,7 @@ def sound_lines(tried: SweepResult) -> list[str]:
     return lines
 
 
-def verdict_lines(tried: SweepResult, plan: Plan) -> list[str]:
+def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
     """Give the smallest size of each kind that is found."""
     lines = lines_of(tried, plan)
     if not tried.trials:
@@ -270,9 +262,9 @@ def verdict_lines(tried: SweepResult, plan: Plan) -> list[str]:
     return [*words, _motion(tried)]
 
 
-def _motion(tried: SweepResult) -> str:
+def _motion(tried: Subject) -> str:
     """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
-    moving, times = sum(largest > MOVES for _, largest in tried.speeds), len(tried.times)
+    moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
     words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
     if 2 * moving >= times:
         return words
@@ -289,7 +281,7 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     return f"from {size} {of}" if found else f"from a larger size on than {size} {of}"
 
 
-def side_by_side(results: Sequence[SweepResult], plan: Plan) -> Rows:
+def side_by_side(results: Sequence[Subject], plan: Plan) -> Rows:
     """Table of all monitors: share isolated, share detected, median delay until detected."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
@@ -313,7 +305,7 @@ HINTS = (
 )
 
 
-def sweep_text(results: Sequence[SweepResult], plan: Plan, bag: str) -> str:
+def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
     """Everything, for a terminal."""
     tried = [one for one in results if one.trials]
     count = sum(len(one.trials) for one in tried)
@@ -326,7 +318,7 @@ def sweep_text(results: Sequence[SweepResult], plan: Plan, bag: str) -> str:
     return "\n".join([head, *map(section_text, sections)])
 
 
-def _as_they_are(results: Sequence[SweepResult], plan: Plan) -> list[Section]:
+def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
     """Tell of each monitor without a fault, and of all side by side with faults."""
     sections = [Section(f"{one.name}, nothing injected", "", sound_lines(one)) for one in results]
     if sum(bool(one.trials) for one in results) > 1:
@@ -334,7 +326,7 @@ def _as_they_are(results: Sequence[SweepResult], plan: Plan) -> list[Section]:
     return sections
 
 
-def _figures(one: SweepResult, plan: Plan) -> Section:
+def _figures(one: Subject, plan: Plan) -> Section:
     at = ", ".join(f"{time:.1f}" for time in one.times)
     title = f"{one.name}, faults from {at} s on each of {len(one.used)} channels"
     return Section(title, "", figures_table(one, plan))
@@ -345,11 +337,11 @@ def _figures(one: SweepResult, plan: Plan) -> Section:
 
 LEAST_SIZES = 3
 """Of a kind for a curve; the map and the table show fewer as well."""
-Curve = tuple[str, str, Sequence[float]]
+Curve = tuple[str, str, Callable[[Line], float]]
 """Name, dash and values of a line of a plot."""
 
 
-def sweep_page(results: Sequence[SweepResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
+def sweep_page(results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
@@ -359,7 +351,7 @@ def sweep_page(results: Sequence[SweepResult], plan: Plan, bag: str, about: Mapp
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 
-def _summary(results: Sequence[SweepResult], plan: Plan) -> list[str]:
+def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
     lines = []
     for one in results:
         before = f"{one.name}: " if len(results) > 1 else ""
@@ -370,66 +362,54 @@ def _summary(results: Sequence[SweepResult], plan: Plan) -> list[str]:
     return [*lines[:1], f"{smallest_hint(plan)}:", *lines[1:]]
 
 
-def _curves(tried: Sequence[SweepResult], plan: Plan) -> list[Section]:
+def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:
     """Draw shares and delays of each kind that has several sizes."""
-    families = Counter(swept.family for swept in plan.faults)
-    names, sections = [one.name for one in tried], []
+    shares: list[Curve] = [
+        ("isolated", "solid", lambda line: 100 * line.isolated.value),
+        ("detected", "dash", lambda line: 100 * line.detected.value),
+    ]
+    if len(tried) == 1:
+        shares.append(("95 %, low", "dot", lambda line: 100 * line.isolated.low))
+        shares.append(("95 %, high", "dot", lambda line: 100 * line.isolated.high))
+    delays: list[Curve] = [
+        ("median", "solid", lambda line: line.found_after.median),
+        ("95 %", "dash", lambda line: line.found_after.p95),
+    ]
+    families, sections = Counter(swept.family for swept in plan.faults), []
     for family in [name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried]:
-        own = [[line for line in lines_of(one, plan) if line.swept.family == family] for one in tried]
+        own = {one.name: [line for line in lines_of(one, plan) if line.swept.family == family] for one in tried}
         hint = "Solid: isolated; dashed: detected; dotted: 95 % interval of the share isolated (Wilson 1927)."
         axis = {"title": {"text": "share of the faults, %"}, "range": [-3, 103]}
-        figure = _figure(names, own, [_shares(lines, len(tried) == 1) for lines in own], axis)
-        sections.append(Section(f"{family}: share detected", hint, "", [figure]))
-        if any(np.isfinite(line.found_after.median) for lines in own for line in lines):
+        sections.append(Section(f"{family}: share detected", hint, "", [_figure(own, shares, axis)]))
+        if any(np.isfinite(line.found_after.median) for lines in own.values() for line in lines):
             hint = "Until it was detected; solid: half of all faults were, dashed: 95 %. No point: fewer were."
-            figure = _figure(names, own, map(_delays, own), {"title": {"text": "delay, s"}, "type": "log"})
+            figure = _figure(own, delays, {"title": {"text": "delay, s"}, "type": "log"})
             sections.append(Section(f"{family}: delay", hint, "", [figure]))
     return sections
 
 
-def _shares(lines: Sequence[Line], intervals: bool) -> list[Curve]:
-    isolated = [line.isolated for line in lines]
-    curves: list[Curve] = [
-        ("isolated", "solid", [100 * one.value for one in isolated]),
-        ("detected", "dash", [100 * line.detected.value for line in lines]),
-    ]
-    if intervals:
-        curves.append(("95 %, low", "dot", [100 * one.low for one in isolated]))
-        curves.append(("95 %, high", "dot", [100 * one.high for one in isolated]))
-    return curves
-
-
-def _delays(lines: Sequence[Line]) -> list[Curve]:
-    return [
-        ("median", "solid", [line.found_after.median for line in lines]),
-        ("95 %", "dash", [line.found_after.p95 for line in lines]),
-    ]
-
-
-def _figure(
-    names: Sequence[str], lines: Sequence[Sequence[Line]], curves: Iterable[Sequence[Curve]], yaxis: dict[str, Any]
-) -> Figure:
+def _figure(monitors: Mapping[str, Sequence[Line]], curves: Sequence[Curve], yaxis: dict[str, Any]) -> Figure:
     """Draw the curves of each monitor against the size of the faults."""
-    alone, unit = len(names) == 1, lines[0][0].swept.unit
+    alone, unit = len(monitors) == 1, next(iter(monitors.values()))[0].swept.unit
     data = [
         {
             "type": "scatter",
             "mode": "lines" if dash == "dot" else "lines+markers",
             "name": words if alone else name,
-            "x": [line.swept.size for line in own],
-            "y": [round(value, 4) if np.isfinite(value) else None for value in values],
+            "x": [line.swept.size for line in lines],
+            "y": [round(y, 4) if np.isfinite(y) else None for y in map(value, lines)],
             "line": {"color": PALETTE[k % len(PALETTE)], "dash": dash},
             "showlegend": alone or dash == "solid",
         }
-        for k, (name, own, drawn) in enumerate(zip(names, lines, curves, strict=True))
-        for words, dash, values in drawn
+        for k, (name, lines) in enumerate(monitors.items())
+        for words, dash, value in curves
     ]
     xaxis = {"type": "log", "title": {"text": f"size, {unit}" if unit else "size"}}
     legend = {"orientation": "h", "y": 1.12}
     return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "legend": legend, "height": 360}}
 
 
-def _map(one: SweepResult, plan: Plan) -> Section:
+def _map(one: Subject, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
