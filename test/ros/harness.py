@@ -275,7 +275,7 @@ TRANSITIONS = {
 
 
 @contextlib.contextmanager
-def listening(topics=(), kind=Imu) -> Iterator[Listener]:
+def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
     """A listener that spins in a thread, in the ROS domain that processes started now have."""
     context = rclpy.get_default_context()
     # A test before may have had another domain.
@@ -283,7 +283,7 @@ def listening(topics=(), kind=Imu) -> Iterator[Listener]:
         rclpy.shutdown()
     if not context.ok():
         rclpy.init()
-    listener = Listener(topics, kind)
+    listener = make(topics, kind)
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
 

@@ -43,20 +43,20 @@ def injector(tmp_path_factory):
 
 
 def flow(injector, z: np.ndarray) -> tuple[np.ndarray, list[list[bytes]]]:
+    """Stamps of samples that are sent, and what comes of them."""
     listener, out, _ = injector
-    rest(out)
+
+    def rest() -> None:
+        before = -1
+        while before != (before := sum(map(len, out))):
+            time.sleep(0.3)
+
+    rest()
     for kept in out:
         kept.clear()
     stamps = listener.play(z)
-    rest(out)
+    rest()
     return stamps, out
-
-
-def rest(out: list[list[bytes]]) -> None:
-    """Wait until nothing more comes."""
-    before = -1
-    while before != (before := sum(map(len, out))):
-        time.sleep(0.3)
 
 
 def test_off_it_passes_every_byte(injector) -> None:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
 from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, wait
 from sensor_msgs.msg import Imu
@@ -25,33 +25,21 @@ from fdi_ros.sources.imus import ImuSource
 TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
 
 
-class Ears:
-    """What the node publishes."""
+class Ears(Listener):
+    """Hears what the node of the link publishes, and what all nodes say last."""
 
-    def __init__(self, listener: Listener, node: str = "mavlink_node") -> None:
-        self.listener, self.node = listener, node
+    def __init__(self, *arguments) -> None:
+        super().__init__(*arguments)
         self.imu: list[list[bytes]] = [[] for _ in TOPICS]
-        self.said: dict[str, DiagnosticStatus] = {}
         for kept, topic in zip(self.imu, TOPICS, strict=True):
-            listener.create_subscription(Imu, topic, kept.append, DEEP, raw=True)
-        listener.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 100)
+            self.create_subscription(Imu, topic, kept.append, DEEP, raw=True)
 
-    def _hear(self, message: DiagnosticArray) -> None:
-        self.said |= {status.name: status for status in message.status}
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.diagnostics.append((time.monotonic(), message))
 
-    def value(self, name: str, key: str) -> str:
-        status = self.said.get(f"{self.node}: {name}")
-        return {} if status is None else {pair.key: pair.value for pair in status.values}.get(key, "")
-
-    def says(self, name: str, words: str) -> bool:
-        def heard() -> bool:
-            status = self.said.get(f"{self.node}: {name}")
-            return status is not None and words in status.message
-
-        found = wait(heard)
-        if not found:
-            print(f"{name} never said {words!r}; said:", *self.said.values(), sep="\n")
-        return found
+    def _statuses(self, name: str) -> list:
+        names = (name, f"mavlink_node: {name}")
+        return [s for _, array in list(self.diagnostics) for s in array.status if s.name in names][-1:]
 
     def stamps(self, unit: int) -> np.ndarray:
         return np.array([ImuSource.parse(data, 3)[0] for data in list(self.imu[unit])])
@@ -60,8 +48,7 @@ class Ears:
 @contextlib.contextmanager
 def linked(config: str, url: str, *arguments: str) -> Iterator[tuple[Ears, Process]]:
     file = ROOT / "config" / f"{config}.yaml"
-    with listening(()) as listener:
-        ears = Ears(listener)
+    with listening(make=Ears) as ears:
         process = Process("mavlink_node", "--ros-args", "--params-file", str(file), "-p", f"url:={url}", *arguments)
         try:
             yield ears, process
@@ -71,24 +58,27 @@ def linked(config: str, url: str, *arguments: str) -> Iterator[tuple[Ears, Proce
         assert "Traceback" not in process.said()
 
 
+def struck(autopilot: Autopilot, unit: int, axis: int) -> Callable[[], None]:
+    """What, when called, lets a gyro of the autopilot go bad."""
+    strikes, healthy = [], autopilot.motion
+
+    def motion(t: float) -> np.ndarray:
+        z = healthy(t)
+        z[unit, axis] += 0.3 * bool(strikes)
+        return z
+
+    autopilot.motion = motion
+    return lambda: strikes.append(True)
+
+
 def boot() -> int:
     return time.monotonic_ns() - 100 * NS
 
 
 def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compiled) -> None:
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
-    strikes = [float("inf")]
     autopilot, other = (Autopilot("px4", system=system, boot=boot(), seed=system) for system in (2, 1))
-    healthy = autopilot.motion
-
-    def motion(t: float) -> np.ndarray:
-        z = healthy(t)
-        if t >= strikes[0]:
-            z[1, 1] += 0.3
-        return z
-
-    autopilot.motion = motion
-    port = free_port()
+    strike, port = struck(autopilot, 1, 1), free_port()
     words = ("-p", "named_values:=true", "-p", "mavlink_node:system_id:=2")
     monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "px4.yaml"))
     try:
@@ -96,16 +86,15 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
             assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
             assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
             assert not other.intervals
-            assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), ears.said
-            assert wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
-            assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
+            assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), process.said()
+            assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
             # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
             now = time.time_ns()
             assert wait(lambda: len(ears.imu[0]) > 50)
             assert abs(int(ears.stamps(0)[-1]) - now) < 30 * NS
             assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
             assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
-            strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
+            strike()
             told = (2, "FDI: imu_2.y faulty, left out")
             assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
             assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
@@ -117,17 +106,8 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
 
 def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain, compiled, tmp_path) -> None:
     """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
-    strikes = [float("inf")]
     autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
-    healthy = autopilot.motion
-
-    def motion(t: float) -> np.ndarray:
-        z = healthy(t)
-        z[0, 1] += 0.3 * (strikes[0] <= t)
-        return z
-
-    autopilot.motion = motion
-    port = free_port()
+    strike, port = struck(autopilot, 0, 1), free_port()
     words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={tmp_path / 'out.json'}")
     words += ("-r", "/fdi_node/integrity:=/verdict")
     settings = ("--params-file", str(ROOT / "config" / "ardupilot.yaml"), "-r", "~/integrity:=/verdict")
@@ -135,23 +115,18 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain
     try:
         with OverUdp(port, autopilot), linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
             assert ears.says("failover", "ready"), process.said()
-            assert wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
-            assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
-            stranger = ears.listener.create_publisher(Imu, "imu_1/data_raw", 1)
+            assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
+            stranger = ears.create_publisher(Imu, "imu_1/data_raw", 1)
             assert ears.says("failover", "the monitor is in doubt"), "rates of another source"
-            ears.listener.destroy_publisher(stranger)
+            ears.destroy_publisher(stranger)
             assert ears.says("failover", "ready")
-            strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
+            strike()
             assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
             assert wait(
                 lambda: any(text.startswith("FDI: IMU 1 (imu_1) out of use (gyro y") for _, text in autopilot.texts)
             )
             assert ears.says("failover", "out of use: IMU 1 (imu_1) of system 1")
-            restore = ears.listener.create_client(Trigger, "/mavlink_node/restore")
-            assert wait(restore.service_is_ready)
-            answer = restore.call_async(Trigger.Request())
-            assert wait(answer.done)
-            assert answer.result().message == "IMU 1 (imu_1) is put back"
+            assert ears.call(Trigger, "/mavlink_node/restore", Trigger.Request()).message == "IMU 1 (imu_1) is put back"
             assert wait(lambda: autopilot.flies_with == 0)
             assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
             assert "failover over an unsigned link" in process.said()

@@ -40,7 +40,7 @@ def stamp_of(message: Imu) -> int:
 
 def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
     words = [*WORDS, "-r", "__ns:=/drone"]
-    with listening(("unused",)) as listener:
+    with listening() as listener:
         heard: list[int] = []
         listener.create_subscription(Imu, "/drone/imu_1/data_raw", lambda m: heard.append(stamp_of(m)), DEEP)
         listener.create_subscription(Imu, "/drone/imu_2/data_raw", lambda m: None, DEEP)
@@ -70,7 +70,7 @@ def test_a_bag_waits_for_the_monitor_behind_the_injector_and_is_monitored_in_its
     """As replay.launch.py starts them; the monitor comes last, as where it compiles first. At four times the speed."""
     with Recording(flight) as recording:
         first = min(int(batch.log_time.min()) for batch in recording.batches(CONFIG.topics))
-    with listening(("unused",)) as listener:
+    with listening() as listener:
         simulated = ("-p", "use_sim_time:=true")
         playing = Process("player_node", *WORDS, "-p", f"bag:={flight}", "-p", "rate:=4.0", "-p", "wait:=3600.0")
         nodes = [playing, injecting := Process("injector_node", *WORDS, *simulated, "-p", "suffix:=_faulty")]
@@ -149,7 +149,7 @@ def test_a_damaged_first_time_is_not_waited_for(tmp_path: Path, first: int) -> N
     times = [first, *(begin + k * 10**7 for k in range(1, 100))]
     messages = [(topic, at, imu(at, (0.0, 0.0, 0.0))) for at in times for topic in CONFIG.topics]
     recording = write_mcap(tmp_path / "damaged.mcap", messages)
-    with listening(("unused",)) as listener:
+    with listening() as listener:
         heard: list[int] = []
         for topic in CONFIG.topics:
             listener.create_subscription(Imu, topic, lambda m: heard.append(stamp_of(m)), DEEP)
