@@ -91,6 +91,8 @@ class Detector(ABC):
     """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
+        if refused := self.refuses(geometry.n):
+            raise DetectorError(refused)
         self.geometry = geometry
         self.noise = noise.for_channels(geometry.n)
         self.options = options
@@ -283,5 +285,11 @@ def as_verdict(verdicts: NDArray[Any], n: int) -> Verdict:
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:
     """Names of the options that a detector class takes."""
-    parameters = inspect.signature(method).parameters
-    return tuple(name for name in parameters if name not in ("geometry", "noise"))
+    names: list[str] = []
+    for kind in method.__mro__:
+        parameters = inspect.signature(kind).parameters.values()
+        names += [one.name for one in parameters if one.kind == one.KEYWORD_ONLY and one.name not in names]
+        # What a class does not name it passes on to its base.
+        if all(one.kind != one.VAR_KEYWORD for one in parameters):
+            break
+    return tuple(names)

@@ -134,10 +134,9 @@ class Side:
 
 @record
 class State:
-    """Running sums, two per channel: downward, then upward."""
+    """Running sums, two per channel."""
 
-    down: Annotated[list[Side], MAX_CHANNELS]
-    up: Annotated[list[Side], MAX_CHANNELS]
+    sides: Annotated[list[Side], 2 * MAX_CHANNELS]  # downward of each channel, then upward
     room: Scratch
     resting: Channels  # of this sample: residuals over noise_std
     variance: Channels  # of this sample: variance of each w0 by all errors; by noise_std alone it is 1
@@ -149,14 +148,12 @@ def advance(
 ) -> None:
     """Take one sample into a running sum; it stays between 0 and 1.5 thresholds."""
     side.total = min(max(side.total + step, 0.0), 1.5 * params.threshold)
-    if side.total == 0.0 and side.count == 0:
-        return
-    if side.total == 0.0:
+    if side.total == 0.0 and side.count > 0:
         side.count = 0
         side.factor = side.systematic = 0.0
         for i in range(params.sensors.n):
             side.residual[i] = 0.0
-    elif side.count < params.window:
+    elif side.total > 0.0 and side.count < params.window:
         side.count += 1
         side.factor += factor
         side.systematic += systematic
@@ -180,13 +177,9 @@ def name(params: Constants, side: Side, state: State, sample: SampleInput, verdi
 @compiled
 def name_largest(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Name the channels by the largest sum, the downward ones first where several are as large."""
-    for i in range(params.sensors.n):
-        if state.down[i].total == verdict.statistic:
-            name(params, state.down[i], state, sample, verdict)
-            return
-    for i in range(params.sensors.n):
-        if state.up[i].total == verdict.statistic:
-            name(params, state.up[i], state, sample, verdict)
+    for k in range(2 * MAX_CHANNELS):
+        if state.sides[k].total == verdict.statistic:
+            name(params, state.sides[k], state, sample, verdict)
             return
 
 
@@ -217,9 +210,10 @@ def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleV
     for i in range(n):
         w, variance = verdict.scores[i] * shrink, state.variance[i]
         less = min(params.half_shift + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance), LARGEST)
-        advance(state.down[i], params, -w - less, factor, lasting, state.resting)
-        advance(state.up[i], params, w - less, factor, lasting, state.resting)
-        verdict.scores[i] = max(state.down[i].total, state.up[i].total)
+        down, up = state.sides[i], state.sides[MAX_CHANNELS + i]
+        advance(down, params, -w - less, factor, lasting, state.resting)
+        advance(up, params, w - less, factor, lasting, state.resting)
+        verdict.scores[i] = max(down.total, up.total)
         verdict.statistic = max(verdict.statistic, verdict.scores[i])
         if not sensors.detectable[i]:
             verdict.scores[i] = math.nan
@@ -304,7 +298,11 @@ class Cusum(Detector):
         params["scale"][:n] = 1 / np.sqrt(share)
         params["squares"][:n, :n] = residual**2 / share[:, None] / self.noise.noise_std**2
         params["bias"][:n] = params["squares"][:n, :n] @ self.noise.bias_std**2
-        self.threshold = _threshold(geometry, self.noise, shift / 2, self.run_length)
+        seen = np.flatnonzero(geometry.detectable).tolist()
+        first = [seen.index(group[0]) for group in geometry.groups if group[0] in seen]
+        directions = whitened_directions(geometry, self.noise)[first]
+        rho = directions @ directions.T
+        self.threshold = threshold_for(self.run_length, shift / 2, np.block([[rho, -rho], [-rho, rho]]))
         self.window = math.ceil(16 * self.threshold / shift) + 1
         """Samples after the onset, at most, that the naming of the channel rests on."""
         params["half_shift"], params["threshold"], params["window"] = shift / 2, self.threshold, self.window
@@ -314,14 +312,6 @@ class Cusum(Detector):
 
         0: no drift. At most `window`: that long or longer. Of a channel's two sums the larger counts.
         """
-        state, n = self.states[0], self.geometry.n
-        down, up = state["down"][:n], state["up"][:n]
+        sides, n = self.states[0]["sides"], self.geometry.n
+        down, up = sides[:n], sides[MAX_CHANNELS : MAX_CHANNELS + n]
         return np.where(up["total"] >= down["total"], up["count"], down["count"])
-
-
-def _threshold(geometry: Geometry, noise: NoiseModel, reference: float, run_length: float) -> float:
-    directions = whitened_directions(geometry, noise)
-    seen = np.flatnonzero(geometry.detectable).tolist()
-    first = [seen.index(group[0]) for group in geometry.groups if group[0] in seen]
-    rho = directions[first] @ directions[first].T
-    return threshold_for(run_length, reference, np.block([[rho, -rho], [-rho, rho]]))

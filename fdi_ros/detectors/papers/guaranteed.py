@@ -47,7 +47,7 @@ def circuits(axes: Array) -> Array:
 
 def _pairs(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 2)))
-    a, b = unit[index[:, 0]], unit[index[:, 1]]
+    a, b = unit[index.T]
     dependent = np.linalg.norm(np.cross(a, b), axis=1) < ROUNDING
     values = np.column_stack([np.ones(len(index)), -np.sign((a * b).sum(axis=1))])
     return _scatter(index[dependent], values[dependent], len(unit))
@@ -55,7 +55,7 @@ def _pairs(unit: Array) -> Array:
 
 def _triples(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 3)))
-    a, b, c = unit[index[:, 0]], unit[index[:, 1]], unit[index[:, 2]]
+    a, b, c = unit[index.T]
     dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < ROUNDING
     # In a plane with unit normal N: (b x c . N) a + (c x a . N) b + (a x b . N) c = 0.
     products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)[dependent]
@@ -69,10 +69,7 @@ def _triples(unit: Array) -> Array:
 
 def _quadruples(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 4)))
-    signs, others = (1, -1, 1, -1), ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
-    rows = unit[index]
-    volumes = [sign * np.linalg.det(rows[:, list(three)]) for sign, three in zip(signs, others, strict=True)]
-    values = np.stack(volumes, axis=1)
+    values = np.stack([(-1) ** k * np.linalg.det(unit[np.delete(index, k, axis=1)]) for k in range(4)], axis=1)
     whole = (np.abs(values) >= ROUNDING).all(axis=1)
     return _scatter(index[whole], values[whole], len(unit))
 
@@ -425,9 +422,6 @@ class Guaranteed(Detector):
 
 
 def _allowed_faults(n: int, asked: int | None, reduce: bool) -> int:
-    refused = Guaranteed.refuses(n)
-    if refused:
-        raise DetectorError(refused)
     allowed = min(MOST_FAULTS, n - 4)
     if asked is None:
         return allowed

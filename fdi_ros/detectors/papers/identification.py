@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from itertools import combinations
 from math import comb
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,22 +25,21 @@ from fdi_ros.detectors.papers.single_fault import (
     SingleFault,
     SingleFaultDetector,
     SumsOfForms,
+    chosen,
     conclude,
-    error_ratio,
+    conclude_by_error,
     fill_variances,
+    judge_sums,
     largest_form_threshold,
     resting_std,
-    score_by_sums,
     set_forms,
     std_of,
     value_of,
     worst,
 )
-from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.geometry import ROUNDING, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import FalseAlarmRate
 
 # The projector: sections 1 and 2 --------------------------------------------------------------------------------------
 
@@ -59,14 +58,6 @@ class OneNorm(SingleFault):
     solutions: Annotated[NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)]  # its error as a form of z
 
 
-@callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
-def judge_two_norm(params: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Judge one sample by what a fault of each channel leaves unexplained."""
-    score_by_sums(params, sample, verdict)
-    named = worst(params, verdict)
-    conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
-
-
 @callback(OneNorm, NoState, SampleInput, SampleVerdict)
 def judge_one_norm(params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the error of least 1-norm that explains it."""
@@ -83,8 +74,7 @@ def judge_one_norm(params: OneNorm, state: NoState, sample: SampleInput, verdict
     # The scores of all other channels are zero as they come.
     for k in range(n - 3):
         verdict.scores[params.channels[best, k]] = abs(value_of(params.solutions[best, k], z, n))
-    named = worst(params, verdict)
-    conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
+    conclude_by_error(params, sample, verdict)
 
 
 class Projector(SingleFaultDetector):
@@ -109,8 +99,8 @@ class Projector(SingleFaultDetector):
         ``svd`` or ``qr``: equal to rounding, QR is cheaper to build.
     norm
         ``l2`` or ``l1``.
-    false_alarm_probability, false_alarms_per_hour, sample_rate
-        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+    rate
+        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
 
     Raises
     ------
@@ -120,7 +110,7 @@ class Projector(SingleFaultDetector):
 
     name = "projector"
     Constants = SumsOfForms
-    judge = judge_two_norm
+    judge = judge_sums
 
     def __init__(
         self,
@@ -129,23 +119,19 @@ class Projector(SingleFaultDetector):
         *,
         construction: str = "svd",
         norm: str = "l2",
-        false_alarm_probability: float | None = None,
-        false_alarms_per_hour: float | None = None,
-        sample_rate: float | None = None,
+        **rate: Any,
     ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
         options = {"construction": construction, "norm": norm}
-        if norm not in NORMS:
-            raise ConfigError(f"norm is {norm!r}, expected one of: {', '.join(NORMS)}")
-        if norm == "l1":
+        one = chosen("norm", norm, NORMS) == "l1"
+        if one:
             self.Constants = OneNorm  # type: ignore[assignment]
             self.judge = judge_one_norm
         self.basis = parity_basis(geometry.axes, construction)
         """U2, (n, n - 3)."""
         errors = _single_errors(self.basis, geometry.detectable)
-        super().__init__(geometry, noise, rate, options, largest=norm == "l1", errors=errors)
+        super().__init__(geometry, noise, options, largest=one, errors=errors, **rate)
         params = self.constants[0]
-        if norm == "l1":
+        if one:
             sets, solutions = _basic_solutions(self.basis, geometry.detectable)
             count, m, n = solutions.shape
             params["sets"], params["channels"][:count, :m], params["solutions"][:count, :m, :n] = count, sets, solutions
@@ -160,9 +146,7 @@ def parity_basis(axes: Array, construction: str) -> Array:
 
     `ConfigError` if there is no such construction.
     """
-    if construction not in CONSTRUCTIONS:
-        raise ConfigError(f"construction is {construction!r}, expected one of: {', '.join(CONSTRUCTIONS)}")
-    if construction == "svd":
+    if chosen("construction", construction, CONSTRUCTIONS) == "svd":
         return np.linalg.svd(axes)[0][:, 3:]
     return np.linalg.qr(axes, mode="complete")[0][:, 3:]
 
@@ -218,17 +202,13 @@ class Innovations(SingleFault):
 @callback(Innovations, NoState, SampleInput, SampleVerdict)
 def judge_innovations(params: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the largest k_s of all equations and permutations."""
-    n, constant = params.sensors.n, params.sensors.constant
-    if not constant:
-        # The place of the errors is free until the verdict is concluded.
-        fill_variances(params, sample, verdict.error)
-    largest = 0.0
+    n, largest = params.sensors.n, 0.0
+    fill_variances(params, sample, verdict)
     for i in range(n):
         before, last = 0.0, 0.0
         for k in range(n - 3):
-            innovation = value_of(params.innovations[k, i], sample.z, n)
-            if not constant:
-                innovation /= std_of(params.innovations[k, i], verdict.error, n)
+            form = params.innovations[k, i]
+            innovation = value_of(form, sample.z, n) / std_of(params, form, 1.0, verdict)
             before, last = last, innovation * innovation
             largest = max(largest, last)
         verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
@@ -253,8 +233,8 @@ class Recursive(SingleFaultDetector):
     ----------
     geometry, noise
         As of every `Detector`.
-    false_alarm_probability, false_alarms_per_hour, sample_rate
-        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+    rate
+        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
 
     Raises
     ------
@@ -266,20 +246,10 @@ class Recursive(SingleFaultDetector):
     Constants = Innovations
     judge = judge_innovations
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        noise: NoiseModel,
-        *,
-        false_alarm_probability: float | None = None,
-        false_alarms_per_hour: float | None = None,
-        sample_rate: float | None = None,
-    ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
-        super().__init__(geometry, noise, rate, {}, largest=True, scored=geometry.n > 4)
+    def __init__(self, geometry: Geometry, noise: NoiseModel, **rate: Any) -> None:
         n = geometry.n
-        params = self.constants[0]
+        super().__init__(geometry, noise, {}, largest=True, scored=n > 4, **rate)
+        params, forms = self.constants[0], innovations(geometry.axes, self.noise.noise_std)
         params["innovations"][: n - 3, :n, :n] = forms
         params["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
 
@@ -339,18 +309,13 @@ class Struck(SingleFault):
 @callback(Struck, NoState, SampleInput, SampleVerdict)
 def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Judge one sample by the largest determinant over its standard deviation."""
-    constant = params.sensors.constant
-    if not constant:
-        # The place of the errors is free until the verdict is concluded.
-        fill_variances(params, sample, verdict.error)
     statistic = 0.0
+    fill_variances(params, sample, verdict)
     for j in range(CHANNELS):
         size = abs(value_of(params.determinants[j], sample.z, CHANNELS))
         # A determinant that is always zero has no deviation.
         if size > 0:
-            std = (
-                params.determinants_resting[j] if constant else std_of(params.determinants[j], verdict.error, CHANNELS)
-            )
+            std = std_of(params, params.determinants[j], params.determinants_resting[j], verdict)
             statistic = max(statistic, size / std)
         verdict.scores[j] = condition_without(params, j, sample) if params.by_condition else size
     conclude(params, worst(params, verdict), statistic, params.limit, sample, verdict)
@@ -366,14 +331,10 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither divides by delta, which is zero for a failed
     row without noise.
     """
-    complement, z = params.complement[j], sample.z
+    u, z = params.complement[j], sample.z
     s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
-    a, b, c = (
-        value_of(complement[0], z, CHANNELS),
-        value_of(complement[1], z, CHANNELS),
-        value_of(complement[2], z, CHANNELS),
-    )
-    delta = abs(value_of(complement[3], z, CHANNELS))
+    a, b, c = value_of(u[0], z, CHANNELS), value_of(u[1], z, CHANNELS), value_of(u[2], z, CHANNELS)
+    delta = abs(value_of(u[3], z, CHANNELS))
     largest = largest_root((a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0))
     a, b, c = a / s, b / t, c / v
     s, t, v = delta / s, delta / t, delta / v
@@ -426,8 +387,8 @@ class Determinant(SingleFaultDetector):
         Error model of a healthy channel.
     criterion
         ``determinant`` or ``condition_number``.
-    false_alarm_probability, false_alarms_per_hour, sample_rate
-        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+    rate
+        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
 
     Raises
     ------
@@ -441,23 +402,9 @@ class Determinant(SingleFaultDetector):
     Constants = Struck
     judge = judge_determinants
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        noise: NoiseModel,
-        *,
-        criterion: str = "determinant",
-        false_alarm_probability: float | None = None,
-        false_alarms_per_hour: float | None = None,
-        sample_rate: float | None = None,
-    ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        if refused := self.refuses(geometry.n):
-            raise DetectorError(refused)
-        if criterion not in CRITERIA:
-            raise ConfigError(f"criterion is {criterion!r}, expected one of: {', '.join(CRITERIA)}")
-        by_condition = criterion == "condition_number"
-        super().__init__(geometry, noise, rate, {"criterion": criterion}, largest=by_condition)
+    def __init__(self, geometry: Geometry, noise: NoiseModel, *, criterion: str = "determinant", **rate: Any) -> None:
+        by_condition = chosen("criterion", criterion, CRITERIA) == "condition_number"
+        super().__init__(geometry, noise, {"criterion": criterion}, largest=by_condition, **rate)
         forms = determinant_forms(geometry.axes)
         params = self.constants[0]
         params["determinants"], params["determinants_resting"] = forms, resting_std(forms, self.noise)
@@ -471,11 +418,8 @@ class Determinant(SingleFaultDetector):
     @classmethod
     def refuses(cls, n: int) -> str:
         """Why the method cannot run on n channels."""
-        if n == CHANNELS:
-            return ""
-        return (
-            f"determinant has {n} channels, expected {CHANNELS}: struck of one row, only [H z] of five rows is square"
-        )
+        words = f"determinant has {n} channels, expected {CHANNELS}: struck of one row, only [H z] of five is square"
+        return "" if n == CHANNELS else words
 
 
 def determinant_forms(axes: Array) -> Array:
@@ -484,6 +428,5 @@ def determinant_forms(axes: Array) -> Array:
     for j in range(CHANNELS):
         others = np.delete(np.arange(CHANNELS), j)
         for place, k in enumerate(others):
-            sign = -1.0 if place % 2 == 0 else 1.0
-            forms[j, k] = sign * np.linalg.det(axes[np.delete(others, place)])
+            forms[j, k] = (-1.0) ** (place + 1) * np.linalg.det(axes[np.delete(others, place)])
     return forms

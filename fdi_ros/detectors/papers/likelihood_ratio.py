@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
@@ -127,11 +128,8 @@ def fill_scratch(params: Hypotheses, sensors: Sensors, sample: SampleInput, room
             total += params.residual[i, j] * (sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j])
         room.residual[i] = total
     if not params.fixed:
-        a = sample.acceleration
         for i in range(n):
-            h = sensors.axes[i]
-            timing = sensors.timing_std[i] * (h[0] * a[0] + h[1] * a[1] + h[2] * a[2])
-            room.quiet[i] = sensors.noise_std[i] * sensors.noise_std[i] + timing * timing
+            room.quiet[i] = variance_of(sensors, i, 0.0, sample.acceleration)
 
 
 @compiled
@@ -333,16 +331,14 @@ def explain_by_units(
     params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
 ) -> bool:
     """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
-    found = NONE
+    found, possible = NONE, 0
     for k in range(params.units):
         unit = params.unit[k]
         if fit(params, sensors, sample, room, unit[0], unit[1], unit[2]) <= params.unit_limit:
-            if found != NONE:
-                return False
-            found = k
+            found, possible = k, possible + 1
             for place in range(3):
                 room.misfit[place] = room.estimate[place]
-    if found == NONE:
+    if possible != 1:
         return False
     for i in range(sensors.n):
         verdict.suspects[i] = False
@@ -436,8 +432,7 @@ class LikelihoodRatio(Detector):
         confidence: float = 0.999,
     ) -> None:
         rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        options = {**rate.as_options(), "confidence": confidence}
-        super().__init__(geometry, noise, options)
+        super().__init__(geometry, noise, {**rate.as_options(), "confidence": confidence})
         self.probability = rate.per_sample()
         params = self.constants[0]
         prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)

@@ -6,53 +6,25 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from fdi_ros.compiling.compiled import callback
-from fdi_ros.compiling.record import Flag, record
-from fdi_ros.core.records import SampleInput, SampleVerdict
-from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
     SingleFaultDetector,
     SumsOfForms,
-    conclude,
-    error_of,
-    error_ratio,
+    chosen,
+    judge_sums,
     largest_form_threshold,
     prediction_errors,
-    score_by_sums,
     set_forms,
-    worst,
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import FalseAlarmRate
 
 TOLERANCES = ("calibrated", "paper")
-
-
-@record
-class SearchConstants(SumsOfForms):
-    """Constants of a residual search."""
-
-    paper: Flag  # the tolerance is the paper's
-
-
-@callback(SearchConstants, NoState, SampleInput, SampleVerdict)
-def judge(params: SearchConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Judge one sample by the tolerance of its worst channel."""
-    score_by_sums(params, sample, verdict)
-    named = worst(params, verdict)
-    if params.paper:
-        residual = error_of(params, named, sample)
-        zero, scale = params.sensors.noise_std[named], params.sensors.scale_std[named] * (sample.z[named] - residual)
-        conclude(params, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
-    else:
-        conclude(params, named, error_ratio(params, named, sample, verdict), params.limit, sample, verdict)
 
 
 class ResidualSearch(SingleFaultDetector):
@@ -77,8 +49,9 @@ class ResidualSearch(SingleFaultDetector):
         As of every `Detector`.
     tolerance
         ``calibrated`` or ``paper``.
-    false_alarm_probability, false_alarms_per_hour, sample_rate
-        For `calibrated`: per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+    rate
+        For `calibrated`: `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with
+        `sample_rate`, Hz.
 
     Raises
     ------
@@ -86,32 +59,23 @@ class ResidualSearch(SingleFaultDetector):
         If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
     """
 
-    Constants = SearchConstants
-    judge = judge
+    Constants = SumsOfForms
+    judge = judge_sums
     criterion_squares: ClassVar[bool] = False
     """The criterion sums squares, not absolute values."""
     criterion_largest: ClassVar[bool] = False
     """The worst channel has the largest figure, not the least."""
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        noise: NoiseModel,
-        *,
-        tolerance: str = "calibrated",
-        false_alarm_probability: float | None = None,
-        false_alarms_per_hour: float | None = None,
-        sample_rate: float | None = None,
-    ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
+    def __init__(self, geometry: Geometry, noise: NoiseModel, *, tolerance: str = "calibrated", **rate: Any) -> None:
+        paper = chosen("tolerance", tolerance, TOLERANCES) == "paper"
+        if paper and any(value is not None for name, value in rate.items() if name != "sample_rate"):
+            raise ConfigError("tolerance 'paper' keeps no false-alarm rate: leave it out, or take 'calibrated'")
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
         scored = self.criterion_largest or geometry.n > 4
         largest = self.criterion_largest or not scored
-        super().__init__(geometry, noise, rate, {"tolerance": tolerance}, largest=largest, scored=scored)
+        super().__init__(geometry, noise, {"tolerance": tolerance}, largest=largest, scored=scored, **rate)
         params = self.constants[0]
-        forms = self._forms(geometry) if scored else self.errors[None]
-        set_forms(params, forms, squares=self.criterion_squares and scored)
+        set_forms(params, self._forms(geometry) if scored else self.errors[None], self.criterion_squares and scored)
         params["paper"] = paper
         if not paper:
             params["limit"] = largest_form_threshold(self.errors, geometry, self.noise, self.probability)
@@ -193,11 +157,3 @@ def _square_root(forms: Array, terms: int) -> Array:
     root = np.zeros((terms, forms.shape[1]))
     root[: len(singular)] = (singular[:, None] * rows)[:terms]
     return root
-
-
-def _is_paper(tolerance: str, per_sample: float | None, per_hour: float | None) -> bool:
-    if tolerance not in TOLERANCES:
-        raise ConfigError(f"tolerance is {tolerance!r}, expected one of: {', '.join(TOLERANCES)}")
-    if tolerance == "paper" and not (per_sample is None and per_hour is None):
-        raise ConfigError("tolerance 'paper' keeps no false-alarm rate: leave it out, or take tolerance 'calibrated'")
-    return tolerance == "paper"

@@ -17,11 +17,12 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.subsets import variance_of
-from fdi_ros.detectors.base import Detector
+from fdi_ros.detectors.base import Detector, NoState
+from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
@@ -64,15 +65,6 @@ def value_of(form: Array, z: Array, n: int) -> float:
     return total
 
 
-@compiled
-def std_of(form: Array, variance: Array, n: int) -> float:
-    """Return the standard deviation of one form when the n channels have these error variances, (rad/s)^2."""
-    total = 0.0
-    for j in range(n):
-        total += form[j] * form[j] * variance[j]
-    return math.sqrt(total)
-
-
 TRIAL_FAULT = 50.0
 """Size of the faults tried, in noise_std of their channel."""
 TRIAL_NOISE = 1.5
@@ -92,16 +84,14 @@ class SingleFault:
     suspects: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # row i: suspects when i is named
     names: Flags  # the fault is isolated when i is named
     sign: Real  # +1: the worst channel has the largest score; -1: the least
-    scored: Flag  # the scores tell channels apart
+    scored: Flag  # the scores tell channels apart; if not, none are published
 
 
-@record
-class SumsOfForms(SingleFault):
-    """For scores that are sums of absolute values or of squares of linear forms of z."""
-
-    terms: Whole  # forms per score
-    squares: Flag  # sum squares, not absolute values
-    forms: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)]  # [t, i]: t of score i
+def chosen(name: str, value: str, words: tuple[str, ...]) -> str:
+    """Return the value of an option; `ConfigError` if it is none of the words that it may be."""
+    if value not in words:
+        raise ConfigError(f"{name} is {value!r}, expected one of: {', '.join(words)}")
+    return value
 
 
 class SingleFaultDetector(Detector):
@@ -116,31 +106,25 @@ class SingleFaultDetector(Detector):
     Statistic and threshold, unless a method has its own: ``|z_i - z_ip|`` of the channel named over its standard
     deviation, against the level that the largest of these over all channels exceeds with the false-alarm probability.
 
-    Parameters
-    ----------
-    geometry, noise, options
-        As of every `Detector`.
-    rate
-        False-alarm rate; its options are added.
-    largest
-        The worst channel has the largest score, not the least.
-    scored
-        The scores tell channels apart; if not, none are published.
-    errors
-        Matrix (n, n) that maps z to ``z_i - z_ip``; by default from the axes.
+    ``options``: of the method, to which those of the false-alarm rate are added. ``largest``: the worst channel has the
+    largest score, not the least. ``scored``: as in `SingleFault`. ``errors``: matrix (n, n) that maps z to ``z_i -
+    z_ip``; None: from the axes.
     """
 
     def __init__(
         self,
         geometry: Geometry,
         noise: NoiseModel,
-        rate: FalseAlarmRate,
         options: dict[str, Any],
-        *,
-        largest: bool = False,
+        largest: bool,
         scored: bool = True,
         errors: Array | None = None,
+        *,
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
     ) -> None:
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
         super().__init__(geometry, noise, {**options, **rate.as_options()})
         self.probability = rate.per_sample()
         n = geometry.n
@@ -182,24 +166,6 @@ class SingleFaultDetector(Detector):
         self._set_suspects(found, self.geometry.isolable & (found.sum(axis=1) == 1))
 
 
-def set_forms(params: Any, forms: Array, squares: bool) -> None:
-    """Fill in what `SumsOfForms` adds, from forms (t, n, n)."""
-    terms, n, _ = forms.shape
-    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = terms, squares, forms
-
-
-@compiled
-def score_by_sums(params: SumsOfForms, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Fill the scores with the sums."""
-    n = params.sensors.n
-    for i in range(n):
-        total = 0.0
-        for t in range(params.terms):
-            value = value_of(params.forms[t, i], sample.z, n)
-            total += value * value if params.squares else abs(value)
-        verdict.scores[i] = total
-
-
 @compiled
 def worst(params: SingleFault, verdict: SampleVerdict) -> int:
     """Return the channel of the worst score among those whose faults are seen."""
@@ -218,22 +184,34 @@ def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
 
 
 @compiled
-def fill_variances(params: SingleFault, sample: SampleInput, variance: Array) -> None:
-    """Fill in the error variance of each channel at the least-squares rate of the sample, (rad/s)^2."""
-    for i in range(params.sensors.n):
+def fill_variances(params: SingleFault, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Error variance of each channel at the least-squares rate of the sample, (rad/s)^2, where that depends on it.
+
+    It is in the place of the errors, which is free until the verdict is concluded.
+    """
+    for i in range(0 if params.sensors.constant else params.sensors.n):
         rate_along = sample.z[i] - error_of(params, i, sample) * params.sensors.share[i]
-        variance[i] = variance_of(params.sensors, i, rate_along, sample.acceleration)
+        verdict.error[i] = variance_of(params.sensors, i, rate_along, sample.acceleration)
 
 
 @compiled
-def error_ratio(params: SingleFault, named: int, sample: SampleInput, verdict: SampleVerdict) -> float:
-    """``|z_i - z_ip|`` of the channel named over its standard deviation."""
-    std = params.resting[named]
-    if not params.sensors.constant:
-        # The place of the errors is free until the verdict is concluded.
-        fill_variances(params, sample, verdict.error)
-        std = std_of(params.errors[named], verdict.error, params.sensors.n)
-    return abs(error_of(params, named, sample)) / std
+def std_of(params: SingleFault, form: Array, resting: float, verdict: SampleVerdict) -> float:
+    """Return the standard deviation of one form in the sample, after `fill_variances`, from that at rest."""
+    if params.sensors.constant:
+        return resting
+    total = 0.0
+    for j in range(params.sensors.n):
+        total += form[j] * form[j] * verdict.error[j]
+    return math.sqrt(total)
+
+
+@compiled
+def conclude_by_error(params: SingleFault, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Fill the verdict, whose scores are there, by ``|z_i - z_ip|`` of the worst over its standard deviation."""
+    named = worst(params, verdict)
+    fill_variances(params, sample, verdict)
+    std = std_of(params, params.errors[named], params.resting[named], verdict)
+    conclude(params, named, abs(error_of(params, named, sample)) / std, params.limit, sample, verdict)
 
 
 @compiled
@@ -250,3 +228,38 @@ def conclude(
         verdict.error[i] = error_of(params, i, sample) if suspect else 0.0
         if not (params.scored and params.sensors.detectable[i]):
             verdict.scores[i] = math.nan
+
+
+# Scores that are sums of forms ----------------------------------------------------------------------------------------
+
+
+@record
+class SumsOfForms(SingleFault):
+    """For scores that are sums of absolute values or of squares of linear forms of z."""
+
+    terms: Whole  # forms per score
+    squares: Flag  # sum squares, not absolute values
+    forms: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)]  # [t, i]: t of score i
+    paper: Flag  # the tolerance of a residual search is that of its paper
+
+
+def set_forms(params: Any, forms: Array, squares: bool) -> None:
+    """Fill in forms (t, n, n)."""
+    terms, n, _ = forms.shape
+    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = terms, squares, forms
+
+
+@callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
+def judge_sums(params: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the error of the channel that the sums name."""
+    for i in range(params.sensors.n):
+        for t in range(params.terms):
+            value = value_of(params.forms[t, i], sample.z, params.sensors.n)
+            verdict.scores[i] += value * value if params.squares else abs(value)
+    if params.paper:
+        named = worst(params, verdict)
+        residual = error_of(params, named, sample)
+        zero, scale = params.sensors.noise_std[named], params.sensors.scale_std[named] * (sample.z[named] - residual)
+        conclude(params, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
+    else:
+        conclude_by_error(params, sample, verdict)
