@@ -65,20 +65,13 @@ def is_copy(copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b
     for lag in range(min(MAX_LAG, min(line.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
         for turned in range(2):
             source, target = (second, first) if turned else (first, second)
-            wanted = FEW
-            while agrees(copies, settings, line, source, target, lag, wanted):
-                if wanted == ROWS:
-                    return True
-                wanted = ROWS
+            agrees = True
+            for wanted in (FEW, ROWS):
+                agrees = agrees and sum_changes(copies, line, source, target, lag, wanted)
+                agrees = agrees and is_explained(copies, settings, target, wanted)
+            if agrees:
+                return True
     return False
-
-
-@compiled
-def agrees(
-    copies: Copies, settings: PathSettings, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
-) -> bool:
-    """Whether so many changes of the one unit are those of the other, some samples later."""
-    return sum_changes(copies, line, source, target, lag, wanted) and is_explained(copies, settings, target, wanted)
 
 
 @compiled
@@ -121,11 +114,8 @@ def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -
 
     What is not finite or out of range is no evidence.
     """
-    new, middle, old = (
-        line.rows[k % RESTAMP_SAMPLES],
-        line.rows[(k - 1) % RESTAMP_SAMPLES],
-        line.rows[(k - 2) % RESTAMP_SAMPLES],
-    )
+    new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
+    old = line.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
         out[place + i] = new.values[first + i] - 2.0 * middle.values[first + i] + old.values[first + i]
     return new.plain & middle.plain & old.plain & 7 << first == 7 << first

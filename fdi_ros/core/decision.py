@@ -144,7 +144,7 @@ def decide(limits: DecisionSettings, decision: Decision, n: int, evidence: Evide
     suspected = evidence.suspected & ~decision.faulty
     counted = 0 if evidence.held else suspected
     doubtful = suspected | evidence.outliers & ~decision.faulty
-    push(decision, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
+    push(decision, limits, n, (doubtful, counted, counted if evidence.isolated else 0, evidence.checked))
     decision.suspicion = at_least(decision, SUSPECTED, n, 1)
     # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
@@ -197,20 +197,15 @@ def reason_for(evidence: Evidence, i: int) -> int:
 
 
 @compiled
-def push(
-    decision: Decision, limits: DecisionSettings, n: int, suspected: int, counted: int, isolated: int, checked: int
-) -> None:
-    """Move the window on by one sample."""
+def push(decision: Decision, limits: DecisionSettings, n: int, sets: tuple[int, int, int, int]) -> None:
+    """Move the window on by one sample with these sets, by kind."""
     decision.at = (decision.at + 1) % limits.window
-    if counted:
+    if sets[COUNTED]:
         decision.alarms += 1
     if decision.sets[COUNTED, decision.at]:
         decision.alarms -= 1
     for kind in range(4):
-        new = checked if kind == CHECKED else isolated if kind == ISOLATED else counted
-        if kind == SUSPECTED:
-            new = suspected
-        old = decision.sets[kind, decision.at]
+        new, old = sets[kind], decision.sets[kind, decision.at]
         decision.sets[kind, decision.at] = new
         if new != old:
             for i in range(n):
@@ -301,17 +296,12 @@ def forget_alarms(decision: Decision, limits: DecisionSettings, n: int) -> None:
 
 
 @compiled
-def clear(decision: Decision, limits: DecisionSettings, n: int) -> None:
-    """Clear all that is declared or suspected."""
-    decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0
-    for i in range(n):
-        decision.why[i] = UNDECLARED
-    forget_alarms(decision, limits, n)
-
-
-@compiled
 def clear_declarations(core: NDArray[Any]) -> int:
     """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
-    declared = core[0].decision.faulty | core[0].decision.ambiguous
-    clear(core[0].decision, core[0].settings.decision, core[0].settings.n)
+    decision, settings = core[0].decision, core[0].settings
+    declared = decision.faulty | decision.ambiguous
+    decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0
+    for i in range(settings.n):
+        decision.why[i] = UNDECLARED
+    forget_alarms(decision, settings.decision, settings.n)
     return declared

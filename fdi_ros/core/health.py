@@ -31,12 +31,7 @@ NOT_BAD = -(1 << 62)
 
 @compiled
 def check(
-    limits: HealthSettings,
-    health: Health,
-    n: int,
-    stamp: int,
-    z: NDArray[np.float64],
-    received: NDArray[np.uint8],
+    limits: HealthSettings, health: Health, n: int, stamp: int, z: NDArray[np.float64], received: NDArray[np.uint8]
 ) -> None:
     """Check the values z (n,) of one sample; results in ``health.condition``."""
     if health.begun == 0:
@@ -46,9 +41,8 @@ def check(
             health.bad_stamp[i] = NOT_BAD
     health.begun += 1
     follow_presence(health, n, stamp, received)
-    update_received(limits, health, n, stamp, z, received)
     for i in range(n):
-        condition = health.condition[i]
+        condition = receive(limits, health, i, stamp, z[i]) if received[i] else MISSING
         if condition == FINE and limits.frozen_time and stamp - health.run_stamp[i] >= limits.frozen_time:
             condition = FROZEN
         if stamp - health.received_stamp[i] > limits.stale_time:
@@ -60,33 +54,24 @@ def check(
 
 
 @compiled
-def update_received(
-    limits: HealthSettings, health: Health, n: int, stamp: int, z: NDArray[np.float64], received: NDArray[np.uint8]
-) -> None:
-    """Remember the values that were received; ``health.condition``: what each is by itself, or that there is none."""
-    for i in range(n):
-        before = health.received_stamp[i]
-        if not received[i]:
-            health.condition[i] = MISSING
-            continue
-        # Across a hole it is unknown what the value was: a run begins anew.
-        hole = stamp - health.received_stamp[i] > limits.stale_time
-        health.received_stamp[i] = stamp
-        follow_share(health, i, math.isfinite(z[i]), stamp - before)
-        if math.isfinite(z[i]):
-            change = abs(z[i] - health.value[i])
-            if z[i] != health.value[i] or hole:
-                health.run_stamp[i] = stamp
-            if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
-                health.step[i] = change
-            health.value[i] = z[i]
-            health.bad_stamp[i] = NOT_BAD
-            health.condition[i] = OUT_OF_RANGE if abs(z[i]) >= limits.max_rate[i] else FINE
-        else:
-            if health.bad_stamp[i] == NOT_BAD or hole:
-                health.bad_stamp[i] = stamp
-            lasting = stamp - health.bad_stamp[i] >= limits.non_finite_time
-            health.condition[i] = NON_FINITE_LASTING if lasting else NON_FINITE
+def receive(limits: HealthSettings, health: Health, i: int, stamp: int, z: float) -> int:
+    """Remember a value that was received of channel i; return what is wrong with it by itself."""
+    # Across a hole it is unknown what the value was: a run begins anew.
+    step = stamp - health.received_stamp[i]
+    hole = step > limits.stale_time
+    health.received_stamp[i] = stamp
+    follow_share(health, i, math.isfinite(z), step)
+    if math.isfinite(z):
+        change = abs(z - health.value[i])
+        if z != health.value[i] or hole:
+            health.run_stamp[i] = stamp
+        if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
+            health.step[i] = change
+        health.value[i], health.bad_stamp[i] = z, NOT_BAD
+        return OUT_OF_RANGE if abs(z) >= limits.max_rate[i] else FINE
+    if health.bad_stamp[i] == NOT_BAD or hole:
+        health.bad_stamp[i] = stamp
+    return NON_FINITE_LASTING if stamp - health.bad_stamp[i] >= limits.non_finite_time else NON_FINITE
 
 
 # Values that come and go ----------------------------------------------------------------------------------------------
@@ -285,10 +270,17 @@ def update_repeated(core: Core) -> int:
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
     """Whether the rate of the channels in use is that of a vehicle at rest."""
     square = now.rate[0] * now.rate[0] + now.rate[1] * now.rate[1] + now.rate[2] * now.rate[2]
+    least = RESTS * largest_noise(settings) + AT_REST
+    return square < least * least
+
+
+@compiled
+def largest_noise(settings: PathSettings) -> float:
+    """Largest noise_std of all channels, rad/s."""
     noise = 0.0
     for i in range(settings.n):
         noise = max(noise, settings.sensors.noise_std[i])
-    return square < (RESTS * noise + AT_REST) * (RESTS * noise + AT_REST)
+    return noise
 
 
 @compiled
@@ -297,9 +289,7 @@ def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int)
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
     """
-    step, noise = largest_step(settings, health, now), 0.0
-    for i in range(settings.n):
-        noise = max(noise, settings.sensors.noise_std[i])
+    step, noise = largest_step(settings, health, now), largest_noise(settings)
     # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
     if not now.usable or (coarse and is_at_rest(settings, now)):

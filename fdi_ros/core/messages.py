@@ -84,9 +84,7 @@ def _write_double(out: Bytes, at: int, value: float) -> None:
 def _write_doubles(out: Bytes, at: int, values: NDArray[Any], places: Int, count: int) -> None:
     """Write the values at the first so many places, as `_write_double` does."""
     for i in range(count):
-        bits = np.float64(values[places[i]]).view(np.int64)
-        for k in range(8):
-            out[at + 8 * i + k] = bits >> 8 * k & 255
+        _write_double(out, at + 8 * i, values[places[i]])
 
 
 # Reading ------------------------------------------------------------------------------------------------------------

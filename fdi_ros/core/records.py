@@ -161,7 +161,7 @@ class Sensors:
 
 @record
 class Circumstances:
-    """What is known of a sample beside its values; channels are all those there are."""
+    """What is known of a sample beside its values; masks and `bias_std` are of all channels that there are."""
 
     stamp: Whole  # ns
     out: Mask  # channels taken out of use, which may be there all the same
@@ -190,22 +190,14 @@ class Estimate:
 
 
 @record
-class SampleInput:
-    """The values of one set of channels in one sample, in order, without gaps.
+class SampleInput(Circumstances):
+    """A sample of one set of channels, and what is known of it: values in order, without gaps.
 
     Of a method that takes any set of channels: of all channels, those in ``mask`` are there.
     """
 
     z: Channels  # rad/s
     mask: Mask
-    out: Mask  # channels taken out of use
-    beyond: Mask  # channels unfit for use in this sample by themselves
-    stamp: Whole  # ns
-    acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
-    interrupted: Flag  # there is a hole in the stream before this sample
-    held: Flag  # no evidence is to be taken, and what there is is void
-    repeated: Flag  # no evidence is to be taken
     estimate: Estimate  # filled by the method, if it estimates the errors of the sensors
 
 

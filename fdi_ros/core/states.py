@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.records import Condition, Core, Subset
 
-FINE, MISSING, NON_FINITE = int(Condition.FINE), int(Condition.MISSING), int(Condition.NON_FINITE)
-NON_FINITE_LASTING = int(Condition.NON_FINITE_LASTING)
-OUT_OF_RANGE, FROZEN, SILENT = int(Condition.OUT_OF_RANGE), int(Condition.FROZEN), int(Condition.SILENT)
+FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(int, Condition)
 
 
 class ChannelState(IntEnum):
@@ -61,44 +59,15 @@ class Reason(str, Enum):
 
 REASONS = tuple(Reason)
 
-
-OK, SUSPECT, AMBIGUOUS = int(ChannelState.OK), int(ChannelState.SUSPECT), int(ChannelState.AMBIGUOUS)
-FAULTY, STALE = int(ChannelState.FAULTY), int(ChannelState.STALE)
-UNCHECKED, EXCLUDED = int(ChannelState.UNCHECKED), int(ChannelState.EXCLUDED)
-
+OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED, EXCLUDED = map(int, ChannelState)
+_NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_FEW = range(8)
+_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _COPY = range(8, len(REASONS))
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
 """State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
-_OF_DISAGREEMENT = REASONS.index(Reason.DISAGREES)
-_OF_CONDITION = tuple(
-    REASONS.index(reason)
-    for reason in (
-        Reason.DISAGREES,
-        Reason.DISAGREES,
-        Reason.NON_FINITE,
-        Reason.OUT_OF_RANGE,
-        Reason.FROZEN,
-        Reason.NO_DATA,
-        Reason.NON_FINITE,
-    )
-)
+_OF_CONDITION = (_DISAGREES, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _FROZEN, _NO_DATA, _NON_FINITE)
 """Why, by `Condition`."""
-_OF_DECISION = tuple(
-    REASONS.index(reason)
-    for reason in (
-        Reason.NONE,
-        Reason.DISAGREES,
-        Reason.STUCK,
-        Reason.NON_FINITE,
-        Reason.DRIFTED,
-        Reason.INTERMITTENT,
-    )
-)
+_OF_DECISION = (_NONE, _DISAGREES, _STUCK, _NON_FINITE, _DRIFTED, _INTERMITTENT)
 """By why a channel was declared."""
-_TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
-    REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
-)
-_ALL_REPEAT, _COPY = REASONS.index(Reason.ALL_REPEAT), REASONS.index(Reason.COPY)
-_DRIFTED, _INTERMITTENT = REASONS.index(Reason.DRIFTED), REASONS.index(Reason.INTERMITTENT)
 
 
 @compiled
@@ -150,7 +119,7 @@ def update_reasons(core: Core, subset: Subset) -> None:
     """Why each channel is in its state; subset: the channels alive."""
     for i in range(core.settings.n):
         state, condition = core.last.state[i], core.health.condition[i]
-        reason = _OF_CONDITION[condition] if state == _SHOWN[condition] else _OF_DISAGREEMENT
+        reason = _OF_CONDITION[condition] if state == _SHOWN[condition] else _DISAGREES
         if state == OK:
             reason = 0
         elif state == EXCLUDED:
@@ -188,7 +157,7 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
         after, reason = last.state[i], core.reason[i]
         if after != core.state[i]:
             error = 0.0
-            if reason in (_OF_DISAGREEMENT, _DRIFTED) and not learning:
+            if reason in (_DISAGREES, _DRIFTED) and not learning:
                 error = core.now.verdict.error[i]
                 if error == 0:
                     # Of a drift that was declared before a restart the bias is known, too.
@@ -197,10 +166,9 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
                     # It gives nothing in this very sample.
                     error = 0.0
             event = events[count]
-            event.row, event.stamp, event.channel = row, last.stamp, i
+            event.row, event.stamp, event.channel, event.error = row, last.stamp, i, error
             event.before, event.after, event.reason = core.state[i], after, reason
             event.group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
-            event.error = error
             core.state[i], core.since[i], core.error[i] = after, last.stamp, error
             count += 1
     return count

@@ -17,16 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import allocate, call, compiled
-from fdi_ros.core.records import (
-    ACCELERATION_SAMPLES,
-    Acceleration,
-    Bank,
-    Circumstances,
-    SampleVerdict,
-    Sensors,
-    Subset,
-    TimedRate,
-)
+from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration, Bank, Circumstances, SampleVerdict, Sensors, Subset
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
@@ -192,14 +183,13 @@ def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.
         newest.rate[a] = rate[a]
         acceleration.value[a] = 0.0
     if here == 0:
-        note_known(acceleration, newest)
+        note_known(acceleration, 0)
         return
     while acceleration.oldest + 1 < here and (
         here - acceleration.oldest >= ACCELERATION_SAMPLES
         or acceleration.history[(acceleration.oldest + 1) % ACCELERATION_SAMPLES].stamp <= stamp - acceleration.window
     ):
-        acceleration.oldest += 1
-        note_known(acceleration, acceleration.history[acceleration.oldest % ACCELERATION_SAMPLES])
+        note_known(acceleration, acceleration.oldest + 1)
     if acceleration.has_known and math.isfinite(rate[0]):
         seconds = (stamp - acceleration.known.stamp) * 1e-9
         for a in range(3):
@@ -207,8 +197,9 @@ def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.
 
 
 @compiled
-def note_known(acceleration: Acceleration, one: TimedRate) -> None:
-    """Remember the rate of the oldest sample if it had one."""
+def note_known(acceleration: Acceleration, oldest: int) -> None:
+    """Go on to a number of the oldest sample, and remember its rate if it had one."""
+    acceleration.oldest, one = oldest, acceleration.history[oldest % ACCELERATION_SAMPLES]
     if math.isfinite(one.rate[0]):
         acceleration.has_known = 1
         acceleration.known.stamp = one.stamp
@@ -227,6 +218,15 @@ LARGEST_RATE = 1e6
 """rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
 UNPREPARED, REFUSED = -1, -2
 """Instead of a row: constants for these channels were not prepared yet; the method cannot run on them."""
+
+
+@compiled
+def count_of(mask: int, n: int) -> int:
+    """Return how many of n channels are in a set."""
+    count = 0
+    for i in range(n):
+        count += mask >> i & 1
+    return count
 
 
 @compiled
@@ -261,24 +261,23 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     row = 0 if bank.takes_any else bank.row[mask]
     if row == UNPREPARED:
         return False
+    clear_verdict(verdict, bank.n)
     if row == REFUSED:
-        clear_verdict(verdict, bank.n)
         return True
     present, judged = bank.sample, bank.judged
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
             present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
-            present.bias_std[k] = known.bias_std[i]
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
+        present.bias_std[i] = known.bias_std[i]
     for a in range(3):
         present.acceleration[a] = known.acceleration[a]
-    present.mask, present.out, present.stamp = mask, known.out, known.stamp
-    present.beyond = known.beyond
+    present.mask, present.out, present.beyond, present.stamp = mask, known.out, known.beyond, known.stamp
     present.interrupted, present.held, present.repeated = known.interrupted, known.held, known.repeated
     judged.alarm = judged.isolated = present.estimate.known = False
     call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)
@@ -286,13 +285,10 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
     k = 0
     for i in range(bank.n):
-        here = bank.takes_any or mask >> i & 1
-        verdict.suspects[i] = judged.suspects[k] if here else 0
-        verdict.error[i] = judged.error[k] if here else 0.0
-        verdict.scores[i] = judged.scores[k] if here else math.nan
-        verdict.noise[i] = judged.noise[k] if here else 0.0
-        verdict.outliers[i] = judged.outliers[k] if here else 0
-        k += 1 if here else 0
+        if bank.takes_any or mask >> i & 1:
+            verdict.suspects[i], verdict.outliers[i] = judged.suspects[k], judged.outliers[k]
+            verdict.error[i], verdict.scores[i], verdict.noise[i] = judged.error[k], judged.scores[k], judged.noise[k]
+            k += 1
     return True
 
 
