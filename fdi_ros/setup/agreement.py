@@ -28,12 +28,11 @@ LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel sh
 FOLLOWS = 0.9  # correlation from which a channel shows the rotation, if on another scale
 LEAST_WINDOWS = 20  # in motion; with fewer, units are not compared, and no mount is estimated
 SHARED, SAME = 0.7, 0.9  # share of rotation in common: less contradicts, more shows by which axes it would not
-SIGNED_AXES = [
+SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
     for signs in itertools.product((1.0, -1.0), repeat=3)
 ]
-"""All 48 ways to swap and reverse three axes."""
 
 
 def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) -> None:
@@ -104,12 +103,11 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     raise DisagreementError(words)
 
 
-_REVERSED = (
+_REVERSED = (  # what is seen of a unit whose x, y or z axis is reversed; x forward, y left, z up
     "shows a roll to the right as one to the left",
     "shows nose up as nose down",
     "shows a left turn as a right turn",
 )
-"""What is seen of a unit whose x, y or z axis is reversed; x forward, y left, z up."""
 
 
 def _wrong_axes(signed: Array) -> str:

@@ -58,7 +58,7 @@ class Finding(NamedTuple):
     headline: str = ""  # how the verdict begins where this decides it, one of `HEADLINES`; empty: it does not
 
 
-HEADLINES = {
+HEADLINES = {  # of verdicts, the first that is there decides
     "NEEDS": Severity.BAD,
     "NEEDS A LOOK": Severity.BAD,
     "DO NOT USE": Severity.BAD,
@@ -69,7 +69,6 @@ HEADLINES = {
     "USABLE": Severity.GOOD,
     "READY": Severity.GOOD,
 }
-"""Of verdicts, the first that is there decides."""
 
 
 def lines_of(findings: Iterable[Finding], role: Role) -> list[str]:
@@ -165,9 +164,9 @@ def needs(reports: Sequence[TopicReport]) -> str:
     """
     if chosen := candidates(reports):
         return in_degrees(chosen)
-    why = {shown(report.topic.name): _unusable(report) for report in reports if report.kind is not None}
-    good = [name for name, words in why.items() if not words]
-    bad = [f"{name}: {words}" for name, words in why.items() if words]
+    why = [(shown(report.topic.name), _unusable(report)) for report in reports if report.kind is not None]
+    good = [name for name, words in why if not words]
+    bad = [f"{name}: {words}" for name, words in why if words]
     usable = [f"usable: only {', '.join(good)}"] if good else []
     return "; ".join([NEEDED, *usable, *([first_of(bad, _NAMED, "; ", "; and")] if bad else [])])
 

@@ -25,7 +25,6 @@ from fdi_ros.system.text import date_of, shown
 
 GAP = 3.0  # intervals longer than this many usual ones are gaps
 _INTERVALS = 1_000_000  # intervals of a topic that are kept at most
-_USUAL = 0.999  # share of the intervals that a timeout must bear
 FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
 RECENT = 256  # messages in a row in which copies are looked for
 BELIEVED = 1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
@@ -49,7 +48,7 @@ class TopicReport:
     channels: int = 0  # values in a message, of what could be gyros; else 0
     announced: int = 0  # values that a message says it has: whatever its bytes claim
     largest: float = math.nan  # largest value that can be a rate, rad/s; NaN: there is none
-    intervals: list[Array] = field(default_factory=list)
+    intervals: list[Array] = field(default_factory=list)  # s, of the first messages
     copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
 
     def __post_init__(self) -> None:
@@ -81,11 +80,6 @@ class TopicReport:
     def complete(self) -> bool:
         """Whether there is a message in which every value can be a rate."""
         return not self.segments.empty
-
-    @property
-    def usual_longest(self) -> float:
-        """Interval that 999 of 1000 do not exceed, s."""
-        return float(np.quantile(np.concatenate(self.intervals), _USUAL)) if self.intervals else 0.0
 
 
 def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], tuple[str, ...]]:

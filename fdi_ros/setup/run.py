@@ -252,8 +252,7 @@ def recalibrate(
     return _proved(block, bag, start, end, proof, lambda part: (given, _calibrated(part, given, reference)), True)
 
 
-Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]
-"""The settings before, and those that a recording gives."""
+Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]  # settings before, and those of a recording
 
 
 def _kept_from(block: Block) -> tuple[float, float] | None:

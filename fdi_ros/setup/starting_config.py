@@ -32,6 +32,7 @@ _MOSTLY = 0.5  # share of a recording in motion from which its noise is that in 
 _TIMEOUT = float(PARAMETERS["imus.timeout"].default)  # s; that of health.stale_timeout is the same
 _BRIDGED = 4.4  # message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across
 _EXPLAINED = 0.3  # a rotation must bring the difference between two units down to this share: a fault stays
+_USUAL = 0.999  # share of the intervals that a timeout must bear
 _SILENT = 3.0  # message intervals without a value after which a channel may be called silent
 
 
@@ -183,7 +184,8 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
 
 def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
     """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
-    needed = max(max(intervals * report.interval, report.usual_longest) for report in chosen)
+    nearly_all = [float(np.quantile(np.concatenate(one.intervals), _USUAL)) for one in chosen if one.intervals]
+    needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
     return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
 
 
