@@ -5,32 +5,19 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from fdi_ros.replay.front import ConfigSource, Injected, Source
-    from fdi_ros.replay.summary import Summary
+from typing import Any
 
 
 class _Callable(ModuleType):
     """Package that can be called: ``fdi_ros.replay`` is a verb, too."""
 
-    def __call__(
-        self,
-        path: Source,
-        config: ConfigSource = None,
-        faults: Sequence[Injected] = (),
-        start: float = 0.0,
-        end: float = math.inf,
-    ) -> Summary:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Replay a recording; arguments as of `fdi_ros.replay.front.replay`, whose docstring explains them."""
         from fdi_ros.replay.front import replay
 
-        return replay(path, config, faults, start, end)
+        return replay(*arguments, **named)
 
 
 sys.modules[__name__].__class__ = _Callable

@@ -37,20 +37,15 @@ class Stretches:
         """Yield the parts of the next block, and of each whether a new stretch begins with it; never the first."""
         if not len(block):
             yield False, block
-            return
-        before = block.stamp[:1] if self._last is None else np.array([self._last])
-        far = np.diff(np.concatenate([before, block.stamp])) > GAP * 1e9
-        self._last = int(block.stamp[-1])
-        edges = [0, *np.flatnonzero(far).tolist(), len(block)]
-        for begin, end in pairwise(edges):
-            if end > begin:
-                yield bool(far[begin]), block[begin:end]
+        for rows in pieces(block.stamp, GAP):
+            anew = self._last is not None and int(block.stamp[rows.start]) - self._last > GAP * 1e9
+            self._last = int(block.stamp[rows.stop - 1])
+            yield anew, block[rows]
 
 
 def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
     """Return the rows of stamps (N,), ns, in pieces without an interval longer than this, s."""
-    cuts = (np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist()
-    edges = [0, *cuts, len(stamp)]
+    edges = [0, *(np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist(), len(stamp)]
     return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
@@ -242,15 +237,13 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     """Tell of an episode in one sentence, without a full stop."""
     until = "" if one.stands else f" to {one.end_s:.3f} s"
-    words = f"{one.who} {one.state} from {one.since_s:.3f} s{until}"
-    about = _about(one, unit)
+    about, before = _about(one, unit), _before(one)
     if one.apart is not None:
         where = "" if one.apart.channels == one.channels else f"seen on {one.apart.who.removesuffix(',')}: "
-        words += f", {where}{about}"
+        about = f", {where}{about}"
     elif about:
-        words += f" ({about})"
-    before = _before(one)
-    return f"{words}; {before}" if before else words
+        about = f" ({about})"
+    return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{f'; {before}' if before else ''}"
 
 
 def _about(one: Episode, unit: Unit) -> str:
@@ -267,29 +260,16 @@ def _about(one: Episode, unit: Unit) -> str:
         return "; ".join(part for part in ("" if disagrees else one.evidence.reason, size if disagrees else "") if part)
     if len(one.channels) <= FEW_CHANNELS:
         return "; ".join(f"{words} if it is {name}" for name, words in sizes)
-    return _range(one, unit)
-
-
-def _range(one: Episode, unit: Unit) -> str:
-    """Say between what the size lies where many channels are in question; empty: not known."""
     known = [abs(candidate.size.rad_s) for candidate in one.candidates if candidate.size is not None]
-    if not known:
-        return ""
-    least, most = (_figure(value, unit) for value in (min(known), max(known)))
-    return f"{least} to {most} {unit.name}, by which of them it is"
+    span = f"{_figure(min(known), unit)} to {_figure(max(known), unit)} {unit.name}" if known else ""
+    return f"{span}, by which of them it is" if span else ""
 
 
 def _before(one: Episode) -> str:
     """Say what it was before it came to what it is: the first step and the last."""
     # A channel that was the only one left, and not yet surely it, is the one that it came to.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
-    if not earlier:
-        return ""
-    told = [
-        step
-        for k, step in enumerate(earlier)
-        if k == 0 or (k == len(earlier) - 1 and len(step.channels) <= 1 + FEW_CHANNELS)
-    ]
+    told = [*earlier[:1], *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS)]
     return ", ".join(f"{_one_of(step.channels, step.who, one)} from {step.at_s:.3f} s" for step in told)
 
 
@@ -301,33 +281,31 @@ def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
     return who
 
 
-def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
-    """Tell the rest of an episode, each line under its title."""
-    several = [candidate for candidate in one.candidates if candidate.size and candidate.size.slope_rad_s2]
+def detail_words(one: Episode, unit: Unit = RADIANS, scored: bool = False) -> list[tuple[str, str]]:
+    """Tell the rest of an episode, each line under its title; scored: faults were injected."""
+    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
     lines = [("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")]
     if one.declares:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
         if 0 < len(axes) <= FEW_CHANNELS:
             lines.append(("axis", f"{', '.join(axes)} of the body"))
-        if several and len(one.channels) <= FEW_CHANNELS:
-            lines.append(("size", "; ".join(_growth(candidate, unit) for candidate in several)))
-        lines.append(("evidence", evidence_words(one)))
-        lines.append(("what else explains it", rival_words(one, unit)))
-    lines.append(("fused rate meanwhile", rate_words(one, unit)))
-    return lines
+        growing = [words for candidate in one.candidates if (words := _growth(candidate, unit))]
+        if growing and len(one.channels) <= FEW_CHANNELS:
+            lines.append(("size", "; ".join(growing)))
+        lines += [("evidence", _evidence(one)), ("what else explains it", _rivals(one, unit))]
+    return [*lines, ("fused rate meanwhile", _rate(one, unit)), *injected]
 
 
 def _growth(one: Candidate, unit: Unit) -> str:
-    """Say how an error went on that grows or shrinks."""
+    """Say how an error went on that grows or shrinks; nothing of others."""
     size = one.size
-    assert size is not None
-    first, last, slope = (
-        f"{value * unit.factor:+.3g}" for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2 or 0.0)
-    )
+    if size is None or not size.slope_rad_s2:
+        return ""
+    first, last, slope = (f"{value * unit.factor:+.3g}" for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2))
     return f"{one.channel} {size.course}: {slope} {unit.name} a second, from {first} to {last} {unit.name}"
 
 
-def evidence_words(one: Episode) -> str:
+def _evidence(one: Episode) -> str:
     """Say what the declaration rests on."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
@@ -337,7 +315,7 @@ def evidence_words(one: Episode) -> str:
     return ", ".join(words)
 
 
-def rival_words(one: Episode, unit: Unit = RADIANS) -> str:
+def _rivals(one: Episode, unit: Unit) -> str:
     """Say which other channels would explain it as well."""
     if one.state == "FAULTY":
         return "no other channel by itself" if len(one.channels) == 1 else "no channel by itself"
@@ -347,7 +325,7 @@ def rival_words(one: Episode, unit: Unit = RADIANS) -> str:
     return "; or ".join(f"{name} wrong by {words}" if words else name for name, words in sizes)
 
 
-def rate_words(one: Episode, unit: Unit = RADIANS) -> str:
+def _rate(one: Episode, unit: Unit) -> str:
     """Say what the fused rate did."""
     rate = one.rate
     if rate.published == 0.0:
@@ -357,11 +335,8 @@ def rate_words(one: Episode, unit: Unit = RADIANS) -> str:
     if rate.std_rad_s is not None:
         before = "" if rate.std_before_rad_s is None else f" ({_figure(rate.std_before_rad_s, unit)} before)"
         words.append(f"its standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}")
-    if rate.level_rad_s is None:
-        words.append("no protection level at times")
-    else:
-        words.append(f"protection level up to {_figure(rate.level_rad_s, unit)} {unit.name}")
-    return ", ".join(words)
+    level = "" if rate.level_rad_s is None else f"protection level up to {_figure(rate.level_rad_s, unit)} {unit.name}"
+    return ", ".join([*words, level or "no protection level at times"])
 
 
 def story_lines(story: Story, episodes: Sequence[Episode], unit: Unit = RADIANS) -> list[str]:

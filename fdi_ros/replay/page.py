@@ -120,7 +120,7 @@ class Report(Sink):
         scores, story, unit = summary.scores, summary.story, self._unit
         common = {
             "shapes": _shades(summary),
-            "marks": marks(scores.faults, story.episodes),
+            "marks": _marks(scores.faults, story.episodes),
         }
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         states = _timeline(self.names, self._first_states, summary)
@@ -182,8 +182,9 @@ class Report(Sink):
             _line("statistic", "statistic", _INK, 1.2),
             _line("threshold", "threshold", "#e0662f", 1.8, dash="dash"),
         ]
-        axis = {"type": "log" if log else "linear", "title": {"text": "statistic, and threshold"}}
-        return {"data": lines, "layout": time_layout(240, yaxis=axis, **layout)}
+        figure = _plot(lines, 240, "statistic, and threshold", True, layout)
+        figure["layout"]["yaxis"]["type"] = "log" if log else "linear"
+        return figure
 
     def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
         """Draw the fused rate about an axis, and what the channels that see it make of it."""
@@ -243,13 +244,10 @@ def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
     room = max(SHOWN_AROUND, 0.2 * one.duration_s)
     low, high = max(0.0, one.start_s - room), one.end_s + room
     link = f'<a href="#t={low:.3f},{high:.3f}">show it</a>'
-    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
     date = date_of(origin + round(one.start_s * 1e9)) if origin is not None else None
     begin = [("begins", f"{date:%Y-%m-%d %H:%M:%S} UTC")] if date is not None else []
-    rows = "".join(
-        f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>"
-        for title, words in (*begin, *detail_words(one, unit), *injected)
-    )
+    told = (*begin, *detail_words(one, unit, scored))
+    rows = "".join(f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>" for title, words in told)
     head = f"<h3>{escape(episode_words(one, unit))}.</h3>"
     return f'<article class="{one.state.lower()}">{head}{link}<dl>{rows}</dl></article>'
 
@@ -272,15 +270,13 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
 
 def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
     levels = summary.monitor.protection_level
-    return {
-        "protection level at end": _per_axis(levels.at_end, unit),
-        "protection level after one more loss": _per_axis(levels.after_one_more_loss, unit),
-    }
+    titled = {"at end": levels.at_end, "after one more loss": levels.after_one_more_loss}
 
+    def say(values: Sequence[float | None]) -> str:
+        words = ("none" if value is None else f"{value * unit.factor:.4g}" for value in values)
+        return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + f" {unit.name}"
 
-def _per_axis(values: Sequence[float | None], unit: Unit) -> str:
-    words = ("none" if value is None else f"{value * unit.factor:.4g}" for value in values)
-    return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + f" {unit.name}"
+    return {f"protection level {when}": say(values) for when, values in titled.items()}
 
 
 def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:
@@ -327,10 +323,9 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary) -> F
         state, since, reason = current[name]
         into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
         for low, high in _recorded(since, max(until, since), holes):
-            into["row"].append(names.index(name))
-            into["from"].append(low)
-            into["to"].append(high)
-            into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
+            words = f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s"
+            for values, value in zip(into.values(), (names.index(name), low, high, words), strict=True):
+                values.append(value)
 
     changes = [event for event in scores.events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
@@ -373,25 +368,19 @@ def _in_view(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[lis
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
 
-def marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+def _marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
-    found = []
+    found: list[tuple[float | None, str, str, str]] = []
     for fault in faults:
-        words = f"{fault.kind} on {fault.channel}"
         for kind, at in (("detected", fault.detected_at_s), ("isolated", fault.isolated_at_s)):
-            if at is not None:
-                found.append({"x": at, "kind": kind, "text": f"{words}: {kind} at {at:.3f} s"})
+            found.append((at, kind, f"{fault.kind} on {fault.channel}: {kind}", ""))
     why = ", no injected fault explains it" if faults else ""
     for one in [one for one in episodes if one.declares and not one.injected][:MOST_MARKS]:
-        first = one.steps[0]
-        found.append(
-            {"x": one.start_s, "kind": "declared", "text": f"{first.who} {first.state} at {one.start_s:.3f} s{why}"}
-        )
+        found.append((one.start_s, "declared", f"{one.steps[0].who} {one.steps[0].state}", why))
         if one.state == "FAULTY" and one.since_s > one.start_s:
-            found.append(
-                {"x": one.since_s, "kind": "isolated", "text": f"{one.who} {one.state} at {one.since_s:.3f} s{why}"}
-            )
-    return found
+            found.append((one.since_s, "isolated", f"{one.who} {one.state}", why))
+    known = [(at, kind, f"{words} at {at:.3f} s{why}") for at, kind, words, why in found if at is not None]
+    return [{"x": at, "kind": kind, "text": text} for at, kind, text in known]
 
 
 def _autopilot_marks(summary: Summary) -> list[dict[str, Any]]:

@@ -38,19 +38,15 @@ from fdi_ros.replay.episodes import (
     Stretch,
     episode_words,
 )
+from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.size import CERTAIN, Batches
 
-Told = NDArray[np.int8]
+Told = NDArray[np.uint8]
+"""States, of which those that say nothing are OK."""
 ReasonOf = Callable[[set[int]], str]
-
-NOTHING, ONE_OF, FAULTY, STALE, HIDDEN, LEFT_OUT = range(6)
-"""What a state says: nothing, one of a set, faulty, silent; that it hides what is declared; taken out by hand."""
-_STATES = {ONE_OF: "AMBIGUOUS", FAULTY: "FAULTY", STALE: "STALE"}
-_TOLD = np.zeros(len(ChannelState), dtype=np.int8)
-_TOLD[ChannelState.AMBIGUOUS], _TOLD[ChannelState.FAULTY] = ONE_OF, FAULTY
-_TOLD[ChannelState.STALE], _TOLD[ChannelState.SUSPECT] = STALE, HIDDEN
-_TOLD[ChannelState.EXCLUDED] = LEFT_OUT
-_DECLARES = np.isin(np.arange(LEFT_OUT + 1), (ONE_OF, FAULTY))
+S = ChannelState
+_DECLARED, _TOLD, _HIDING = (S.AMBIGUOUS, S.FAULTY), (S.AMBIGUOUS, S.FAULTY, S.STALE), (S.STALE, S.SUSPECT)
+"""States that declare; that an episode may have; that hide what is declared."""
 
 MOST_EPISODES = 1000
 MOST_STEPS = 20
@@ -68,7 +64,7 @@ HOLES = 0.1, 5.0
 class _Open:
     """An episode that still stands."""
 
-    kind: int
+    kind: ChannelState
     members: set[int]
     start: float
     since: float
@@ -97,7 +93,7 @@ class Recorder:
         self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
         self._pairs = lone_pairs(geometry)
-        self._before: Told = np.zeros(geometry.n, dtype=np.int8)
+        self._before: Told = np.zeros(geometry.n, dtype=np.uint8)
         self._tail = np.empty((0, 2))
         """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
         self._interval = np.inf
@@ -117,7 +113,7 @@ class Recorder:
         self._open, self._before = [], np.zeros_like(self._before)
         self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, np.nan
         if self._part is not None:
-            self._stretches.append(_rounded(self._part))
+            self._stretches.append(self._part)
         self._part = None
 
     def add(self, time: Array, output: Output) -> None:
@@ -128,8 +124,9 @@ class Recorder:
             # Units begin one after the other, as behind a hole.
             self._resumed = float(time[0])
         resumed, told = self._holes(time), self._told(output.state)
-        self._add_to_stretch(time, output, told)
-        changes = self._changes(told)
+        before = np.vstack([self._before, told[:-1]])
+        self._add_to_stretch(time, output, before)
+        changes = np.flatnonzero((told != before).any(axis=1)).tolist()
         # Where nothing changes, the last samples are enough.
         first = 0 if changes else max(0, int(np.searchsorted(time, time[-1] - TOGETHER)) - 1)
         self._tail = np.vstack([self._tail, np.column_stack([time[first:], _stds(output, slice(first, None))])])
@@ -138,10 +135,12 @@ class Recorder:
         for begin, end in pairwise(edges):
             if begin in changed:
                 self._resumed = max(resumed[resumed <= time[begin]], default=self._resumed)
-                self._change(begin, time, output, told, reasons)
+                stamp = int(output.stamp[begin])
+                named = {i: why for i in range(output.n) if (why := reasons.get((stamp, i)))}
+                self._change(float(time[begin]), before[begin], told[begin], named)
             if self._open:
                 self._take(slice(begin, end), time, output, told[begin])
-        self._before = told[-1]
+        self._before = told[-1].copy()
         self._resumed = max(resumed, default=self._resumed)
         self._tail = self._tail[self._row_before(time[-1]) :]
 
@@ -153,37 +152,29 @@ class Recorder:
         """
         standing = [self._ended(one, None) for one in self._open]
         kept = [*self._episodes, *(one for one in standing if one is not None and (one.declares or one.start_s <= end))]
-        stretches = [*self._stretches, *([] if self._part is None else [_rounded(self._part)])]
-        episodes = sorted(kept, key=lambda one: (one.start_s, one.since_s))
-        return Story(tuple(stretches), tuple(episodes), self._more)
+        parts = [*self._stretches, *([] if self._part is None else [self._part])]
+        stretches = [
+            Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))
+            for one in parts
+        ]
+        return Story(tuple(stretches), tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
         """Return what the states (N, n) say; what hides nothing says nothing."""
         if not state.any():
-            return np.zeros(state.shape, dtype=np.int8)
-        told = _TOLD[state]
-        in_sets = (told == ONE_OF).any(axis=0)
+            return state
+        told, in_sets = state.copy(), (state == S.AMBIGUOUS).any(axis=0)
         for one in self._open:
-            if one.kind == ONE_OF:
+            if one.kind == S.AMBIGUOUS:
                 in_sets[list(one.members)] = True
-        told[(told == HIDDEN) & ~in_sets] = NOTHING
+        told[(state == S.UNCHECKED) | ((state == S.SUSPECT) & ~in_sets)] = S.OK
         return told
 
-    def _changes(self, told: Told) -> list[int]:
-        """Find the rows in which something else is said than in the one before."""
-        if not told.any() and not self._before.any():
-            return []
-        rows: list[int] = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
-        return rows
-
-    def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
-        if self._part is None:
-            self._part = Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
-        part, judged = self._part, np.isfinite(output.threshold)
-        steps = np.diff(np.concatenate([[part.end_s], time]))
-        watched = judged & (steps <= HOLE)
-        if told.any() or self._before.any():
-            watched &= ~_DECLARES[np.vstack([self._before, told[:-1]])].any(axis=1)
+    def _add_to_stretch(self, time: Array, output: Output, before: Told) -> None:
+        """Count samples; before: what was told right before each."""
+        part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
+        judged, steps = np.isfinite(output.threshold), np.diff(np.concatenate([[part.end_s], time]))
+        watched = judged & (steps <= HOLE) & ~np.isin(before, _DECLARED).any(axis=1)
         self._part = Stretch(
             part.start_s,
             float(time[-1]),
@@ -192,33 +183,23 @@ class Recorder:
             part.watched_s + float(steps[watched].sum()),
         )
 
-    def _change(
-        self,
-        row: int,
-        time: Array,
-        output: Output,
-        told: Told,
-        reasons: Mapping[tuple[int, int], str],
-    ) -> None:
-        """Take over what one sample changed."""
-        now, at = told[row], float(time[row])
-        before = told[row - 1] if row else self._before
-        new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _STATES}
-        stamp = int(output.stamp[row])
+    def _change(self, at: float, before: Told, now: Told, reasons: Mapping[int, str]) -> None:
+        """Take over what one sample changed; reasons: by channel."""
+        new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _TOLD}
 
         def reason_of(members: set[int]) -> str:
-            return next((why for i in sorted(members) if (why := reasons.get((stamp, i), ""))), "")
+            return next((reasons[i] for i in sorted(members) if i in reasons), "")
 
         std = float(self._tail[self._row_before(at), 1])
-        for one in [one for one in self._open if one.kind == ONE_OF]:
+        for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
             self._follow_set(one, now, new, at, reason_of)
-        taken = set().union(*(one.members for one in self._open if one.kind == FAULTY and one.since == at))
-        for group in self._by_unit(new[FAULTY] - taken):
-            self._open.append(self._opened(FAULTY, group, at, reason_of(group), std))
-        if new[ONE_OF] and not any(one.kind == ONE_OF for one in self._open):
-            self._open.append(self._opened(ONE_OF, new[ONE_OF], at, reason_of(new[ONE_OF]), std))
-        hidden = set().union(*(one.members for one in self._open if one.kind != STALE))
-        for group in self._by_unit(new[STALE] - hidden):
+        taken = set().union(*(one.members for one in self._open if one.kind == S.FAULTY and one.since == at))
+        for group in self._by_unit(new[S.FAULTY] - taken):
+            self._open.append(self._opened(S.FAULTY, group, at, reason_of(group), std))
+        if new[S.AMBIGUOUS] and not any(one.kind == S.AMBIGUOUS for one in self._open):
+            self._open.append(self._opened(S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std))
+        hidden = set().union(*(one.members for one in self._open if one.kind != S.STALE))
+        for group in self._by_unit(new[S.STALE] - hidden):
             self._silent(group, at, reason_of(group), std)
         ended = [one for one in self._open if self._is_over(one, now)]
         self._open = [one for one in self._open if one not in ended]
@@ -239,11 +220,15 @@ class Recorder:
         """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
         return max(0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1)
 
-    def _follow_set(self, one: _Open, now: Told, new: Mapping[int, set[int]], at: float, reason_of: ReasonOf) -> None:
+    def _follow_set(
+        self, one: _Open, now: Told, new: Mapping[ChannelState, set[int]], at: float, reason_of: ReasonOf
+    ) -> None:
         """Let a set widen, narrow, or come to a name."""
-        named = new[FAULTY] & one.members
-        hidden = {i for i in one.members if now[i] in (STALE, HIDDEN)}
-        kind, members = (FAULTY, named) if named else (ONE_OF, set(np.flatnonzero(now == ONE_OF).tolist()) | hidden)
+        named = new[S.FAULTY] & one.members
+        kind, members = S.FAULTY, named
+        if not named:
+            kind, members = S.AMBIGUOUS, set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
+            members |= {i for i in one.members if now[i] in _HIDING}
         if not members or (members == one.members and kind == one.kind):
             return
         one.kind = kind
@@ -255,12 +240,12 @@ class Recorder:
         """Open an episode of channels that give nothing, or add them to that of their unit."""
         unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
         for one in self._open:
-            if one.kind == STALE and one.members <= unit and at - one.start <= TOGETHER:
+            if one.kind == S.STALE and one.members <= unit and at - one.start <= TOGETHER:
                 self._step(one, one.members | group, one.since)
                 return
-        self._open.append(self._opened(STALE, group, at, reason, std))
+        self._open.append(self._opened(S.STALE, group, at, reason, std))
 
-    def _opened(self, kind: int, members: set[int], at: float, reason: str, std: float) -> _Open:
+    def _opened(self, kind: ChannelState, members: set[int], at: float, reason: str, std: float) -> _Open:
         one = _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
         self._step(one, members, at)
         return one
@@ -269,9 +254,9 @@ class Recorder:
         """Note who it is from now on."""
         one.members, one.since = members, at
         channels = sorted(members)
-        say = one_of_words if one.kind == ONE_OF else all_of_words
+        say = one_of_words if one.kind == S.AMBIGUOUS else all_of_words
         names = tuple(self._geometry.channel_names[i] for i in channels)
-        step = Step(round(at, 9), _STATES[one.kind], names, say(self._geometry, channels))
+        step = Step(round(at, 9), one.kind.name, names, say(self._geometry, channels))
         if one.steps and (one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS):
             one.steps.pop()
         one.steps.append(step)
@@ -285,8 +270,8 @@ class Recorder:
         return [*(group for group in groups if group), *({i} for i in sorted(left))]
 
     def _is_over(self, one: _Open, now: Told) -> bool:
-        if one.kind == ONE_OF:
-            return all(now[i] not in (ONE_OF, STALE, HIDDEN) for i in one.members)
+        if one.kind == S.AMBIGUOUS:
+            return all(now[i] not in (S.AMBIGUOUS, *_HIDING) for i in one.members)
         return all(now[i] != one.kind for i in one.members)
 
     def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
@@ -308,13 +293,13 @@ class Recorder:
             one.with_rate += int(valid.sum())
             one.variance += float(variance.sum())
             one.level = max(one.level, level)
-            if one.kind != STALE:
+            if one.kind != S.STALE:
                 self._measure(one, rows, time[rows], output, told)
 
     def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
         """Add the errors that the channels of an episode have by the others."""
         geometry, residual = self._geometry, output.residual[rows]
-        trusted = ~np.isin(told, (FAULTY, STALE, LEFT_OUT))
+        trusted = ~np.isin(told, (S.FAULTY, S.STALE, S.EXCLUDED))
         for i in sorted(one.members):
             gain = self._gain(trusted, i)
             if gain is None:
@@ -325,7 +310,7 @@ class Recorder:
             if i not in one.batches:
                 one.batches[i] = self._batches(float(time[0]), gain)
             one.batches[i].add(time, error, rate)
-        for a, b in self._pairs if one.kind == ONE_OF else ():
+        for a, b in self._pairs if one.kind == S.AMBIGUOUS else ():
             if {a, b} <= one.members:
                 if (a, b) not in one.pairs:
                     both = np.zeros(geometry.n)
@@ -339,7 +324,7 @@ class Recorder:
         """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
         sizes = {pair: size for pair, batches in one.pairs.items() if (size := batches.size(one.since)) is not None}
         pair = max(sizes, key=lambda pair: abs(sizes[pair].rad_s) / (sizes[pair].std_rad_s or np.inf), default=None)
-        if one.kind != ONE_OF or pair is None:
+        if one.kind != S.AMBIGUOUS or pair is None:
             return None
         size = sizes[pair]
         if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
@@ -356,9 +341,8 @@ class Recorder:
         """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
         key = trusted.tobytes(), i
         if key not in self._gains:
-            self._gains[key] = error_gain(
-                self._geometry.axes, i, [k for k in np.flatnonzero(trusted).tolist() if k != i]
-            )
+            others = [k for k in np.flatnonzero(trusted).tolist() if k != i]
+            self._gains[key] = error_gain(self._geometry.axes, i, others)
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
@@ -373,7 +357,7 @@ class Recorder:
         """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""
         assert self._part is not None
         end = self._part.end_s if at is None else at
-        if one.kind == STALE and one.after_hole and end - one.start < HOLE:
+        if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
             return None
         geometry, names = self._geometry, self._geometry.channel_names
         candidates = [
@@ -382,7 +366,7 @@ class Recorder:
         ]
         episode = Episode(
             stretch=len(self._stretches) + 1,
-            state=_STATES[one.kind],
+            state=one.kind.name,
             channels=one.steps[-1].channels,
             who=one.steps[-1].who,
             start_s=round(one.start, 9),
@@ -392,21 +376,15 @@ class Recorder:
             steps=tuple(one.steps),
             candidates=tuple(candidates),
             apart=self._apart(one),
-            evidence=Evidence(
-                one.reason, float(one.ratio) if np.isfinite(one.ratio) else None, one.alarms, one.last_alarm
+            evidence=Evidence(one.reason, finite(one.ratio), one.alarms, one.last_alarm),
+            rate=RateMeanwhile(
+                published=one.with_rate / max(1, one.samples),
+                std_before_rad_s=finite(one.std_before),
+                std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
+                level_rad_s=finite(one.level),
             ),
-            rate=_meanwhile(one),
         )
         return replace(episode, words=episode_words(episode))
-
-
-def _meanwhile(one: _Open) -> RateMeanwhile:
-    return RateMeanwhile(
-        published=one.with_rate / max(1, one.samples),
-        std_before_rad_s=one.std_before if np.isfinite(one.std_before) else None,
-        std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
-        level_rad_s=one.level if np.isfinite(one.level) else None,
-    )
 
 
 def error_gain(axes: Array, i: int, others: Sequence[int]) -> Array | None:
@@ -425,7 +403,3 @@ def _stds(output: Output, rows: slice) -> Array:
     with np.errstate(invalid="ignore"):
         stds = np.sqrt(output.rows["covariance"][rows][:, _DIAGONAL].sum(axis=1))
     return np.where(output.valid[rows], stds, np.nan)
-
-
-def _rounded(one: Stretch) -> Stretch:
-    return Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import Batch
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Samples, Tap
+from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, Injector
@@ -50,7 +50,7 @@ from fdi_ros.replay.summary import (
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""
 PORTION = 16384
-"""Samples judged at once where many are at hand."""
+"""Samples judged at once where many are at hand: their outputs take little memory."""
 LAST_SAMPLES = 1_000_000_000
 """A channel whose values end no sooner than this before the recording delivers to its end, ns."""
 
@@ -108,8 +108,8 @@ class Walk:
 
     def take(self, block: Block) -> None:
         """Take the next samples, of any number."""
-        for part in portions(block):
-            for piece in self.pieces(part):
+        for first in range(0, len(block), PORTION):
+            for piece in self.pieces(block[first : first + PORTION]):
                 self.feed(piece)
 
     def pieces(self, block: Block) -> Iterator[Block]:
@@ -145,12 +145,6 @@ class Walk:
         if any(sink.stops_at_events for sink in self.sinks):
             return self.pipeline.steps(block)
         return [self.pipeline.process(block)]
-
-
-def portions(block: Block) -> Iterator[Block]:
-    """Cut many samples into portions of which the outputs take little memory."""
-    for first in range(0, len(block), PORTION):
-        yield block[first : first + PORTION]
 
 
 class Judge(Walk):
@@ -211,15 +205,12 @@ class Judge(Walk):
         status, evaluation, end = self.pipeline.status(), self.evaluation, self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
+        far = [one.name for one in status.channels if status.is_far(one)]
         monitor = MonitorResult(
             channels=tuple(evaluation.channel_at(end, i, one) for i, one in enumerate(status.channels)),
             delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
             degraded=tuple(self._degraded.values()),
-            bias=BiasResult(
-                status.bias_state,
-                tuple(status.bias),
-                tuple(one.name for one in status.channels if status.is_far(one)),
-            ),
+            bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
             note=status.note,
             protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
@@ -250,28 +241,18 @@ class Judge(Walk):
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be replayed.
-
-    Attributes
-    ----------
-    bag
-        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
-    config
-        Settings of the monitor.
-    faults
-        To be injected.
-    start, end
-        Part of the recording, s from its first message.
-    period
-        The sinks look at the pipeline at multiples of this time of recording, ns; 0: never.
-    """
+    """What is to be replayed."""
 
     bag: Path
+    """rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file."""
     config: Config
     faults: tuple[Fault, ...] = ()
+    """To be injected."""
     start: float = 0.0
     end: float = math.inf
+    """Part of the recording, s from its first message."""
     period: int = 0
+    """The sinks look at the pipeline at multiples of this time of recording, ns; 0: never."""
 
 
 def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
@@ -282,9 +263,14 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
     begun, config = clock(), request.config
     injector = Injector(request.faults, build_geometry(config).channel_names)
     judge = Judge(Pipeline.from_config(config), injector, sinks)
+
+    def tap(batch: Batch, rows: Int) -> None:
+        for sink in sinks:
+            sink.tap(batch, rows)
+
     with Recording(request.bag) as recording:
         span = (request.start, request.end)
-        samples = Samples(recording, config, len(injector.channel_names), *span, _tap_of(sinks), request.period)
+        samples = Samples(recording, config, len(injector.channel_names), *span, tap, request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
@@ -316,11 +302,3 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
     end = judgement.scores.start_s + judgement.scores.duration_s
     said = tuple(replace(one, at_s=round(one.at_s, 6)) for one in texts if judgement.scores.start_s <= one.at_s <= end)
     return Summary(**vars(judgement), bag=str(request.bag), stream=stream, seconds=clock() - begun, autopilot=said)
-
-
-def _tap_of(sinks: Sequence[Sink]) -> Tap:
-    def tap(batch: Batch, rows: Int) -> None:
-        for sink in sinks:
-            sink.tap(batch, rows)
-
-    return tap

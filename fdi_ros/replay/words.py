@@ -81,11 +81,12 @@ def _without_state(one: Episode, unit: Unit) -> str:
 def _verdict_on_faults(summary: Summary) -> Verdict:
     """Say how many of the injected faults were detected."""
     scores = summary.scores
+    detected, isolated = len(scores.detected), scores.isolated
     plural = "fault" if len(scores.faults) == 1 else "faults"
-    words = f"{len(scores.detected)} of {len(scores.faults)} injected {plural} detected, {scores.isolated} isolated."
+    words = f"{detected} of {len(scores.faults)} injected {plural} detected, {isolated} isolated."
     if _wrongly_named(summary) or any(not one.injected for one in summary.story.declared):
         return Verdict(Severity.BAD, words)
-    return Verdict(Severity.GOOD if scores.isolated == len(scores.faults) else Severity.UNKNOWN, words)
+    return Verdict(Severity.GOOD if isolated == len(scores.faults) else Severity.UNKNOWN, words)
 
 
 def _wrongly_named(summary: Summary) -> list[str]:
@@ -117,12 +118,8 @@ def unchecked_longest(judgement: Judgement) -> dict[str, float]:
     for channel in judgement.monitor.channels:
         changes = [one for one in scores.events if one.channel == channel.name]
         states = [changes[0].before if changes else channel.state, *(one.state for one in changes)]
-        edges = [scores.start_s, *(one.at_s for one in changes), scores.start_s + scores.duration_s]
-        spans = [
-            end - begin
-            for state, (begin, end) in zip(states, pairwise(edges), strict=True)
-            if state in UNCHECKED_STATES
-        ]
+        edges = pairwise([scores.start_s, *(one.at_s for one in changes), scores.start_s + scores.duration_s])
+        spans = [b - a for state, (a, b) in zip(states, edges, strict=True) if state in UNCHECKED_STATES]
         if max(spans, default=0.0) > LONGEST_UNCHECKED * scores.duration_s:
             found[channel.name] = max(spans)
     return found
@@ -145,11 +142,7 @@ def _unchecked_at_the_end(summary: Summary) -> str:
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
     """Return what stands below the verdict."""
-    return [
-        *_fault_lines(summary.scores),
-        *_episode_lines(summary, unit),
-        *noisy_lines(summary, unit),
-    ]
+    return [*_fault_lines(summary.scores), *_episode_lines(summary, unit), *noisy_lines(summary, unit)]
 
 
 def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
@@ -191,8 +184,7 @@ def _since_words(channels: Sequence[ChannelResult]) -> str:
 def notes(summary: Summary) -> list[str]:
     """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
     stream, scores = summary.stream, summary.scores
-    lines = list(stream.damage)
-    lines += sample_rate_notes(stream.sample_rate)
+    lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [f"{count} malformed messages on {topic}" for topic, count in stream.malformed.items() if count]
     if stream.disordered:
         lines.append(f"{stream.disordered} messages left out: recorded after later ones")
@@ -202,7 +194,7 @@ def notes(summary: Summary) -> list[str]:
     missing = scores.samples - scores.samples_with_rate
     if missing:
         lines.append(f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}")
-    lines += [line for line in stretch_words(summary.story) if line]
+    lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
 
@@ -217,17 +209,14 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
 
 
 def _fault_lines(scores: Scores) -> list[str]:
-    faults, detected = scores.faults, scores.detected
-    lines = [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in detected]
-    for fault in faults:
-        if fault.detected_at_s is None:
-            why = "its channels had been declared before" if fault.declared_before else "not detected"
-            lines.append(f"{fault.kind} on {fault.channel}: {why}.")
-    return lines
+    ordered = sorted(scores.faults, key=lambda fault: fault.detected_at_s is None)
+    return [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in ordered]
 
 
 def _detection_words(fault: Outcome) -> str:
     """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
+    if fault.detected_at_s is None:
+        return "its channels had been declared before" if fault.declared_before else "not detected"
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
         return f"{words}, isolated"
@@ -247,18 +236,15 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
         lost = "" if verdict(summary).severity is Severity.GOOD else _unchecked_at_the_end(summary)
         return [f"At the end not checked: {lost}."] if lost else []
     if told:
-        lines = story_lines(story, told, unit)
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
         first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
-        return [f"{count} that no injected fault explains{first}:", *lines]
+        return [f"{count} that no injected fault explains{first}:", *story_lines(story, told, unit)]
     if wrong := _wrongly_named(summary):
         return [f"Declared faulty, and not struck by a fault: {', '.join(wrong)}."]
     if why := _untold(summary):
         return [f"Of the others it cannot be told: {why}."]
     struck = {name for fault in scores.faults for name in fault.channels}
-    doubted = list(
-        dict.fromkeys(name for fault in scores.faults for name in fault.other_channels if name not in struck)
-    )
+    doubted = dict.fromkeys(name for fault in scores.faults for name in fault.other_channels if name not in struck)
     if doubted:
         return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
     return ["No other channel was declared faulty."]
@@ -347,7 +333,6 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     for place, one in enumerate(told, 1):
         where = f" (stretch {one.stretch})" if several else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
-        injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
-        lines += [f"       {title}: {words}\n" for title, words in (*detail_words(one, unit), *injected)]
+        lines += [f"       {title}: {words}\n" for title, words in detail_words(one, unit, scored)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
