@@ -253,7 +253,7 @@ def _parser() -> argparse.ArgumentParser:
         description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
         epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
         added = verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
-        verb.add_arguments(added)
+        verb.add_to(added)
     return parser
 
 

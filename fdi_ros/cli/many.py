@@ -6,28 +6,14 @@
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
-from fdi_ros.cli.arguments import Verb, add_config, add_file, add_report, add_results, add_workers, shipped
+from fdi_ros.cli.arguments import FILE, RESULTS, WORKERS, Verb, config_files, shipped
 from fdi_ros.errors import BagError, FdiError, StudyError
-from fdi_ros.system.installation import BAGS, WORKERS, resolve
+from fdi_ros.system.installation import BAGS, POOL, resolve
 from fdi_ros.system.text import shown, storable
 
 PAGE = "fleet.html"
-
-
-def _add_fleet(parser: ArgumentParser) -> None:
-    parser.add_argument("paths", nargs="+", metavar="PATH", help="recordings, and folders with recordings")
-    add_config(parser, "; default: of each recording what fdi inspect writes for it", required=False, default=[])
-    add_file(parser, "--output", "folder for the tables and the page", "DIR", required=True)
-    parser.add_argument(
-        "--calibrate",
-        choices=("none", "each"),
-        default="none",
-        help="each: calibrate each recording on itself, where it allows that; default none",
-    )
-    add_workers(parser)
-    add_results(parser, force="begin anew where the folder holds a run with other settings")
 
 
 def _fleet(arguments: Namespace) -> int:
@@ -82,19 +68,22 @@ def _fleet(arguments: Namespace) -> int:
 FLEET = Verb(
     "judge many recordings: tables of flights and episodes, and a page of what needs a person",
     ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
-    _add_fleet,
+    {
+        "paths": {"nargs": "+", "metavar": "PATH", "help": "recordings, and folders with recordings"},
+        **config_files("; default: of each recording what fdi inspect writes for it", required=False, default=[]),
+        "--output": {**FILE, "metavar": "DIR", "help": "folder for the tables and the page", "required": True},
+        "--calibrate": {
+            "choices": ("none", "each"),
+            "default": "none",
+            "help": "each: calibrate each recording on itself, where it allows that; default none",
+        },
+        **WORKERS,
+        **RESULTS,
+        "--force": {"help": "begin anew where the folder holds a run with other settings"},
+    },
     _fleet,
-    (*BAGS, *WORKERS, "pyarrow", "scipy"),
+    (*BAGS, *POOL, "pyarrow", "scipy"),
 )
-
-
-def _add_montecarlo(parser: ArgumentParser) -> None:
-    parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help=f"what to run; shipped: {shipped('studies')}")
-    parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
-    parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
-    add_workers(parser)
-    add_report(parser, "write curves and tables as one page")
-    add_results(parser)
 
 
 def _montecarlo(arguments: Namespace) -> int:
@@ -118,7 +107,14 @@ def _montecarlo(arguments: Namespace) -> int:
 MONTECARLO = Verb(
     "compare detectors over many simulated trials",
     ("fdi montecarlo power.yaml --trials 200 --report power.html",),
-    _add_montecarlo,
+    {
+        "study": {"type": resolve, "metavar": "STUDY.yaml", "help": f"what to run; shipped: {shipped('studies')}"},
+        "--trials": {"type": int, "metavar": "N", "help": "trials per cell, instead of the file's"},
+        "--seed": {"type": int, "metavar": "S", "help": "seed, instead of the file's"},
+        **WORKERS,
+        "--report": {"help": "write curves and tables as one page"},
+        **RESULTS,
+    },
     _montecarlo,
-    WORKERS,
+    POOL,
 )

@@ -6,23 +6,14 @@
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.cli.arguments import (
-    Verb,
-    add_bag,
-    add_config,
-    add_degrees,
-    add_file,
-    add_part,
-    add_report,
-    add_results,
-)
+from fdi_ros.cli.arguments import FILE, PART, RESULTS, Options, Verb, config_files, shared
 from fdi_ros.errors import ConfigError
-from fdi_ros.system.installation import BAGS, PROGRESS, WORKERS, resolve
+from fdi_ros.system.installation import BAGS, POOL, PROGRESS, resolve
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
@@ -33,11 +24,21 @@ if TYPE_CHECKING:
     from fdi_ros.setup.run import SetupResult
 
 
-def _add_inspect(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    parser.add_argument("--output", "--write", type=Path, metavar="FILE", help="write the config to a file, too")
-    add_results(parser)
-    add_degrees(parser)
+_MADE: Mapping[str, Options] = {
+    "--output": {**FILE, "help": "parameter file to write", "required": True},
+    **PART,
+    "--reference": {
+        "default": "",
+        "metavar": "NAME",
+        "help": "triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike",
+    },
+    "--proof": {
+        "type": resolve,
+        "metavar": "RECORDING",
+        "help": "prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
+    },
+}
+"""What is made settings of, and where they are written."""
 
 
 def _inspect(arguments: Namespace) -> int:
@@ -90,36 +91,15 @@ def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | N
 INSPECT = Verb(
     "say what is in a recording and print a starting config for it",
     ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
-    _add_inspect,
+    {
+        **shared("bag"),
+        "--output --write": {**FILE, "help": "write the config to a file, too"},
+        **RESULTS,
+        **shared("--degrees"),
+    },
     _inspect,
     (*BAGS, *PROGRESS),
 )
-
-
-def _add_setup(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    _add_settings(parser)
-    add_report(parser, "page of what was found; default: beside the parameter file")
-    add_results(parser)
-    add_degrees(parser)
-
-
-def _add_settings(parser: ArgumentParser) -> None:
-    """Take what is made settings of, and where they are written."""
-    add_file(parser, "--output", "parameter file to write", required=True)
-    add_part(parser)
-    parser.add_argument(
-        "--reference",
-        default="",
-        metavar="NAME",
-        help="triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike",
-    )
-    parser.add_argument(
-        "--proof",
-        type=resolve,
-        metavar="RECORDING",
-        help="prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
-    )
 
 
 def _setup(arguments: Namespace) -> int:
@@ -161,19 +141,16 @@ SETUP = Verb(
         "fdi setup my_flight --output my_gyros.yaml",
         "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
     ),
-    _add_setup,
+    {
+        **shared("bag"),
+        **_MADE,
+        "--report": {"help": "page of what was found; default: beside the parameter file"},
+        **RESULTS,
+        **shared("--degrees"),
+    },
     _setup,
-    (*BAGS, *WORKERS, "scipy"),
+    (*BAGS, *POOL, "scipy"),
 )
-
-
-def _add_calibrate(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    add_config(parser, " to start from")
-    _add_settings(parser)
-    add_report(parser)
-    add_results(parser)
-    add_degrees(parser)
 
 
 def _calibrate(arguments: Namespace) -> int:
@@ -212,16 +189,17 @@ def _calibration_origin(arguments: Namespace, result: Calibration, kept: str) ->
 CALIBRATE = Verb(
     "fit axes, biases and noise to a recording and write a config",
     ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
-    _add_calibrate,
+    {
+        **shared("bag"),
+        **config_files(" to start from"),
+        **_MADE,
+        **shared("--report"),
+        **RESULTS,
+        **shared("--degrees"),
+    },
     _calibrate,
-    (*BAGS, *WORKERS, "scipy"),
+    (*BAGS, *POOL, "scipy"),
 )
-
-
-def _add_convert(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    add_file(parser, "--output", "rosbag2 folder to write, with one MCAP file", "DIR", required=True)
-    add_results(parser, force="overwrite a bag made by fdi")
 
 
 def _convert(arguments: Namespace) -> int:
@@ -244,7 +222,12 @@ def _convert(arguments: Namespace) -> int:
 CONVERT = Verb(
     "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
     ("fdi convert flight.bin --output flight_bag",),
-    _add_convert,
+    {
+        **shared("bag"),
+        "--output": {**FILE, "help": "rosbag2 folder to write, with one MCAP file", "metavar": "DIR", "required": True},
+        **RESULTS,
+        "--force": {"help": "overwrite a bag made by fdi"},
+    },
     _convert,
     (*BAGS, *PROGRESS),
 )

@@ -7,29 +7,17 @@ from __future__ import annotations
 
 import math
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.cli.arguments import (
-    Verb,
-    add_bag,
-    add_config,
-    add_degrees,
-    add_detector,
-    add_fault,
-    add_file,
-    add_part,
-    add_report,
-    add_results,
-    shipped,
-)
+from fdi_ros.cli.arguments import FILE, PART, RESULTS, Verb, config_files, shared, shipped
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.system.installation import BAGS, PROGRESS, WORKERS, resolve
+from fdi_ros.system.installation import BAGS, POOL, PROGRESS, resolve
 
 if TYPE_CHECKING:
     from fdi_ros.cli.outputs import Outputs
@@ -39,34 +27,6 @@ if TYPE_CHECKING:
     from fdi_ros.replay.run import Request, Sink
     from fdi_ros.replay.summary import Summary
     from fdi_ros.replay.sweep import Plan, Subject
-
-
-def _add_replay(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    add_config(parser, "; default: what fdi inspect writes, where units are mounted alike", required=False, default=[])
-    add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
-    parser.add_argument(
-        "--scenario",
-        type=resolve,
-        metavar="FILE",
-        help=f"inject the faults of a scenario file; shipped: {shipped('scenarios')}",
-    )
-    add_detector(parser)
-    add_part(parser)
-    parser.add_argument(
-        "--check",
-        metavar="'TERM ...'",
-        help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
-        " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
-        " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
-        " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
-        " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
-    )
-    add_file(parser, "--csv", "write a line for every sample")
-    add_report(parser, "write a report to be looked at")
-    add_file(parser, "--output", "write a bag of what the node would have published", "DIR")
-    add_results(parser, force="overwrite outputs that exist")
-    add_degrees(parser)
 
 
 def _replay(arguments: Namespace) -> int:
@@ -200,7 +160,32 @@ REPLAY = Verb(
         "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
         "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
     ),
-    _add_replay,
+    {
+        **shared("bag"),
+        **config_files("; default: what fdi inspect writes, where units are mounted alike", required=False, default=[]),
+        "--fault": {"help": "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated"},
+        "--scenario": {
+            "type": resolve,
+            "metavar": "FILE",
+            "help": f"inject the faults of a scenario file; shipped: {shipped('scenarios')}",
+        },
+        **shared("--detector"),
+        **PART,
+        "--check": {
+            "metavar": "'TERM ...'",
+            "help": "exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
+            " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
+            " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
+            " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
+            " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
+        },
+        "--csv": {"help": "write a line for every sample"},
+        "--report": {"help": "write a report to be looked at"},
+        "--output": {**FILE, "help": "write a bag of what the node would have published", "metavar": "DIR"},
+        **RESULTS,
+        "--force": {"help": "overwrite outputs that exist"},
+        **shared("--degrees"),
+    },
     _replay,
     (*BAGS, *PROGRESS),
 )
@@ -210,32 +195,6 @@ REPLAY = Verb(
 
 
 MOST_TIMES = 1000
-
-
-def _add_sweep(parser: ArgumentParser) -> None:
-    add_bag(parser)
-    add_config(parser)
-    add_fault(
-        parser,
-        "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
-        " scale factors, stuck, dropout",
-    )
-    parser.add_argument("--times", type=int, default=10, metavar="N", help="times per channel and fault; default 10")
-    parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
-    add_detector(parser)
-    parser.add_argument(
-        "--compare",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="other detectors (as of --detector) or parameter files beside it",
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
-    add_part(parser)
-    add_file(parser, "--csv", "write a line for every fault")
-    add_report(parser)
-    add_results(parser)
 
 
 def _sweep(arguments: Namespace) -> int:
@@ -326,7 +285,28 @@ SWEEP = Verb(
         "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
         "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1' --compare likelihood_ratio cusum",
     ),
-    _add_sweep,
+    {
+        **shared("bag", "--config"),
+        "--fault": {
+            "help": "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts,"
+            " noise, scale factors, stuck, dropout"
+        },
+        "--times": {"type": int, "default": 10, "metavar": "N", "help": "times per channel and fault; default 10"},
+        "--within": {"type": float, "default": 5.0, "metavar": "S", "help": "watch a fault for so long; default 5"},
+        **shared("--detector"),
+        "--compare": {
+            "nargs": "+",
+            "default": [],
+            "metavar": "NAME",
+            "help": "other detectors (as of --detector) or parameter files beside it",
+        },
+        "--seed": {"type": int, "default": 1, "metavar": "S", "help": "of signs and random faults; default 1"},
+        "--workers": {"default": 1, "help": "processes; default 1"},
+        **PART,
+        "--csv": {"help": "write a line for every fault"},
+        **shared("--report"),
+        **RESULTS,
+    },
     _sweep,
-    (*BAGS, *WORKERS),
+    (*BAGS, *POOL),
 )

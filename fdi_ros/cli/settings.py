@@ -9,11 +9,11 @@ import difflib
 import json
 import re
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
 
-from fdi_ros.cli.arguments import Verb, add_degrees, add_flag, add_report, add_results, detector_names
+from fdi_ros.cli.arguments import DETECTOR_NAMES, FLAG, RESULTS, Verb, shared
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.system.installation import resolve, shipped_files
@@ -24,15 +24,6 @@ _NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 """Full name of a node."""
 _ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
 """In the file, a regular expression of statuses of any monitor."""
-
-
-def _add_geometry(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "config", type=resolve, nargs="+", metavar="CONFIG", help="ROS 2 parameter file; of several, later ones win"
-    )
-    add_report(parser, "write a page with tables and a picture")
-    add_results(parser)
-    add_degrees(parser)
 
 
 def _geometry(arguments: Namespace) -> int:
@@ -52,21 +43,19 @@ def _geometry(arguments: Namespace) -> int:
 GEOMETRY = Verb(
     "say what a mounting can detect and isolate, before it flies",
     ("fdi geometry two_triads.yaml", "fdi geometry my_gyros.yaml --degrees --report mounting.html"),
-    _add_geometry,
+    {
+        "config": {
+            "type": resolve,
+            "nargs": "+",
+            "metavar": "CONFIG",
+            "help": "ROS 2 parameter file; of several, later ones win",
+        },
+        "--report": {"help": "write a page with tables and a picture"},
+        **RESULTS,
+        **shared("--degrees"),
+    },
     _geometry,
 )
-
-
-def _add_shipped(parser: ArgumentParser) -> None:
-    parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
-    parser.add_argument(
-        "--node",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
-    )
-    add_results(parser)
 
 
 def _shipped(arguments: Namespace) -> int:
@@ -118,19 +107,18 @@ def made_for(nodes: Sequence[str], text: str) -> str:
 SHIPPED = Verb(
     "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
     ("fdi shipped", "fdi shipped two_imus.yaml"),
-    _add_shipped,
+    {
+        "name": {"nargs": "?", "default": "", "metavar": "NAME", "help": "only this file, such as two_imus.yaml"},
+        "--node": {
+            "action": "append",
+            "default": [],
+            "metavar": "NAME",
+            "help": "print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
+        },
+        **RESULTS,
+    },
     _shipped,
 )
-
-
-def _add_compile(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "--detector",
-        nargs="+",
-        metavar="NAME",
-        help=f"for these detectors; default: for all: {detector_names()}",
-    )
-    add_results(parser)
 
 
 def _compile(arguments: Namespace) -> int:
@@ -156,14 +144,9 @@ def _compile(arguments: Namespace) -> int:
 COMPILE = Verb(
     "compile now what else is compiled when it is first used, for images and CI",
     ("fdi compile", "fdi compile --detector sequential"),
-    _add_compile,
+    {"--detector": {"nargs": "+", "help": f"for these detectors; default: for all: {DETECTOR_NAMES}"}, **RESULTS},
     _compile,
 )
-
-
-def _add_watch(parser: ArgumentParser) -> None:
-    parser.add_argument("--node", default="", metavar="/NS/NAME", help="the monitor; default: the only one running")
-    add_flag(parser, "--plain", "line by line, as where the output is no terminal")
 
 
 def _watch(arguments: Namespace) -> int:
@@ -176,6 +159,9 @@ def _watch(arguments: Namespace) -> int:
 WATCH = Verb(
     "show a running monitor: residuals, states, rates and events as they come",
     ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
-    _add_watch,
+    {
+        "--node": {"default": "", "metavar": "/NS/NAME", "help": "the monitor; default: the only one running"},
+        "--plain": {**FLAG, "help": "line by line, as where the output is no terminal"},
+    },
     _watch,
 )

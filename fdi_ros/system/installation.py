@@ -57,9 +57,9 @@ def resolve(path: str) -> Path:
 BAGS = ("mcap", "rosbags", "lz4", "zstandard")
 """What reads and writes recordings."""
 PROGRESS = ("tqdm",)
-WORKERS = (*PROGRESS, "joblib")
+POOL = (*PROGRESS, "joblib")
 """What shares work among processes."""
-REQUIRED = (*BAGS, *WORKERS)
+REQUIRED = (*BAGS, *POOL)
 """Of setup.py, for every installation by pip."""
 
 
