@@ -17,6 +17,7 @@ they are exact to 0.3 us.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 import re
@@ -95,7 +96,11 @@ class CsvLog(FlightLog):
             bad += int((~good).sum())
             # Numbers of a damaged table may be anything.
             with np.errstate(all="ignore"):
-                columns = columns._replace(tick=columns.tick or _tick(table[good, 0]))
+                if not columns.tick and good.any():
+                    # Dates by their size, else seconds.
+                    first = table[good, 0][0]
+                    tick = next((tick for tick in (1e-9, 1e-6, 1e-3) if first * tick * 1e9 >= EARLIEST), 1.0)
+                    columns = columns._replace(tick=tick)
                 samples = _samples(table[good], ends[used][good], columns)
             self.counts["lines"] += len(used)
             offset, rest = offset + size, b"" if final else data[size:]
@@ -112,7 +117,12 @@ def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Colu
     `BagError` if there is no such line, or it has no columns of gyros.
     """
     file.seek(0)
-    line = _header(file)
+    for _ in range(64):
+        line = file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
+        if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
+            break
+    else:
+        raise BagError(f"{file.name} has no line with the names of its columns")
     delimiter = max("\t;,", key=line.count)
     names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
     if np.isfinite([_number(names, k) for k in range(len(names))]).all():
@@ -121,15 +131,6 @@ def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Colu
             f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
         )
     return delimiter, _columns(file, names, note)
-
-
-def _header(file: BinaryIO) -> str:
-    """Return the first line with something in it, of at least four columns."""
-    for _ in range(64):
-        line = file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
-        if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
-            return line.rstrip("\r\n")
-    raise BagError(f"{file.name} has no line with the names of its columns")
 
 
 def _columns(file: BinaryIO, names: Sequence[str], note: Callable[[str], None]) -> Columns:
@@ -195,13 +196,6 @@ def _imus(names: Sequence[str]) -> list[list[str]]:
     return gyros or [axes for (head, _), axes in whole.items() if not _OTHER.search(head)]
 
 
-def _tick(times: Array) -> float:
-    """Return the seconds of one unit of times: if they are dates by their size, else 1; 0: there is no time."""
-    if not len(times):
-        return 0.0
-    return next((tick for tick in (1e-9, 1e-6, 1e-3) if times[0] * tick * 1e9 >= EARLIEST), 1.0)
-
-
 def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
     """Return the time and the rates of each line, (k, 1 + 3 IMUs); NaN: it has no number there."""
     chosen = [columns.time, *(column for imu in columns.imus for column in imu)]
@@ -209,20 +203,17 @@ def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
         return np.empty((0, len(chosen)))
     if delimiter == ";":
         lines = [line.replace(",", ".") for line in lines]
-    try:
+    with contextlib.suppress(ValueError):
         table = np.loadtxt(lines, delimiter=delimiter, usecols=chosen, comments=None, quotechar='"', ndmin=2)
         if len(table) == len(lines):
             return table
-    except ValueError:
-        pass
-    return np.array([[_number(cells, k) for k in chosen] for cells in (_cells(line, delimiter) for line in lines)])
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    try:
-        return next(csv.reader([line], delimiter=delimiter), [])
-    except csv.Error:
-        return []
+    rows = []
+    for line in lines:
+        cells: list[str] = []
+        with contextlib.suppress(csv.Error):
+            cells = next(csv.reader([line], delimiter=delimiter), [])
+        rows.append([_number(cells, k) for k in chosen])
+    return np.array(rows)
 
 
 def _number(cells: Sequence[str], column: int) -> float:

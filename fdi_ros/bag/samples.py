@@ -137,10 +137,10 @@ class Samples:
         """Take the stamps (k,) of a block, ns, None at the end, and check the rate once enough are there."""
         if self._first is None:
             return
-        self._first += [stamp] if stamp is not None else []
-        if stamp is None or sum(map(len, self._first)) >= _RATE_SAMPLES:
-            first, self._first = self._first, None
-            check_sample_rate(self.recording.path, np.concatenate(first) if first else np.zeros(0), self._configured)
+        self._first += [] if stamp is None else [stamp]
+        if self._first and (stamp is None or sum(map(len, self._first)) >= _RATE_SAMPLES):
+            check_sample_rate(self.recording.path, np.concatenate(self._first), self._configured)
+            self._first = None
 
     def _portions(self) -> Iterator[Rows]:
         """Put messages together, or apart, into what becomes a block."""

@@ -76,9 +76,8 @@ class _Bounded(io.BytesIO):
         """Read so many bytes; a message begins with three."""
         data = super().read(size) if self._left > 0 else b""
         if size == _HEAD and len(data) == _HEAD and data[2] != _DATA:
-            self._left -= (data[0] | data[1] << 8) + (
-                ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
-            )
+            cost = ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
+            self._left -= (data[0] | data[1] << 8) + cost
         self.cut = len(data) < (size or 0) and not (size == _HEAD and not data)
         self.reached = max(self.reached, self.tell())
         return data
@@ -127,7 +126,13 @@ class Ulog(FlightLog):
         log = _parsed(bounded, self.file.name)
         if bounded.cut or bounded.reached < len(data):
             self.note(f"it is cut off or damaged: read up to byte {bounded.reached}")
-        self._note_gaps(log)
+        if log.file_corruption:
+            self.note("it is damaged: what pyulog could not read was left out")
+        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
+            times = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
+            self.note(
+                f"the logger dropped out {times}, for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
+            )
         for text in log.logged_messages:
             self.add_text(int(text.timestamp), text.log_level_str(), text.message)
         topics: dict[Source, Columns] = {}
@@ -137,15 +142,6 @@ class Ulog(FlightLog):
         if log.file_corruption:
             self.unread |= dict.fromkeys(set(_KINDS) & log.message_formats.keys() - self.counts.keys(), _LACKS)
         return topics
-
-    def _note_gaps(self, log: Any) -> None:
-        """Tell what of a file, as pyulog reads it, is damaged or was never written."""
-        if log.file_corruption:
-            self.note("it is damaged: what pyulog could not read was left out")
-        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
-            times = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
-            seconds = f"for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
-            self.note(f"the logger dropped out {times}, {seconds}")
 
     def _take(self, topics: dict[Source, Columns], source: Source, columns: Columns) -> None:
         """Count the messages of a topic, and keep those of an IMU; of GPS the time of day is taken."""

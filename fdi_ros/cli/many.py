@@ -38,9 +38,8 @@ def _fleet(arguments: Namespace) -> int:
     compile_for_workers(arguments)
     try:
         with Progress(sys.stderr, arguments.quiet, "flights") as progress:
-            judge_all(
-                paths, parameters, arguments.calibrate == "each", tables, workers, arguments.scheduler, progress.show
-            )
+            given = parameters, arguments.calibrate == "each", tables
+            judge_all(paths, *given, workers, arguments.scheduler, progress.show)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise

@@ -33,7 +33,6 @@ from fdi_ros.system.trusted_file import open_regular
 
 # Progress -------------------------------------------------------------------------------------------------------------
 
-
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TIMED_FORMAT = "{desc}, {elapsed}"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
@@ -130,7 +129,6 @@ def bar_of(arguments: argparse.Namespace) -> CompileBar | None:
 
 # Files and words ------------------------------------------------------------------------------------------------------
 
-
 _HEAD = 1 << 16
 """Bytes at the begin of a file in which the mark of a result is looked for."""
 
@@ -203,7 +201,7 @@ class Outputs:
         figures: Mapping[str, Any] | None = None,
         html: Callable[[], str] | None = None,
         severity: Severity | None = None,
-        **others: Callable[[Path], None],
+        **others: Callable[[Path], object],
     ) -> int:
         """Write page, figures and other files where they were asked for, all or none, and say the text.
 
@@ -211,7 +209,7 @@ class Outputs:
         options, by name. Returns the exit code.
         """
         if html is not None:
-            others["report"] = lambda path: _write_page(path, html())
+            others["report"] = lambda path: path.write_text(html(), encoding="utf-8", errors="replace")
         with ExitStack() as stack:
             # They take their places at the end: where one cannot be written, there is none.
             for name, write in others.items():
@@ -227,10 +225,6 @@ class Outputs:
 def config_words(arguments: argparse.Namespace) -> str:
     """Name the parameter files that were read."""
     return ", ".join(map(str, arguments.config))
-
-
-def _write_page(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", errors="replace")
 
 
 def versions() -> str:
@@ -269,10 +263,8 @@ def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = 
         return
     if not force:
         raise BagError(f"{path} exists already; --force overwrites it")
-    if kind is Kind.FOLDER:
-        _check_folder(path)
-    else:
-        _check_file(path, kind)
+    if kept := _why_no_folder(path) if kind is Kind.FOLDER else _why_no_file(path, kind):
+        raise BagError(f"{path} is {kept}; it is not overwritten even by --force")
 
 
 def _parts(source: Path) -> list[Path]:
@@ -290,33 +282,28 @@ def _within(path: Path, folder: Path) -> bool:
     return path == folder or folder in path.parents or path in folder.parents
 
 
-def _check_folder(path: Path) -> None:
-    """Refuse a folder that is neither empty nor an output bag of before."""
+def _why_no_folder(path: Path) -> str:
+    """Say what a folder is that is neither empty nor an output bag of before."""
     if not path.is_dir():
-        raise BagError(f"{path} is no folder; it is not overwritten even by --force")
+        return "no folder"
     there = {child.name for child in path.iterdir()}
-    if not there:
-        return
     try:
         found = find_files(path, Damage())
+        ours = found.made_by_fdi and there == {"metadata.yaml", *(file.name for file in found.paths)}
     except BagError:
-        found = None
-    ours = found is not None and found.made_by_fdi and there == {"metadata.yaml", *(file.name for file in found.paths)}
-    if not ours or not all(child.is_file() for child in path.iterdir()):
-        raise BagError(
-            f"{path} is a folder that holds more than a recording made by fdi; it is not overwritten even by --force"
-        )
+        ours = False
+    ours = ours and all(child.is_file() for child in path.iterdir())
+    return "" if ours or not there else "a folder that holds more than a recording made by fdi"
 
 
-def _check_file(path: Path, kind: Kind) -> None:
-    """Refuse a file that is no former result of a kind."""
+def _why_no_file(path: Path, kind: Kind) -> str:
+    """Say what a file is that is no former result of a kind."""
     if path.is_dir():
-        raise BagError(f"{path} is a folder; it is not overwritten even by --force")
+        return "a folder"
     if not path.exists():
-        return
+        return ""
     if not path.is_file():
-        raise BagError(f"{path} is no file; it is not overwritten even by --force")
+        return "no file"
     with open_regular(path) as file:
         begin = file.read(_HEAD)
-    if begin and not re.match(kind.value, begin):
-        raise BagError(f"{path} is no result of fdi of this kind; it is not overwritten even by --force")
+    return "no result of fdi of this kind" if begin and not re.match(kind.value, begin) else ""

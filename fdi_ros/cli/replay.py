@@ -139,17 +139,14 @@ def _about_replay(arguments: Namespace, request: Request, assumed: str) -> dict[
     """Say what was run, for the report."""
     from fdi_ros.cli.outputs import about, config_words
 
-    changed = request.config.changed
-    return about(
-        arguments,
-        config_words(arguments) or f"none; assumed: {assumed}",
-        {
-            "detector": request.config.detector.name,
-            "faults": "; ".join(map(str, request.faults)) or "none",
-            "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
-            "settings other than the default": "; ".join(f"{name}: {_written(v)}" for name, v in changed.items()),
-        },
-    )
+    changed = "; ".join(f"{name}: {_written(value)}" for name, value in request.config.changed.items())
+    more = {
+        "detector": request.config.detector.name,
+        "faults": "; ".join(map(str, request.faults)) or "none",
+        "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
+        "settings other than the default": changed,
+    }
+    return about(arguments, config_words(arguments) or f"none; assumed: {assumed}", more)
 
 
 REPLAY = Verb(
@@ -270,13 +267,14 @@ def _subjects(arguments: Namespace, configs: dict[str, Config]) -> list[Subject]
     from fdi_ros.replay.sweep import Subject
 
     read: dict[object, Block] = {}
-    subjects = []
-    for name, config in configs.items():
-        key = (config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout)
-        if key not in read:
+    for config in configs.values():
+        if (key := _alignment(config)) not in read:
             read[key] = read_block(arguments.bag, config, arguments.start, arguments.end)
-        subjects.append(Subject(name, config, read[key]))
-    return subjects
+    return [Subject(name, config, read[_alignment(config)]) for name, config in configs.items()]
+
+
+def _alignment(config: Config) -> object:
+    return config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout
 
 
 SWEEP = Verb(

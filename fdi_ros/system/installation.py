@@ -61,8 +61,6 @@ POOL = (*PROGRESS, "joblib")
 """What shares work among processes."""
 REQUIRED = (*BAGS, *POOL)
 """Of setup.py, for every installation by pip."""
-
-
 PACKAGES = {"serial": "pyserial"}
 """What pip calls a library that it calls otherwise than Python does."""
 

@@ -24,6 +24,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -41,13 +42,8 @@ MAX_DEATHS = 3
 """Processes that a job may kill until it is given up; that a job on a cluster is tried again."""
 MOST_WORKERS = 256
 """Processes on this machine."""
-ONE_THREAD = dict.fromkeys(
-    (
-        *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
-        *("VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
-    ),
-    "1",
-)
+_THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
+ONE_THREAD = dict.fromkeys((*(f"{name}_NUM_THREADS" for name in _THREADS), "VECLIB_MAXIMUM_THREADS"), "1")
 """Environment of a worker process: as many processes as cores are enough."""
 
 
@@ -60,11 +56,7 @@ def worker_count(workers: int | None) -> int:
 
 
 def run_jobs(
-    function: Function,
-    jobs: Sequence[Job],
-    workers: int,
-    cluster: str | None,
-    lost: Lost | None = None,
+    function: Function, jobs: Sequence[Job], workers: int, cluster: str | None, lost: Lost | None = None
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs, the arguments of a function that workers can import, and give (index, result) as they are done.
 
@@ -166,22 +158,18 @@ def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Los
             futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_DEATHS): k for k in numbers}
             return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
 
-        def killed(future: Any) -> bool:
-            return future.status == "error" and isinstance(future.exception(), distributed.KilledWorker)
-
-        suspects = []
+        suspects: list[int] = []
+        # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
+        again = ((k, future, True) for number in suspects for k, future in run([number]))
         try:
-            for k, future in run(range(len(jobs))):
-                if lost is not None and killed(future):
-                    suspects.append(k)
-                else:
+            for k, future, alone in chain(((k, future, False) for k, future in run(range(len(jobs)))), again):
+                killed = future.status == "error" and isinstance(future.exception(), distributed.KilledWorker)
+                if not killed or lost is None:
                     yield k, future.result()
-            # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
-            for k, future in (one for number in suspects for one in run([number])):
-                if lost is not None and killed(future):
+                elif alone:
                     yield k, lost(k, _died_words(future.exception().allowed_failures + 1))
                 else:
-                    yield k, future.result()
+                    suspects.append(k)
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             raise StudyError(f"the cluster at {cluster} was lost: {_line(error)}") from error
 
@@ -189,20 +177,17 @@ def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Los
 @functools.cache
 def _warn_if_open(listens_at: str, address: str) -> None:
     """Say once that a scheduler without TLS listens where others reach it."""
-    if listens_at.startswith(TLS):
-        return
     host = listens_at.partition("://")[2].rpartition(":")[0].strip("[]")
     try:
-        if ipaddress.ip_address(host).is_loopback:
-            return
+        private = ipaddress.ip_address(host).is_loopback
     except ValueError:
-        if host == "localhost" or listens_at.startswith("inproc"):
-            return
-    print(
-        f"fdi: warning: the scheduler at {address} listens at {listens_at} without TLS: whoever reaches it can run code"
-        " on its workers and on this machine; see docs/fleet.md, A cluster that others reach",
-        file=sys.stderr,
-    )
+        private = host == "localhost" or listens_at.startswith("inproc")
+    if not private and not listens_at.startswith(TLS):
+        print(
+            f"fdi: warning: the scheduler at {address} listens at {listens_at} without TLS: whoever reaches it can run"
+            " code on its workers and on this machine; see docs/fleet.md, A cluster that others reach",
+            file=sys.stderr,
+        )
 
 
 @contextmanager

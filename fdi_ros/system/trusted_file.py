@@ -31,12 +31,18 @@ class DistrustError(OSError):
         super().__init__(0, why, str(path))
 
 
-def check(path: Path | str) -> None:
+def check(path: Path | str, about: os.stat_result | None = None) -> None:
     """Check that a file or folder can have been written by this user and root alone; links are not followed.
 
-    `DistrustError` if that is not so, `OSError` if there is no such file.
+    ``about``: what is known of it already. `DistrustError` if that is not so, `OSError` if there is no such file.
     """
-    _check(path, os.lstat(path))
+    about = about or os.lstat(path)
+    if stat.S_ISLNK(about.st_mode):
+        raise DistrustError(path, "it is a link")
+    if about.st_uid not in (0, os.geteuid()):
+        raise DistrustError(path, f"it belongs to another user ({about.st_uid})")
+    if about.st_mode & OTHERS:
+        raise DistrustError(path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})")
 
 
 def close_to_others(folder: Path | str) -> None:
@@ -48,7 +54,7 @@ def close_to_others(folder: Path | str) -> None:
     if about.st_mode & OTHERS and about.st_uid == os.geteuid() and stat.S_ISDIR(about.st_mode):
         os.chmod(folder, stat.S_IMODE(about.st_mode) & ~OTHERS, follow_symlinks=False)
         about = os.lstat(folder)
-    _check(folder, about)
+    check(folder, about)
 
 
 def check_ancestor(folder: Path | str) -> None:
@@ -81,7 +87,7 @@ def read(path: Path, most: int) -> bytes:
     `DistrustError` if somebody else may have, or it is no regular file; `OSError` if it cannot be read.
     """
     with open_regular(path, links=False) as file:
-        _check(path, os.fstat(file.fileno()))
+        check(path, os.fstat(file.fileno()))
         return file.read(most)
 
 
@@ -130,12 +136,3 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             with contextlib.suppress(OSError):
                 os.unlink(part)
             raise
-
-
-def _check(path: Path | str, about: os.stat_result) -> None:
-    if stat.S_ISLNK(about.st_mode):
-        raise DistrustError(path, "it is a link")
-    if about.st_uid not in (0, os.geteuid()):
-        raise DistrustError(path, f"it belongs to another user ({about.st_uid})")
-    if about.st_mode & OTHERS:
-        raise DistrustError(path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})")

@@ -121,7 +121,10 @@ def _check_size(text: str) -> None:
             anchor, before = outer.pop()
         elif isinstance(event, yaml.NodeEvent):
             anchor, before = event.anchor, count
-            count += _size_of(event, sizes)
+            alias = isinstance(event, yaml.AliasEvent)
+            if alias and event.anchor not in sizes:
+                raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
+            count += sizes[event.anchor] if alias else 1
         else:
             continue
         if isinstance(event, yaml.CollectionStartEvent):
@@ -132,12 +135,3 @@ def _check_size(text: str) -> None:
             raise _refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
         if count > YAML_NODES:
             raise _refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
-
-
-def _size_of(event: Any, sizes: dict[str, int]) -> int:
-    """Return the number of values that a node adds."""
-    if not isinstance(event, yaml.AliasEvent):
-        return 1
-    if event.anchor not in sizes:
-        raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
-    return sizes[event.anchor]

@@ -176,6 +176,14 @@ def test_units_and_multipliers_are_those_that_the_log_says(tmp_path, units_of, m
     np.testing.assert_allclose(found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_number_of_a_unit_or_an_error_that_is_none_is_no_defect(tmp_path, number):
+    extra = format_record(67, "UNIT", "fZ", "Id,Label") + HEAD + struct.pack("<Bf64s", 67, number, b"deg/s")
+    extra += format_record(90, "ERR", "Qff", "TimeUS,Subsys,ECode") + HEAD + struct.pack("<BQff", 90, 1, number, 1.0)
+    found, damage = messages(log(tmp_path, "IMU", units(seconds=8.0), extra=extra))
+    assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
+
+
 def test_types_of_hundredths_are_hundredths(tmp_path):
     records = np.zeros((100, 2), [("head", "S2"), ("type", "u1"), ("time", "<u8"), ("x", "<i2"), ("y", "<i4", 2)])
     records["head"], records["type"], records["time"] = HEAD, (70, 71), 10_000 * np.arange(100)[:, None]
