@@ -49,7 +49,6 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.record import is_record
 from fdi_ros.system import trusted_file
 
 
@@ -135,19 +134,10 @@ def _call_as_part(dispatcher: Any) -> None:
 
 
 class Callback:
-    """A compiled function reached through its address, so that its callers need not be compiled anew for it.
-
-    Parameters
-    ----------
-    function
-        Takes records, returns nothing.
-    records
-        Record classes of its arguments.
-    """
+    """A compiled function over records, reached through its address: its callers need not be compiled anew for it."""
 
     def __init__(self, function: Callable[..., None], records: tuple[type, ...]) -> None:
-        self.function = function
-        self.records = records
+        self.function, self.records = function, records
         self._compiled: Any = None
         _callbacks.append(self)
 
@@ -161,7 +151,7 @@ class Callback:
         if INTERPRETED:
             return _callbacks.index(self)
         if self._compiled is None:
-            types = tuple(numba.from_dtype(_dtype(kind)) for kind in self.records)
+            types = tuple(numba.from_dtype(kind.dtype) for kind in self.records)  # type: ignore[attr-defined]
             # As `numba.cfunc` does, which would load what is kept before it is known whose it is.
             with _kept(self.function):
                 compiled = CFunc(self.function, (types, numba.types.void), {}, {"error_model": "numpy"})
@@ -233,12 +223,6 @@ def _index_path(dispatcher: Any) -> Path:
 def _part_path(dispatcher: Any) -> Path:
     """Empty file that says that a function has become a part of others."""
     return _index_path(dispatcher).with_suffix(".nbp")
-
-
-def _dtype(kind: type) -> np.dtype[Any]:
-    if not is_record(kind):
-        raise TypeError(f"{kind.__name__} is no record")
-    return cast("np.dtype[Any]", kind.dtype)  # type: ignore[attr-defined]
 
 
 # Calling by address -------------------------------------------------------------------------------------------------
@@ -386,8 +370,11 @@ def folder() -> Path:
     version = f"numba-{numba.__version__}-numpy-{np.__version__}{'-checked' if numba.config.BOUNDSCHECK else ''}"
     in_package = _PACKAGE / "__pycache__" / "compiled"
     # Before anything else what the user asked for.
-    wished = [Path(numba.config.CACHE_DIR) / _NAME] if numba.config.CACHE_DIR else []
-    for root in (*wished, in_package, *_user_folder()):
+    roots = [Path(numba.config.CACHE_DIR) / _NAME] if numba.config.CACHE_DIR else []
+    roots.append(in_package)
+    with contextlib.suppress(RuntimeError):
+        roots.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _NAME)
+    for root in roots:
         if _usable(root, version):
             _take_over(in_package / version, root / version)
             return root / version
@@ -395,13 +382,6 @@ def folder() -> Path:
     _take_over(in_package / version, found)
     LOG.warning("compiled code is kept in %s: neither the package's folder nor a home can be written", found)
     return found
-
-
-def _user_folder() -> list[Path]:
-    home = os.environ.get("XDG_CACHE_HOME")
-    with contextlib.suppress(RuntimeError):
-        return [(Path(home) if home else Path.home() / ".cache") / _NAME]
-    return []
 
 
 def _temporary() -> Path:
@@ -466,7 +446,5 @@ def _digest(source: Path) -> str:
 
 def _source_of(module: str) -> Path | None:
     path = _PACKAGE.joinpath(*module.split(".")[1:])
-    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
-        if candidate.is_file() and candidate != _PACKAGE / "__init__.py":
-            return candidate
-    return None
+    files = (path.with_suffix(".py"), path / "__init__.py")
+    return next((one for one in files if one.is_file() and one != _PACKAGE / "__init__.py"), None)

@@ -66,9 +66,14 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
             for hook in tuple(self.hooks):
                 hook(False)
 
-    def now(self) -> float:
-        """Return the seconds spent compiling so far."""
-        return self.seconds + (time.perf_counter() - self.begun if self.depth else 0.0)
+    @contextlib.contextmanager
+    def calling(self, hook: Callable[[bool], None]) -> Iterator[None]:
+        """Call a hook, too, for what is compiled within."""
+        self.hooks.append(hook)
+        try:
+            yield
+        finally:
+            self.hooks.remove(hook)
 
 
 _watch = _Watch()
@@ -76,19 +81,19 @@ for _kind in (_PASS, _WHOLE):
     event.register(_kind, _watch)
 
 
-def compiling_seconds() -> float:
-    """Return for how long this process has compiled so far, s."""
-    return _watch.now()
-
-
 def is_compiling() -> bool:
     """Return whether this process compiles now."""
     return _watch.depth > 0
 
 
+def compiling_seconds() -> float:
+    """Return for how long this process has compiled so far, s."""
+    return _watch.seconds + (time.perf_counter() - _watch.begun if is_compiling() else 0.0)
+
+
 def clock() -> float:
     """Return a time that passes as `time.perf_counter` does, but stands still while anything is compiled, s."""
-    return time.perf_counter() - _watch.now()
+    return time.perf_counter() - compiling_seconds()
 
 
 class View:
@@ -139,11 +144,10 @@ def announced(view: View | None = None) -> Iterator[None]:
                 thread.start()
 
     thread = threading.Thread(target=tick, daemon=True)
-    _watch.hooks.append(hook)
     try:
-        yield
+        with _watch.calling(hook):
+            yield
     finally:
-        _watch.hooks.remove(hook)
         over.set()
         if thread.is_alive():
             thread.join()
@@ -157,8 +161,5 @@ def refused(words: str) -> Iterator[None]:
         if begins:
             raise FdiError(words)
 
-    _watch.hooks.append(hook)
-    try:
+    with _watch.calling(hook):
         yield
-    finally:
-        _watch.hooks.remove(hook)

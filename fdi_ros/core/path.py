@@ -55,32 +55,16 @@ def run(
     events: NDArray[Any],
     stop_at_event: bool,
 ) -> tuple[int, int, bool]:
-    """Work samples one after the other, from row `start` on.
+    """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
 
-    Parameters
-    ----------
-    core
-        (1,) `Core`.
-    bank, memory
-        (1,) `Bank` of the detector, and the bytes of its states.
-    subsets
-        (2^n,) `Subset`.
-    samples
-        (N,) `Sample`, stamps strictly increasing.
-    start
-        Row to begin with.
-    out
-        (N,) `OutputRow`.
-    events
-        `EventRow`; work ends when fewer than n are free.
-    stop_at_event
-        End after the first sample that brings an event.
+    ``core`` (1,) `Core`; ``bank`` (1,) `Bank` of the detector, ``memory`` the bytes of its states; ``subsets`` (2^n,)
+    `Subset`. Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first
+    sample that brings one.
 
-    Returns
-    -------
-    The row at which work ended, N if all is done; the number of events; and whether something must be prepared. If it
-    is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
-    lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
+    Returned are the row at which work ended, N if all is done; the number of events; and whether something must be
+    prepared. If it is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set; if the
+    row before it lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is
+    set.
     """
     monitor, count = core[0], 0
     for k in range(start, len(samples)):

@@ -47,9 +47,8 @@ class Fault:
     def __post_init__(self) -> None:
         check_fields(self, f"fault {self.kind.name}")
         if not self.stop > self.start:
-            raise FaultError(
-                f"fault {self.kind.name}: stop is {self.stop:g} s, expected more than start {self.start:g} s"
-            )
+            words = f"stop is {self.stop:g} s, expected more than start {self.start:g} s"
+            raise FaultError(f"fault {self.kind.name}: {words}")
 
     @property
     def size(self) -> float | None:
@@ -58,13 +57,7 @@ class Fault:
         return None if size is None else float(size)
 
     def channels(self, channel_names: Sequence[str]) -> tuple[int, ...]:
-        """Find the indices of the channels it strikes.
-
-        Raises
-        ------
-        FaultError
-            If there is no such channel or unit; the message lists the channels.
-        """
+        """Find the indices of the channels it strikes; `FaultError` if there is no such channel or unit."""
         struck: list[int] = []
         for name in self.channel.split(","):
             found = [i for i, known in enumerate(channel_names) if name == known or known.startswith(f"{name}.")]
@@ -90,14 +83,7 @@ _KEYS = ("channel", "kind", "start", "stop", "seed")
 
 
 def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
-    """Build a kind of fault by name.
-
-    Parameters
-    ----------
-    name
-        A key of `FAULT_KINDS`.
-    options
-        Options of the kind; None is the same as not given.
+    """Build a kind of fault by its name in `FAULT_KINDS`, with its options; None is the same as not given.
 
     Raises
     ------
@@ -132,24 +118,12 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
 
 
 def parse_fault(text: str) -> Fault:
-    """Read a fault from the command line: ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``.
-
-    Raises
-    ------
-    FaultError
-        If it is not of that form.
-    """
+    """Read a fault as `fault_from` does: ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``."""
     return fault_from(key_values(text))
 
 
 def key_values(text: str) -> dict[str, str]:
-    """Read words of the form ``key=value``.
-
-    Raises
-    ------
-    FaultError
-        If a word is not of that form, or a key is given twice.
-    """
+    """Read words of the form ``key=value``; `FaultError` if one is not of that form, or a key is given twice."""
     items: dict[str, str] = {}
     for word in text.split():
         name, equals, value = word.partition("=")
@@ -230,13 +204,7 @@ class Injector:
         return truth
 
     def refuse_between(self, low: float, high: float, why: str) -> None:
-        """Refuse faults that begin where they cannot be found: after low and before high, s since the first sample.
-
-        Raises
-        ------
-        FaultError
-            Naming the times that are allowed.
-        """
+        """Refuse (`FaultError`) faults that begin after low and before high, s since the first sample."""
         allowed = [f"at most {low:.12g} s"] if low >= 0 else []
         allowed += [f"at least {high:.12g} s"] if high < math.inf else []
         for fault in self.faults:

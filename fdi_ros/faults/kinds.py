@@ -42,13 +42,7 @@ Memory = dict[str, Any]
 
 
 def check_fields(owner: Any, called: str) -> None:
-    """Check the fields of a frozen dataclass that are declared with `setting`, and give them their types.
-
-    Raises
-    ------
-    FaultError
-        If one is missing or out of range.
-    """
+    """Check (`FaultError`) the fields of a frozen dataclass declared with `setting`, and give them their types."""
     for name, field in fields_of(owner).items():
         value = getattr(owner, name)
         if value is REQUIRED:

@@ -67,17 +67,15 @@ class Geometry:
         _check_axes(self.axes)
         self.axes.flags.writeable = False
         self.n = len(self.axes)
-        names = tuple(channel_names) if channel_names else tuple(f"g{i + 1}" for i in range(self.n))
-        if len(names) != self.n:
-            raise GeometryError(f"{len(names)} channel names for {self.n} axes")
+        names = tuple(channel_names or (f"g{i + 1}" for i in range(self.n)))
+        self.unit_of = tuple(name.rpartition(".")[0] for name in names) if units is None else tuple(units)
+        """Unit of each channel; empty for one that belongs to none."""
+        for count, called in ((len(names), "channel names"), (len(self.unit_of), "names of units")):
+            if count != self.n:
+                raise GeometryError(f"{count} {called} for {self.n} axes")
         if len(set(names)) != self.n:
             raise GeometryError(f"channel names are not unique: {', '.join(names)}")
         self.channel_names = names
-        if units is not None and len(units) != self.n:
-            raise GeometryError(f"{len(units)} names of units for {self.n} axes")
-        prefixes = [name.rpartition(".")[0] for name in names]
-        self.unit_of: tuple[str, ...] = tuple(prefixes if units is None else units)
-        """Unit of each channel; empty for one that belongs to none."""
 
     def __repr__(self) -> str:
         return f"Geometry({self.n} channels: {', '.join(self.channel_names)})"
@@ -111,8 +109,7 @@ class Geometry:
     @classmethod
     def cone(cls, n: int) -> Geometry:
         """Build n axes evenly spread on a cone of half-angle arccos(1/sqrt 3) about body z."""
-        azimuth = 2 * np.pi * np.arange(n) / n
-        c, s = 1 / np.sqrt(3.0), np.sqrt(2 / 3)
+        azimuth, c, s = 2 * np.pi * np.arange(n) / n, 1 / np.sqrt(3.0), np.sqrt(2 / 3)
         return cls(np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)]))
 
     @classmethod
@@ -126,9 +123,7 @@ class Geometry:
         GeometryError
             If a mount is not a rotation matrix.
         """
-        rotations = [np.asarray(mount, dtype=np.float64) for mount in mounts]
-        for k, rotation in enumerate(rotations):
-            _check_rotation(rotation, k)
+        rotations = [_rotation(mount, k) for k, mount in enumerate(mounts)]
         names = channel_names or [f"imu_{k + 1}.{axis}" for k in range(len(rotations)) for axis in "xyz"]
         return cls(np.vstack([rotation.T for rotation in rotations]), names)
 
@@ -179,10 +174,8 @@ class Geometry:
     @cached_property
     def group_matrix(self) -> NDArray[np.bool_]:
         """(n, n): row i marks the channels that cannot be told apart from channel i, itself included."""
-        matrix = np.zeros((self.n, self.n), dtype=bool)
-        for group in self.groups:
-            matrix[np.ix_(group, group)] = True
-        return matrix
+        number = np.array([next(k for k, group in enumerate(self.groups) if i in group) for i in range(self.n)])
+        return np.asarray(number[:, None] == number)
 
     @cached_property
     def isolable(self) -> NDArray[np.bool_]:
@@ -193,8 +186,8 @@ class Geometry:
     @cached_property
     def units(self) -> tuple[tuple[int, ...], ...]:
         """Channels of each unit; units of one channel left out."""
-        named = dict.fromkeys(unit for unit in self.unit_of if unit)
-        members = (tuple(i for i in range(self.n) if self.unit_of[i] == unit) for unit in named)
+        names = dict.fromkeys(filter(None, self.unit_of))
+        members = (tuple(i for i in range(self.n) if self.unit_of[i] == name) for name in names)
         return tuple(unit for unit in members if len(unit) > 1)
 
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
@@ -227,11 +220,9 @@ def _check_axes(axes: Array) -> None:
         raise GeometryError(f"axes have shape {axes.shape}, expected (n, 3)")
     if not MIN_CHANNELS <= len(axes) <= MAX_CHANNELS:
         raise GeometryError(f"{len(axes)} channels, expected {MIN_CHANNELS} to {MAX_CHANNELS}")
-    if not np.isfinite(axes).all():
-        row = int(np.flatnonzero(~np.isfinite(axes).all(axis=1))[0])
-        raise GeometryError(f"axis of channel {row + 1} is not finite: {axes[row].tolist()}")
-    norms = np.linalg.norm(axes, axis=1)
-    for row, norm in enumerate(norms):
+    for row, norm in enumerate(np.linalg.norm(axes, axis=1)):
+        if not np.isfinite(axes[row]).all():
+            raise GeometryError(f"axis of channel {row + 1} is not finite: {axes[row].tolist()}")
         if not MIN_NORM <= norm <= MAX_NORM:
             raise GeometryError(f"axis of channel {row + 1} has norm {norm:.4g}, expected {MIN_NORM} to {MAX_NORM:g}")
     if not spans_space(axes):
@@ -242,7 +233,8 @@ def _check_axes(axes: Array) -> None:
         )
 
 
-def _check_rotation(rotation: Array, index: int) -> None:
+def _rotation(mount: ArrayLike, index: int) -> Array:
+    rotation = np.asarray(mount, dtype=np.float64)
     if rotation.shape != (3, 3):
         raise GeometryError(f"mount of unit {index + 1} has shape {rotation.shape}, expected (3, 3)")
     if not np.isfinite(rotation).all():
@@ -252,6 +244,7 @@ def _check_rotation(rotation: Array, index: int) -> None:
         raise GeometryError(f"mount of unit {index + 1} is no rotation: |R R' - I| is {deviation:.3g}, at most 0.001")
     if np.linalg.det(rotation) < 0:
         raise GeometryError(f"mount of unit {index + 1} is a reflection: det R is -1, expected +1")
+    return rotation
 
 
 PARALLEL = 0.985

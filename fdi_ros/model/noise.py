@@ -79,8 +79,8 @@ class NoiseModel:
     def subset(self, mask: ArrayLike) -> NoiseModel:
         """Return the model of the channels marked in mask (n,) bool."""
         kept = np.asarray(mask, dtype=bool)
-        full = self.for_channels(len(kept))
-        return NoiseModel(**{name: v[kept] for name, v in vars(full).items() if v is not None})
+        full = vars(self.for_channels(len(kept)))
+        return NoiseModel(**{name: value[kept] for name, value in full.items() if value is not None})
 
     def variance(self, geometry: Geometry, rate: Array, acceleration: Array | None = None) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.
@@ -94,19 +94,10 @@ class NoiseModel:
         acceleration
             Body angular acceleration, (N, 3) rad/s^2; None is zero.
         """
-        return self.variance_along(geometry, rate @ geometry.axes.T, acceleration)
-
-    def variance_along(self, geometry: Geometry, rate_along: Array, acceleration: Array | None = None) -> Array:
-        """Error variance of every channel, (N, n) (rad/s)^2, from the rate along its own axis, (N, n) rad/s."""
-        total = rate_along * self.scale_std
-        total *= total
-        total += self.noise_std * self.noise_std
+        total = (rate @ geometry.axes.T * self.scale_std) ** 2 + self.noise_std**2
         if acceleration is not None:
-            timing = acceleration @ geometry.axes.T
-            timing *= self.timing_std
-            timing *= timing
-            total += timing
-        return total
+            total += (acceleration @ geometry.axes.T * self.timing_std) ** 2
+        return np.asarray(total)
 
 
 def _spread(name: str, value: Array, n: int) -> Array:
@@ -121,9 +112,8 @@ def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above
     within = (array > 0 if above else array >= 0) & (array <= high) & np.isfinite(array)
     if array.ndim > 1 or array.size == 0 or not within.all():
         wrong = array if array.ndim > 1 or array.size == 0 else array[~within].flat[0]
-        bound = "> 0" if above else ">= 0"
-        upper = "" if high == np.inf else f" and <= {high:g}"
-        raise ConfigError(f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bound}{upper}")
+        bounds = ("> 0" if above else ">= 0") + ("" if high == np.inf else f" and <= {high:g}")
+        raise ConfigError(f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bounds}")
     array.flags.writeable = False
     return array
 
@@ -141,8 +131,7 @@ def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int
     found = []
     for k, unit in enumerate(units):
         others = noise[[i for j, other in enumerate(units) if j != k for i in other]]
-        others = others[np.isfinite(others)]
-        beside = float(others.max(initial=0.0))
+        beside = float(others[np.isfinite(others)].max(initial=0.0))
         found += [(int(i), beside) for i in unit if beside > 0.0 and noise[i] > MUCH_NOISIER * beside]
     return found
 

@@ -161,11 +161,7 @@ def _sphere_tail(directions: Array) -> Callable[[float], float]:
     points, weights = half_sphere(directions.shape[1])
     largest = np.abs(points @ directions.T).max(axis=1)
     inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
-
-    def tail(t: float) -> float:
-        return float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
-
-    return tail
+    return lambda t: float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
 
 
 def half_sphere(m: int, circle: int = 360, around: int = 128, heights: int = 48) -> tuple[Array, Array]:

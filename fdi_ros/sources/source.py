@@ -34,11 +34,6 @@ class Source(ABC):
     """One kind of input, with the settings of one monitor.
 
     What needs no settings is on the class: the messages of a recording are read before there are any.
-
-    Parameters
-    ----------
-    config
-        Settings of the monitor.
     """
 
     type: ClassVar[str]
@@ -68,22 +63,10 @@ class Source(ABC):
     @staticmethod
     @abstractmethod
     def receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
-        """Take in one live message.
+        """Take in one live message, its bytes, of the input topic ``inlet``, which arrived at ``stamp``, ns.
 
-        Parameters
-        ----------
-        aligner, live
-            As for `fdi_ros.core.path.process`.
-        inlet
-            Number of the input topic.
-        data
-            Bytes of the message.
-        stamp
-            When it arrived, ns, for messages that carry no stamp.
-
-        Returns
-        -------
-        `fdi_ros.core.path.MORE` if a sample is ready to be worked, `MALFORMED` if the message was refused, else 0.
+        ``aligner``, ``live``: as for `fdi_ros.core.path.process`. Returned is `fdi_ros.core.path.MORE` if a sample is
+        ready to be worked, `MALFORMED` if the message was refused, else 0.
         """
 
     # Messages -----------------------------------------------------------------------------------------------------
@@ -105,16 +88,9 @@ class Source(ABC):
 
     @classmethod
     def decode(cls, buffer: Bytes, offset: Int, length: Int, count: int) -> Decoded:
-        """Read messages.
+        """Read messages, each at ``offset`` (k,) and of ``length`` (k,) within the buffer; a number of values in each.
 
-        Parameters
-        ----------
-        buffer
-            Bytes in which the messages lie.
-        offset, length
-            (k,) of each message; each must lie within the buffer.
-        count
-            Number of values in each; a message with another number is malformed.
+        One with another number of values is malformed.
         """
         decoded = Decoded.nothing(len(offset), count)
         cls.decode_into(read_only(buffer), offset, length, *decoded)
@@ -122,13 +98,7 @@ class Source(ABC):
 
     @classmethod
     def parse(cls, data: bytes, count: int) -> tuple[int, tuple[float, ...]]:
-        """Read stamp (ns; 0: it carries none) and values (count,) rad/s of one message.
-
-        Raises
-        ------
-        MessageError
-            If the bytes are no such message.
-        """
+        """Read stamp (ns; 0: it carries none) and values (count,) rad/s of one message, or raise `MessageError`."""
         (code,), (stamp,), (values,) = cls.decode(*as_batch(data), count)
         if code != GOOD:
             raise MessageError(cls.explain(int(code), data, count))
@@ -136,13 +106,7 @@ class Source(ABC):
 
     @classmethod
     def patch(cls, data: bytes, values: Sequence[float]) -> bytes:
-        """Return a message with other values, as many, rad/s, and all else as it was.
-
-        Raises
-        ------
-        MessageError
-            If the bytes are no such message.
-        """
+        """Return a message with other values, as many, rad/s, and all else as it was, or raise `MessageError`."""
         at = cls.place(as_batch(data)[0], 0, len(data), len(values))
         if at < 0:
             raise MessageError(cls.explain(-at, data, len(values)))
