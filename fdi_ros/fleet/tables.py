@@ -221,10 +221,8 @@ class Fleet:
     @property
     def verdict(self) -> Verdict:
         """How many flights need a look."""
-        count, faulty = (
-            _count(len(self.flights), "flight"),
-            sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks),
-        )
+        count = _count(len(self.flights), "flight")
+        faulty = sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks)
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
         failed = sum(bool(row["error"]) for row in self.looks)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,15 +138,11 @@ def mean_of(total: float, squares: float, count: int) -> Estimate | None:
 def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
     """Median and more of whole numbers counted as ``{"number": count}``; None if there are none."""
     counts = sorted((int(number), count) for number, count in histogram.items())
-    total, found = sum(count for _, count in counts), {}
+    reached = list(accumulate(count for _, count in counts))
+    found: dict[str, int | None] = {}
     for level in (0.5, 0.9, 0.99):
-        reached, answer = 0, None
-        for value, count in counts:
-            reached += count
-            if reached >= level * total:
-                answer = value
-                break
-        found[f"p{100 * level:g}"] = answer
+        at_least = (n for (n, _), k in zip(counts, reached, strict=True) if k >= level * reached[-1])
+        found[f"p{100 * level:g}"] = next(at_least, None)
     return found
 
 

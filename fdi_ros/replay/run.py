@@ -12,7 +12,7 @@ it; `replay` judges a recording. The stream passes block by block; memory does n
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -127,9 +127,9 @@ class Walk:
 
     def feed(self, block: Block) -> None:
         """Pass a piece without a gap through the monitor."""
-        row = 0
-        begun = clock()
-        for output in self._outputs(block):
+        stepwise = any(sink.stops_at_events for sink in self.sinks)
+        row, begun = 0, clock()
+        for output in self.pipeline.steps(block) if stepwise else [self.pipeline.process(block)]:
             self.seconds += clock() - begun
             rows = slice(row, row + len(output))
             self.add(block[rows], output, rows)
@@ -140,11 +140,6 @@ class Walk:
         """Hand on what came of some rows of the piece."""
         for sink in self.sinks:
             sink.add(block, output, self.pipeline)
-
-    def _outputs(self, block: Block) -> Iterable[Output]:
-        if any(sink.stops_at_events for sink in self.sinks):
-            return self.pipeline.steps(block)
-        return [self.pipeline.process(block)]
 
 
 class Judge(Walk):

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -30,15 +30,6 @@ FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
 FALSE_ALARM_MARGIN = 4.0
 """The loose thresholds have this many times the false-alarm rate asked for."""
-
-
-class Truth(NamedTuple):
-    """Samples and what is wrong in them."""
-
-    z: Array
-    """(N, n) rad/s."""
-    struck: Mask
-    """(N, n)"""
 
 
 class Snapshot(OnGeometries):
@@ -78,8 +69,8 @@ class Snapshot(OnGeometries):
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratios of healthy samples."""
-        truth, running = self._draw(cell, count, rng), self.contenders[cell.geometry].running
-        return {"trials": count, "largest": largest_ratios(running, truth.z, self.settings["false_alarms"])}
+        z, running = self._draw(cell, count, rng)[0], self.contenders[cell.geometry].running
+        return {"trials": count, "largest": largest_ratios(running, z, self.settings["false_alarms"])}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by geometry, method and false-alarm rate."""
@@ -89,14 +80,14 @@ class Snapshot(OnGeometries):
 
     def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw samples and evaluate every method on them."""
-        truth = self._draw(cell, count, rng)
+        z, struck = self._draw(cell, count, rng)
         methods = {}
         for name, contenders in self._at_rates(cell.geometry, preparation["factors"][cell.geometry]).items():
             evaluations: dict[Contender, Evaluation] = {}
             for contender, _ in contenders:
                 if contender not in evaluations:
-                    evaluations[contender] = contender.evaluate(truth.z)
-            methods[name] = [counted(evaluations[one], factor, truth.struck) for one, factor in contenders]
+                    evaluations[contender] = contender.evaluate(z)
+            methods[name] = [counted(evaluations[one], factor, struck) for one, factor in contenders]
         return {"trials": count, "methods": methods}
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
@@ -137,7 +128,8 @@ class Snapshot(OnGeometries):
                     self._ready[g][name] = [(one, 1.0) for one in built]
         return self._ready[g]
 
-    def _draw(self, cell: Cell, count: int, rng: np.random.Generator) -> Truth:
+    def _draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Mask]:
+        """Draw samples z (N, n) rad/s, and which channels are struck (N, n)."""
         geometry, sigma = self.geometries[cell.geometry], self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
@@ -147,7 +139,7 @@ class Snapshot(OnGeometries):
             rows = np.arange(count)[:, None]
             struck[rows, order] = True
             z[rows, order] += cell.size * sigma * rng.choice([-1.0, 1.0], order.shape)
-        return Truth(z, struck)
+        return z, struck
 
 
 def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
