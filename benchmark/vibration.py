@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from trials import CONFIGS, NOISE, START, Array, Asked, Rng, Row
+from trials import CONFIGS, NOISE, START, Array, Asked, Rng, Row, fresh
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.simulate import Motion, regular_stamps
@@ -30,13 +30,18 @@ from fdi_ros.monitor.output import ChannelState
 LENGTH, MOTORS, COUNTED = 60.0, 10.0, 15.0
 """s: of a flight, until the motors start, and from where on errors count."""
 SCALE, MISALIGNMENT, BIAS = 0.003, float(np.radians(0.2)), 0.01
-FINE = 16
-"""Steps within a sample for what filters and shocks do between samples."""
-FIGURES = {
-    **dict.fromkeys(("nees", "worst", "sigma", "over_best"), ".2f"),
-    **dict.fromkeys(("level", "ok"), ".1%"),
-    **dict.fromkeys(("declared", "faulty"), ".0f"),
+SUMS = {
+    "nees": (np.mean, ".2f"),
+    "worst": (np.max, ".2f"),
+    "sigma": (np.max, ".2f"),
+    "over_best": (np.mean, ".2f"),
+    "level": (np.mean, ".1%"),
+    "ok": (np.mean, ".1%"),
+    "declared": (np.sum, ".0f"),
+    "faulty": (np.sum, ".0f"),
 }
+"""What is made of the figure of each flight, and its format."""
+FIGURES = {name: form for name, (_, form) in SUMS.items()}
 
 
 @dataclass
@@ -119,165 +124,107 @@ def flight_of(config: Config, nominal: Array, rng: Rng) -> Flight:
     return Flight(rng, rate, t, manoeuvres(rng), axes, np.zeros((len(t), n // 3)), noise, np.full(n, NOISE))
 
 
-Condition = Callable[[Flight], None]
-
-
 def white(flight: Flight) -> None:
     """Nothing but white noise."""
 
 
-def late(unit: int, by: float = 0.02) -> Condition:
+def late(flight: Flight, unit: int, by: float = 0.02) -> None:
     """One unit is late."""
-
-    def change(flight: Flight) -> None:
-        if unit < flight.units:
-            flight.late[:, unit] += by
-        flight.std[:] = np.nan
-
-    return change
+    if unit < flight.units:
+        flight.late[:, unit] += by
+    flight.std[:] = np.nan
 
 
-def tones(size: float, *hertz: float) -> Condition:
+def tones(flight: Flight, size: float, *hertz: float) -> None:
     """Lines of their own phase in each channel, amplitude size, rad/s."""
-
-    def change(flight: Flight) -> None:
-        for frequency in hertz:
-            phase = flight.rng.uniform(0, 2 * np.pi, len(flight.axes))
-            line = np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
-            flight.noise += size * flight.running[:, None] * line
-        flight.std[:] = np.nan
-
-    return change
+    for frequency in hertz:
+        phase = flight.rng.uniform(0, 2 * np.pi, len(flight.axes))
+        flight.noise += size * flight.running[:, None] * np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
+    flight.std[:] = np.nan
 
 
-def body(size: float, hertz: float) -> Condition:
+def running_at(t: Array) -> Array:
+    """How far the motors have started at times t (N,) s, (N, 1), 0 to 1."""
+    return np.clip((t - MOTORS) / 0.5, 0.0, 1.0)[:, None]
+
+
+def body(flight: Flight, size: float, hertz: float) -> None:
     """Rotate the whole body, which units see 15 % and 0.15 rad differently."""
-
-    def change(flight: Flight) -> None:
-        rng, units = flight.rng, flight.units
-        along = size * rng.uniform(0.5, 1.0, 3)
-        angle = rng.uniform(0, 2 * np.pi, 3)
-
-        def shaken(t: Array) -> Array:
-            running = np.clip((t - MOTORS) / 0.5, 0.0, 1.0)[:, None]
-            return running * along * np.sin(2 * np.pi * hertz * t[:, None] + angle)
-
-        flight.shaken = shaken
-        flight.gain = np.repeat(1 + 0.15 * rng.standard_normal(units), 3)
-        flight.phase = np.repeat(0.15 * rng.standard_normal(units), 3) / (2 * np.pi * hertz)
-        flight.std[:] = np.nan
-
-    return change
+    along, angle = size * flight.rng.uniform(0.5, 1.0, 3), flight.rng.uniform(0, 2 * np.pi, 3)
+    flight.shaken = lambda t: running_at(t) * along * np.sin(2 * np.pi * hertz * t[:, None] + angle)
+    flight.gain = np.repeat(1 + 0.15 * flight.rng.standard_normal(flight.units), 3)
+    flight.phase = np.repeat(0.15 * flight.rng.standard_normal(flight.units), 3) / (2 * np.pi * hertz)
+    flight.std[:] = np.nan
 
 
-def broad(size: float) -> Condition:
+def broad(flight: Flight, size: float) -> None:
     """Vibration of the whole body from 20 to 90 Hz, folded, seen 15 % differently."""
+    hertz, angle = flight.rng.uniform(20, 90, 40), flight.rng.uniform(0, 2 * np.pi, (40, 3))
+    along = size * np.sqrt(2 / 40) * flight.rng.standard_normal((40, 3))
 
-    def change(flight: Flight) -> None:
-        rng = flight.rng
-        hertz, angle = rng.uniform(20, 90, 40), rng.uniform(0, 2 * np.pi, (40, 3))
-        along = size * np.sqrt(2 / 40) * rng.standard_normal((40, 3))
+    def shaken(t: Array) -> Array:
+        parts = zip(hertz, along, angle, strict=True)
+        return running_at(t) * sum(a * np.sin(2 * np.pi * f * t[:, None] + p) for f, a, p in parts)
 
-        def shaken(t: Array) -> Array:
-            running = np.clip((t - MOTORS) / 0.5, 0.0, 1.0)[:, None]
-            total = np.zeros((len(t), 3))
-            for f, a, p in zip(hertz, along, angle, strict=True):
-                total += a * np.sin(2 * np.pi * f * t[:, None] + p)
-            return running * total
-
-        flight.shaken = shaken
-        flight.gain = np.repeat(1 + 0.15 * rng.standard_normal(flight.units), 3)
-        flight.std[:] = np.nan
-
-    return change
+    flight.shaken = shaken
+    flight.gain = np.repeat(1 + 0.15 * flight.rng.standard_normal(flight.units), 3)
+    flight.std[:] = np.nan
 
 
-def autoregressive(memory: float) -> Condition:
+def autoregressive(flight: Flight, memory: float) -> None:
     """Noise of the first order with this memory from sample to sample, of the same variance."""
-
-    def change(flight: Flight) -> None:
-        drawn = NOISE * flight.rng.standard_normal(flight.noise.shape)
-        coloured = np.empty_like(drawn)
-        coloured[0] = drawn[0]
-        for k in range(1, len(drawn)):
-            coloured[k] = memory * coloured[k - 1] + np.sqrt(1 - memory**2) * drawn[k]
-        flight.noise += coloured - (flight.noise - flight.noise.mean(axis=0))
-
-    return change
+    drawn = NOISE * flight.rng.standard_normal(flight.noise.shape)
+    coloured = np.empty_like(drawn)
+    coloured[0] = drawn[0]
+    for k in range(1, len(drawn)):
+        coloured[k] = memory * coloured[k - 1] + np.sqrt(1 - memory**2) * drawn[k]
+    flight.noise += coloured - (flight.noise - flight.noise.mean(axis=0))
 
 
-def low_pass(hertz: float) -> Condition:
+def low_pass(flight: Flight, hertz: float) -> None:
     """White noise through a filter of the first order."""
-
-    def change(flight: Flight) -> None:
-        autoregressive(float(np.exp(-2 * np.pi * hertz / flight.rate)))(flight)
-
-    return change
+    autoregressive(flight, float(np.exp(-2 * np.pi * hertz / flight.rate)))
 
 
-def clocks(ppm: float) -> Condition:
+def clocks(flight: Flight, ppm: float) -> None:
     """Units whose clocks drift apart."""
-
-    def change(flight: Flight) -> None:
-        flight.late[:] += 1e-6 * ppm * flight.t[:, None] * flight.rng.permutation(np.linspace(0, 1, flight.units))
-        flight.std[:] = np.nan
-
-    return change
+    flight.late[:] += 1e-6 * ppm * flight.t[:, None] * flight.rng.permutation(np.linspace(0, 1, flight.units))
+    flight.std[:] = np.nan
 
 
-def louder(count: int, factor: float) -> Condition:
+def louder(flight: Flight, count: int, factor: float) -> None:
     """Noise of one channel, or of a unit, so many times as strong."""
-
-    def change(flight: Flight) -> None:
-        n = len(flight.axes)
-        own = [int(flight.rng.integers(n))] if count == 1 else 3 * int(flight.rng.integers(n // 3)) + np.arange(3)
-        flight.noise[:, own] += (
-            np.sqrt(factor**2 - 1)
-            * NOISE
-            * flight.running[:, None]
-            * flight.rng.standard_normal((len(flight.t), count))
-        )
-        flight.std[own] *= factor
-
-    return change
+    n = len(flight.axes)
+    own = [int(flight.rng.integers(n))] if count == 1 else 3 * int(flight.rng.integers(n // 3)) + np.arange(3)
+    added = flight.rng.standard_normal((len(flight.t), count))
+    flight.noise[:, own] += np.sqrt(factor**2 - 1) * NOISE * flight.running[:, None] * added
+    flight.std[own] *= factor
 
 
-def landing(size: float) -> Condition:
+def landing(flight: Flight, size: float) -> None:
     """Shake the body when it lands; units are not sampled together."""
+    before, at = flight.motion, LENGTH - 5.0 + flight.rng.uniform(0, 0.1)
+    along = size * flight.rng.standard_normal(3) / np.sqrt(3)
 
-    def change(flight: Flight) -> None:
-        before, at = flight.motion, LENGTH - 5.0 + flight.rng.uniform(0, 0.1)
-        along = size * flight.rng.standard_normal(3) / np.sqrt(3)
+    def shock(t: Array) -> Array:
+        since = np.maximum(t - at, 0.0)[:, None]
+        return before(t) + along * np.sin(2 * np.pi * 12.0 * since) * np.exp(-since / 0.06)
 
-        def shock(t: Array) -> Array:
-            since = np.maximum(t - at, 0.0)[:, None]
-            return before(t) + along * np.sin(2 * np.pi * 12.0 * since) * np.exp(-since / 0.06)
-
-        flight.motion = shock
-        flight.late += flight.rng.uniform(0, 1 / flight.rate, flight.units) - 0.5 / flight.rate
-        flight.std[:] = np.nan
-
-    return change
+    flight.motion = shock
+    flight.late += flight.rng.uniform(0, 1 / flight.rate, flight.units) - 0.5 / flight.rate
+    flight.std[:] = np.nan
 
 
-def rectified(size: float) -> Condition:
+def rectified(flight: Flight, size: float) -> None:
     """Biases that move as the motors start."""
-
-    def change(flight: Flight) -> None:
-        flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * flight.running[:, None]
-        tones(0.02, 41.0)(flight)
-
-    return change
+    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * flight.running[:, None]
+    tones(flight, 0.02, 41.0)
 
 
-def warming(size: float) -> Condition:
+def warming(flight: Flight, size: float) -> None:
     """Biases that warm by so much with a time constant of 30 s."""
-
-    def change(flight: Flight) -> None:
-        since = np.maximum(flight.t - MOTORS, 0.0)[:, None]
-        flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * (1 - np.exp(-since / 30.0))
-
-    return change
+    since = np.maximum(flight.t - MOTORS, 0.0)[:, None]
+    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * (1 - np.exp(-since / 30.0))
 
 
 def misaligned(flight: Flight) -> None:
@@ -289,31 +236,29 @@ def misaligned(flight: Flight) -> None:
     flight.std[:] = np.nan
 
 
-CONDITIONS: dict[str, tuple[Condition, float]] = {
-    "white": (white, 100.0),
-    **{f"unit {u + 1} late by 20 ms": (late(u), 100.0) for u in range(4)},
-    **{
-        f"own tones {size} {hertz} Hz at {rate:.0f}": (tones(size, hertz), rate)
-        for size in (0.03, 0.1)
-        for hertz, rate in ((12.7, 100.0), (43.0, 100.0), (87.3, 100.0), (149.0, 100.0), (149.0, 50.0), (87.3, 50.0))
-    },
-    "two own tones 0.1": (tones(0.1, 31.0, 43.0), 100.0),
-    **{
-        f"body {size} {hertz} Hz at {rate:.0f}": (body(size, hertz), rate)
-        for size in (0.03, 0.1)
-        for hertz, rate in ((12.7, 100.0), (43.0, 100.0), (87.3, 100.0), (149.0, 100.0), (149.0, 50.0), (87.3, 50.0))
-    },
-    "body broadband 0.05": (broad(0.05), 100.0),
-    "AR 0.9": (autoregressive(0.9), 100.0),
-    "low pass 30 Hz at 400": (low_pass(30.0), 400.0),
-    "clocks 50 ppm": (clocks(50.0), 100.0),
-    "misalignment 0.5 deg": (misaligned, 100.0),
-    "one unit x3": (louder(3, 3.0), 100.0),
-    "one channel x10": (louder(1, 10.0), 100.0),
-    "landing shock 5 rad/s": (landing(5.0), 100.0),
-    "rectified 5 mrad/s": (rectified(0.005), 100.0),
-    "warming 20 mrad/s": (warming(0.02), 100.0),
+TONES = [
+    (size, hertz, rate)
+    for size in (0.03, 0.1)
+    for hertz, rate in ((12.7, 100.0), (43.0, 100.0), (87.3, 100.0), (149.0, 100.0), (149.0, 50.0), (87.3, 50.0))
+]
+CONDITIONS: dict[str, tuple[Any, ...]] = {
+    "white": (100.0, white),
+    **{f"unit {u + 1} late by 20 ms": (100.0, late, u) for u in range(4)},
+    **{f"own tones {size} {hertz} Hz at {rate:.0f}": (rate, tones, size, hertz) for size, hertz, rate in TONES},
+    "two own tones 0.1": (100.0, tones, 0.1, 31.0, 43.0),
+    **{f"body {size} {hertz} Hz at {rate:.0f}": (rate, body, size, hertz) for size, hertz, rate in TONES},
+    "body broadband 0.05": (100.0, broad, 0.05),
+    "AR 0.9": (100.0, autoregressive, 0.9),
+    "low pass 30 Hz at 400": (400.0, low_pass, 30.0),
+    "clocks 50 ppm": (100.0, clocks, 50.0),
+    "misalignment 0.5 deg": (100.0, misaligned),
+    "one unit x3": (100.0, louder, 3, 3.0),
+    "one channel x10": (100.0, louder, 1, 10.0),
+    "landing shock 5 rad/s": (100.0, landing, 5.0),
+    "rectified 5 mrad/s": (100.0, rectified, 0.005),
+    "warming 20 mrad/s": (100.0, warming, 0.02),
 }
+"""Samples a second, what happens, and its numbers."""
 
 
 def config_of(units: int, rate: float, asked: Asked) -> Config:
@@ -333,27 +278,24 @@ def config_of(units: int, rate: float, asked: Asked) -> Config:
 def measure(asked: Asked) -> Iterator[Row]:
     """Every condition with two, three and four units."""
     monitors: dict[tuple[int, float], Pipeline] = {}
-    for name, (condition, rate) in CONDITIONS.items():
+    for name, (rate, condition, *numbers) in CONDITIONS.items():
         for units in (2, 3, 4):
             label = f"{units} units, {name}"
             if not asked.wants(label) or (name.startswith("unit ") and int(name[5]) > units):
                 continue
             if (units, rate) not in monitors:
                 monitors[units, rate] = Pipeline.from_config(config_of(units, rate, asked))
-            pipeline = monitors[units, rate]
-            nominal = pipeline.geometry.axes
-            yield (
-                label,
-                figures([judged(pipeline, nominal, condition, asked.rng(label, k)) for k in range(asked.count(4))]),
-            )
+            pipeline, flights = monitors[units, rate], []
+            for k in range(asked.count(4)):
+                flight = flight_of(pipeline.config, pipeline.geometry.axes, asked.rng(label, k))
+                condition(flight, *numbers)
+                flights.append(judged(pipeline, flight))
+            yield label, {name: of(np.array([one[name] for one in flights])) for name, (of, *_) in SUMS.items()}
 
 
-def judged(pipeline: Pipeline, nominal: Array, condition: Condition, rng: Rng) -> dict[str, Any]:
+def judged(pipeline: Pipeline, flight: Flight) -> dict[str, Any]:
     """Fly once."""
-    flight = flight_of(pipeline.config, nominal, rng)
-    condition(flight)
-    pipeline.restart()
-    output = pipeline.process(Block(regular_stamps(LENGTH, flight.rate, START)[: len(flight.t)], flight.values()))
+    output = fresh(pipeline, Block(regular_stamps(LENGTH, flight.rate, START)[: len(flight.t)], flight.values()))
     # The rate is of the instant that the values are of, which delays put before the stamp.
     at = (output.instant - START) * 1e-9
     truth = flight.truth_at(at)
@@ -364,27 +306,14 @@ def judged(pipeline: Pipeline, nominal: Array, condition: Condition, rng: Rng) -
     weighted = flight.axes / flight.std[:, None] ** 2
     best = np.sqrt(np.trace(np.linalg.inv(flight.axes.T @ weighted))) if np.isfinite(flight.std).all() else np.nan
     sigmas = np.abs(error) / std
+    nees = float(np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0]).mean() / 3)
     return {
-        "nees": float(np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0]).mean() / 3),
+        "nees": nees,
+        "worst": nees,
         "sigma": float(sigmas[ok.all(axis=1)].max(initial=0.0)),
         "over_best": float(np.sqrt((error**2).sum(axis=1).mean()) / best),
         "level": float((np.abs(error) > output.level[rows]).any(axis=1).mean()),
         "ok": float((output.state[flight.t >= COUNTED] == ChannelState.OK).mean()),
         "declared": sum(event.declares and event.after == ChannelState.AMBIGUOUS for event in output.events),
         "faulty": sum(event.declares and event.after == ChannelState.FAULTY for event in output.events),
-    }
-
-
-def figures(flights: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of all flights of a row."""
-    column = {name: np.array([flight[name] for flight in flights]) for name in flights[0]}
-    return {
-        "nees": column["nees"].mean(),
-        "worst": column["nees"].max(),
-        "sigma": column["sigma"].max(),
-        "over_best": column["over_best"].mean(),
-        "level": column["level"].mean(),
-        "ok": column["ok"].mean(),
-        "declared": column["declared"].sum(),
-        "faulty": column["faulty"].sum(),
     }
