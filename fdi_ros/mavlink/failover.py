@@ -90,23 +90,11 @@ class Declarations:
 
 
 class Failover:
-    """Takes faulty IMUs of one ArduPilot out of use, and puts them back.
+    """Takes faulty IMUs of one ArduPilot out of use, and puts them back; ``vehicle``: the conversation with it.
 
-    Parameters
-    ----------
-    vehicle
-        The conversation with it.
-    channels
-        Names of the monitor's channels, three for each IMU.
-    limit
-        At most so many IMUs are out of use by our hand at a time.
-    path
-        File in which they stand.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read and written, or is not ours.
+    ``channels``: names of the monitor's channels, three for each IMU. ``limit``: at most so many IMUs are out of use by
+    our hand at a time. ``path``: file in which they stand; `ConfigError` if it cannot be read and written, or is not
+    ours.
     """
 
     def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
@@ -254,12 +242,8 @@ class Failover:
 def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[str]) -> str:
     """Say in a line what failover would have done in a recorded flight: armed, all in use, parameters set at once.
 
-    Parameters
-    ----------
-    changes
-        All changes of state of a recording, in order: when, s since its start, name of the channel, new state.
-    channels
-        Names of the channels, three for each IMU; where failover would not run, nothing is said.
+    ``changes`` of state of a recording, in order: when, s since its start, name of the channel, new state.
+    ``channels``: their names, three for each IMU; where failover would not run, nothing is said.
     """
     count = len(channels) // 3
     if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:

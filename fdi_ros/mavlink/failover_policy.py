@@ -138,16 +138,10 @@ def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
 
 
 def decide(state: FailoverState, known: Known, now: int, limit: int = 1) -> tuple[FailoverState, list[Action]]:
-    """Return the next state, and what is to be done, in this order.
+    """Return the next state, and what is to be done, in this order, at a time now, ns.
 
-    Parameters
-    ----------
-    state, known
-        What was decided before, which stays as it is, and what is known now.
-    now
-        ns.
-    limit
-        At most so many IMUs are out of use by our hand, at most all but one.
+    ``state``: what was decided before, which stays as it is. ``limit``: at most so many IMUs are out of use by our
+    hand, at most all but one.
     """
     state = FailoverState(dict(state.orders), dict(state.seen), set(state.left_alone), dict(state.answered))
     actions: list[Action] = []

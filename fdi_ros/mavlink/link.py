@@ -229,10 +229,7 @@ class Serial(Link):
 def open_link(url: str) -> Link:
     """Return the link of a URL; it opens itself when it is first read.
 
-    Raises
-    ------
-    FdiError
-        If the URL is none, the host has no address, or a library is missing.
+    `FdiError` if the URL is none, the host has no address, or a library is missing.
     """
     kind, _, rest = url.partition(":")
     place, _, last = rest.rpartition(":")
@@ -271,13 +268,7 @@ def now_in_steps(seconds: float) -> int:
 
 
 def read_key(path: str) -> bytes:
-    """Read a key: 32 bytes, or 64 hexadecimal digits.
-
-    Raises
-    ------
-    FdiError
-        If it is no key, or is not its owner's alone.
-    """
+    """Read a key: 32 bytes, or 64 hexadecimal digits. `FdiError` if it is none, or is not its owner's alone."""
     try:
         with open_regular(path) as file:
             about = os.fstat(file.fileno())

@@ -109,13 +109,7 @@ class UnitTrack:
 
 
 def dialect() -> Any:
-    """Return pymavlink's ArduPilot dialect of MAVLink 2, which includes the common one.
-
-    Raises
-    ------
-    FdiError
-        If pymavlink is not installed.
-    """
+    """Return pymavlink's ArduPilot dialect of MAVLink 2, which includes the common one; `FdiError` if it is missing."""
     require("MAVLink", ("pymavlink",))
     from pymavlink.dialects.v20 import ardupilotmega
 
@@ -125,19 +119,8 @@ def dialect() -> Any:
 class Vehicle:
     """One autopilot as it is heard.
 
-    Parameters
-    ----------
-    settings
-        What it is asked for.
-    send
-        Takes the bytes of one message, and the address they go to.
-    seconds
-        Unix time now, s, for the times of signatures.
-
-    Raises
-    ------
-    FdiError
-        If pymavlink is not installed.
+    ``send`` takes the bytes of one message, and the address they go to. ``seconds``: Unix time now, s, for the times of
+    signatures. `FdiError` if pymavlink is not installed.
     """
 
     def __init__(

@@ -43,12 +43,7 @@ RETURN_PROBABILITY = 1e-6
 def build_geometry(config: Config) -> Geometry:
     """Sensitivity axes of a configuration.
 
-    Raises
-    ------
-    ConfigError
-        If the number of axes, names and topics do not fit each other.
-    GeometryError
-        If the axes themselves are unfit.
+    `ConfigError` if the number of axes, names and topics do not fit each other, `GeometryError` if the axes are unfit.
     """
     geometry = _axes(config)
     source_of(config).check_channels(geometry.n)
@@ -114,10 +109,7 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
     """Record of a monitor before its first sample, (1,) `fdi_ros.core.records.Core`.
 
-    Raises
-    ------
-    ConfigError
-        If a setting is given per channel for another number of channels.
+    `ConfigError` if a setting is given per channel for another number of channels.
     """
     n = geometry.n
     check_lengths(config, "channel", n)

@@ -150,24 +150,11 @@ def describe(
     since: Sequence[int] | None = None,
     warning: str = "",
 ) -> list[StatusLine]:
-    """Describe a monitor: the whole first, then every channel, then every input.
+    """Describe a monitor: the whole first, then every channel, then every input; all names begin with the prefix.
 
-    Parameters
-    ----------
-    status
-        Of the pipeline.
-    prefix
-        What all names begin with.
-    inputs
-        The input topics, where there are any.
-    figures
-        More key-values for the whole.
-    silent
-        No sample for this long, s: all is STALE. None: samples come.
-    since
-        Stamps of the messages that brought the channels into their states, ns; None: those of the samples.
-    warning
-        What else is wrong with the whole, while samples come.
+    ``figures``: more key-values for the whole. ``silent``: no sample for this long, s, so that all is STALE; None:
+    samples come. ``since``: stamps of the messages that brought the channels into their states, ns; None: those of the
+    samples. ``warning``: what else is wrong with the whole, while samples come.
     """
     worse = _find_worse(status)
     level, message = _whole_message(status, worse)

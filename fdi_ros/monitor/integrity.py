@@ -81,15 +81,8 @@ class _Modes(NamedTuple):
 class Integrity:
     """Protection levels, one set of channels at a time.
 
-    Parameters
-    ----------
-    config
-        Risk, fault rates, false-alarm probability of the test, and the greatest motion.
-    geometry
-        All channels.
-    noise
-        Error model of a healthy channel; the weights of the fused rate are 1 / noise_std^2. Biases left,
-        bias_std, count as if they hung together as is worst for each axis.
+    The settings have risk, fault rates, false-alarm probability of the test, and the greatest motion. The weights of
+    the fused rate are 1 / noise_std^2; biases left, bias_std, count as if they hung together as is worst for each axis.
     """
 
     def __init__(self, config: Config, geometry: Geometry, noise: NoiseModel) -> None:

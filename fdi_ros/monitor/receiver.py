@@ -227,13 +227,7 @@ _FEW = 5
 
 
 def warm_detector(name: str) -> None:
-    """Compile or load what one detector needs.
-
-    Raises
-    ------
-    DetectorError
-        If there is none of that name.
-    """
+    """Compile or load what one detector needs; `DetectorError` if there is none of that name."""
     method = detector_class(name)
     for one in vars(sys.modules[method.__module__]).values():
         if isinstance(one, Callback):

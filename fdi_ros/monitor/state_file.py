@@ -222,19 +222,9 @@ class SavedState:
 
 
 class StateFile:
-    """The file in which one monitor keeps its biases and declarations.
+    """The file in which one monitor keeps its biases and declarations; what is older than ``max_age``, s, is left.
 
-    Parameters
-    ----------
-    path
-        Of the file; its folder must exist.
-    max_age
-        A state older than this is not taken over, s.
-
-    Raises
-    ------
-    ConfigError
-        If the folder does not exist, or the age is not above zero.
+    `ConfigError` if its folder does not exist, or the age is not above zero.
     """
 
     def __init__(self, path: Path, max_age: float) -> None:
@@ -258,10 +248,7 @@ class StateFile:
     def restore(self, pipeline: Pipeline) -> bool:
         """Take over the state in the file, if it fits; return whether it did; `words` has the details.
 
-        Raises
-        ------
-        ConfigError
-            If the file holds something else than a state: the next save must not replace it.
+        `ConfigError` if the file holds something else than a state: the next save must not replace it.
         """
         self._check_ours(self.path)
         self._check_ours(self._old)

@@ -39,12 +39,8 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
     """Refuse units and channels that do not show one rotation, whatever the fit would make of them.
 
     Axes as configured are good enough to tell a dead channel from a live one, but for those of unknown mount.
-
-    Raises
-    ------
-    DisagreementError
-        Naming the unit that turns by another factor or about other axes than most, the channel that does not follow,
-        or all among which nothing decides.
+    `DisagreementError` names the unit that turns by another factor or about other axes than most, the channel that does
+    not follow, or all among which nothing decides.
     """
     means = data.slow_rates()
     if len(means) < LEAST_WINDOWS:

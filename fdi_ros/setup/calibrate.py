@@ -50,24 +50,12 @@ REPLACED = ("imus.mounts", "geometry.cone_channels")  # parameters that say noth
 
 
 def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:
-    """Calibrate all channels that are not excluded.
+    """Calibrate all channels that are not excluded: the more rest and rotation about all axes, the more is shown.
 
-    Parameters
-    ----------
-    block
-        The recording: the more rest and rotation about all axes, the more is shown.
-    config
-        Nominal mounting, range of the gyros, excluded channels, and what else the monitor needs.
-    reference
-        Name of the triad that is taken for as configured, or of three channels with commas between; empty: no
-        channel is believed more than the others (of an array: the first three that span space).
-    unknown
-        Numbers of channels of which nobody knows how they are mounted.
-
-    Raises
-    ------
-    FdiError
-        If the recording is too short, or its channels contradict each other, naming which.
+    ``reference``: name of the triad that is taken for as configured, or of three channels with commas between; empty:
+    no channel is believed more than the others (of an array: the first three that span space). ``unknown``: numbers of
+    channels of which nobody knows how they are mounted. `FdiError` if the recording is too short, or its channels
+    contradict each other, naming which.
     """
     full = build_geometry(config)
     used = np.array([name not in config.excluded_channels for name in full.channel_names])
@@ -138,10 +126,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
 def reference_channels(config: Config, geometry: Geometry, name: str) -> list[int]:
     """Return the places of the reference channels among those in use; none: all are alike.
 
-    Raises
-    ------
-    ConfigError
-        If these are no three channels in use that span space.
+    `ConfigError` if these are no three channels in use that span space.
     """
     names, units = geometry.channel_names, source_of(config).units
     if not name:

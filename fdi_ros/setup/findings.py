@@ -276,10 +276,7 @@ def _no_gyro_at_rest(report: TopicReport) -> bool:
 def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
     """Refuse a recording whose gyros, of this config, are in deg/s; return what was seen of their topics.
 
-    Raises
-    ------
-    BagError
-        If it cannot be read, or which topic is and what shows it.
+    `BagError` if it cannot be read, or says which topic is and what shows it.
     """
     chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
     if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):

@@ -85,12 +85,7 @@ class TopicReport:
 def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], tuple[str, ...]]:
     """Read a recording through: all topics, or those of these names, with or without the first slash.
 
-    Returns what was seen of each topic, and what of the recording is damaged.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read.
+    Returns what was seen of each topic, and what of the recording is damaged. `BagError` if it cannot be read.
     """
     with Recording(path) as recording:
         wanted = {name.lstrip("/") for name in topics}

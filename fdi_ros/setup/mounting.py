@@ -125,13 +125,7 @@ class Mounting:
 
 
 def assess(config: Config) -> Mounting:
-    """Assess the mounting of a configuration.
-
-    Raises
-    ------
-    FdiError
-        If the settings do not fit each other.
-    """
+    """Assess the mounting of a configuration; `FdiError` if the settings do not fit each other."""
     geometry = build_geometry(config)
     noise, probability = build_noise(config, geometry.n), alarm_probability(config)
     sets = itertools.chain.from_iterable(itertools.combinations(range(geometry.n), lost) for lost in range(3))

@@ -188,21 +188,10 @@ def set_up(
 ) -> SetupResult:
     """Make the fullest config that a recording gives.
 
-    Parameters
-    ----------
-    bag
-        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
-    start, end
-        Part that mounts and calibration are from, s from the first message.
-    reference
-        As `fdi_ros.setup.calibrate.calibrate` takes it.
-    proof
-        Recording that the settings are proved on; none: a part of this one, which is kept aside.
-
-    Raises
-    ------
-    FdiError
-        If it cannot be read, holds no gyros, or a monitor can be built from nothing that it shows.
+    ``start``, ``end``: part that mounts and calibration are from, s from the first message. ``reference`` as of
+    `fdi_ros.setup.calibrate.calibrate`. ``proof``: recording that the settings are proved on; None: a part of this one,
+    which is kept aside. `FdiError` if it cannot be read, holds no gyros, or a monitor can be built from nothing that it
+    shows.
     """
     reports, damage = inspect(bag)
     chosen, lacking = candidates(reports), needs(reports)
@@ -236,10 +225,7 @@ def recalibrate(
 ) -> SetupResult:
     """Calibrate a config on a recording; parameters as of `set_up`.
 
-    Raises
-    ------
-    FdiError
-        If it cannot be read, lacks a topic, or its channels contradict each other.
+    `FdiError` if it cannot be read, lacks a topic, or its channels contradict each other.
     """
     if copies := copy_words(refuse_degrees(bag, config)):
         raise CalibrationError(f"{bag}: {copies}; look at topics and remappings, or leave one out of the config")

@@ -25,20 +25,11 @@ POSSIBLE = 2.0  # what one may lose against the best and be possible
 
 
 class NormalEquations:
-    """What the groups say of the states, the biases first; kept in units of their standard deviations before.
+    """What the groups say of the states, the biases (n) first; kept in units of their standard deviations before.
 
-    In units of their own, information on them would be apart by more than what rounding leaves of a number.
-
-    Parameters
-    ----------
-    n
-        Number of biases.
-    normal, right
-        N (K, s, s) and r (K, s).
-    apart
-        (K,) time to the next group, s; the last is not read.
-    prior, start
-        (s,) standard deviations, of all biases the same, and means before.
+    In units of their own, information on them would be apart by more than what rounding leaves of a number. ``normal``,
+    ``right``: N (K, s, s) and r (K, s). ``apart`` (K,): time to the next group, s; the last is not read. ``prior``,
+    ``start`` (s,): standard deviations, of all biases the same, and means before.
     """
 
     def __init__(self, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> None:

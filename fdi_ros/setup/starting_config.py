@@ -55,10 +55,7 @@ class StartingConfig:
 def starting_config_of(path: Path, refused: str) -> StartingConfig:
     """Return the config to start from that ``fdi inspect`` writes for a recording.
 
-    Raises
-    ------
-    BagError
-        In these words, and with what is missing, if the recording shows no gyros in rad/s.
+    `BagError` in these words, and with what is missing, if the recording shows no gyros in rad/s.
     """
     reports, _ = inspect(path)
     if words := needs(reports):
@@ -69,10 +66,7 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
 def assumed_config(path: Path) -> tuple[Config, str]:
     """Return settings to judge a recording by that came without any, and one line that says what they assume.
 
-    Raises
-    ------
-    BagError
-        If the recording shows no gyros, or they are not mounted alike: then axes have to be given.
+    `BagError` if the recording shows no gyros, or they are not mounted alike: then axes have to be given.
     """
     refused = f"{shown(path.name)}: no config given, and none can be assumed"
     found = starting_config_of(path, refused)

@@ -317,6 +317,13 @@ def test_arrays_that_do_not_fit_are_no_block(arrays, words):
         Block(*arrays)
 
 
+def test_any_memory_layout_gives_the_same():
+    block = stream(Pipeline(config()).geometry, 50)
+    usual = Pipeline(config()).process(block)
+    for z in (np.asfortranarray(block.z), np.repeat(block.z, 2, axis=0)[::2]):
+        same(Pipeline(config()).process(Block(block.stamp.astype(np.uint64), z)), usual)
+
+
 @pytest.mark.parametrize("begin", [-(10**15), 0, START])
 def test_a_dead_channel_is_declared_whatever_the_stamps(begin):
     pipeline = Pipeline(config())
