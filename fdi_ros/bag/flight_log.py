@@ -161,9 +161,9 @@ class FlightLog(BagFile):
         for samples, _ in self.portions():
             found = [self._possible(one) for one in samples]
             ends = [0, *(int(track.end[-1]) for track in self._tracks.values() if len(track.end))]
-            for kind, instance in (one.source for one in found):
-                slowest = _COARSE_RATE if kind == self.coarse else self.slowest
-                self._tracks.setdefault(Source(kind, instance), Track(slowest))
+            for source in (one.source for one in found):
+                slowest = _COARSE_RATE if source.kind == self.coarse else self.slowest
+                self._tracks.setdefault(source, Track(slowest))
             if first := min(filter(None, [self._tracks[one.source].first_behind(one) for one in found]), default=0):
                 ends += [int(one.end[one.end < first].max(initial=0)) for one in found]
                 self._end_at(max(end for end in ends if end < first))

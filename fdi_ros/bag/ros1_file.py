@@ -16,7 +16,8 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from types import SimpleNamespace
+from typing import Any
 
 import lz4.frame
 from rosbags.rosbag1 import Reader, ReaderError
@@ -53,29 +54,16 @@ class _Bounded(io.BufferedReader):
         return super().read(size)
 
 
-class _Place:
-    """Stands for the path of an open file."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file = _Bounded(io.FileIO(file.fileno(), closefd=False))
-        self.file.seek(0)
-
-    def exists(self) -> bool:
-        """Whether it is there."""
-        return True
-
-    def open(self, _: str) -> _Bounded:
-        """Return the file."""
-        return self.file
-
-
 class Ros1File(BagFile):
     """An open bag of ROS 1, whose chunks may unpack to ``most`` bytes; it must have an index, of bounded size."""
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
         super().__init__(path, damage, MAGIC, "is not a bag of ROS 1")
         self._left = most
-        place: Any = _Place(self.file)
+        bounded = _Bounded(io.FileIO(self.file.fileno(), closefd=False))
+        bounded.seek(0)
+        # Stands for the path of a file that is open already.
+        place: Any = SimpleNamespace(exists=lambda: True, open=lambda _: bounded)
         self._reader = Reader(place)
         self._store = get_typestore(Stores.ROS2_JAZZY)
         try:
@@ -87,7 +75,7 @@ class Ros1File(BagFile):
             if "not indexed" in str(error):
                 raise BagError(f"{path} has no index, its recording was cut off: run rosbag reindex") from error
             raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
-        place.file.left = most + self.size
+        bounded.left = most + self.size
         for number, chunk in self._reader.chunks.items():
             unpack = partial(self._unpacked, _UNPACKERS.get(chunk.decompressor))
             self._reader.chunks[number] = chunk._replace(decompressor=unpack)
