@@ -221,15 +221,6 @@ UNPREPARED, REFUSED = -1, -2
 
 
 @compiled
-def count_of(mask: int, n: int) -> int:
-    """Return how many of n channels are in a set."""
-    count = 0
-    for i in range(n):
-        count += mask >> i & 1
-    return count
-
-
-@compiled
 def present_in(z: NDArray[np.float64], n: int) -> int:
     """Bits of the channels whose value is finite."""
     mask = 0

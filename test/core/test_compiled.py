@@ -24,13 +24,13 @@ logging.basicConfig(stream=sys.stdout, format="%(message)s")
 from fdi_ros.compiling.compiled import allocate, folder, reported
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.records import Core
-from fdi_ros.detectors.papers.residual_search import judge
+from fdi_ros.detectors.papers.single_fault import judge_sums
 core = allocate(Core)
 core["settings"]["n"], core["settings"]["decision"]["window"] = 6, 8
 core["decision"]["faulty"] = core["decision"]["ambiguous"] = 5
 with reported("it"):
     clear_declarations(core)
-    judge.address
+    judge_sums.address
 print("kept in", folder())
 print("says", core["decision"]["faulty"][0], core["decision"]["ambiguous"][0])
 """
