@@ -160,7 +160,8 @@ class FlightLog(BagFile):
         starts: list[int] = []
         for samples, _ in self.portions():
             found = [self._possible(one) for one in samples]
-            ends = [0, *(int(track.end[-1]) for track in self._tracks.values() if len(track.end))]
+            # The step may lie among the last samples of the portion before.
+            ends = [0, *(int(end) for track in self._tracks.values() for end in track.end)]
             for source in (one.source for one in found):
                 slowest = _COARSE_RATE if source.kind == self.coarse else self.slowest
                 self._tracks.setdefault(source, Track(slowest))

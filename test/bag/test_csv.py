@@ -128,7 +128,6 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypa
         "the last line is not finished and was left out",
         "1 lines without a time were left out",
     ]
-    monkeypatch.undo()
     path.write_text("\n".join([*lines, *again]) + "\n")
     beside, damage = messages(path)
     assert [one[2] for one in beside.values()] == [one[2] for one in found.values()]
