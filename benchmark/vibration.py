@@ -278,23 +278,23 @@ def config_of(units: int, rate: float, asked: Asked) -> Config:
 def measure(asked: Asked) -> Iterator[Row]:
     """Every condition with two, three and four units."""
     monitors: dict[tuple[int, float], Pipeline] = {}
-    for name, (rate, condition, *numbers) in CONDITIONS.items():
+    for name, (rate, *_) in CONDITIONS.items():
         for units in (2, 3, 4):
             label = f"{units} units, {name}"
             if not asked.wants(label) or (name.startswith("unit ") and int(name[5]) > units):
                 continue
             if (units, rate) not in monitors:
                 monitors[units, rate] = Pipeline.from_config(config_of(units, rate, asked))
-            pipeline, flights = monitors[units, rate], []
-            for k in range(asked.count(4)):
-                flight = flight_of(pipeline.config, pipeline.geometry.axes, asked.rng(label, k))
-                condition(flight, *numbers)
-                flights.append(judged(pipeline, flight))
-            yield label, {name: of(np.array([one[name] for one in flights])) for name, (of, *_) in SUMS.items()}
+            pipeline = monitors[units, rate]
+            flights = [judged(pipeline, name, asked.rng(label, k)) for k in range(asked.count(4))]
+            yield label, {key: of([one[key] for one in flights]) for key, (of, _) in SUMS.items()}
 
 
-def judged(pipeline: Pipeline, flight: Flight) -> dict[str, Any]:
-    """Fly once."""
+def judged(pipeline: Pipeline, name: str, rng: Rng) -> dict[str, Any]:
+    """Fly once in a condition."""
+    _, condition, *numbers = CONDITIONS[name]
+    flight = flight_of(pipeline.config, pipeline.geometry.axes, rng)
+    condition(flight, *numbers)
     output = fresh(pipeline, Block(regular_stamps(LENGTH, flight.rate, START)[: len(flight.t)], flight.values()))
     # The rate is of the instant that the values are of, which delays put before the stamp.
     at = (output.instant - START) * 1e-9

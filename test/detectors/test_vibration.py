@@ -25,11 +25,8 @@ FLIGHTS = 3
 
 
 def flown(units, name):
-    condition, rate = CONDITIONS[name]
-    pipeline = Pipeline.from_config(config_of(units, rate, Asked()))
-    flights = [
-        judged(pipeline, pipeline.geometry.axes, condition, np.random.default_rng([units, k])) for k in range(FLIGHTS)
-    ]
+    pipeline = Pipeline.from_config(config_of(units, CONDITIONS[name][0], Asked()))
+    flights = [judged(pipeline, name, np.random.default_rng([units, k])) for k in range(FLIGHTS)]
     return {key: np.array([flight[key] for flight in flights]) for key in flights[0]}
 
 
