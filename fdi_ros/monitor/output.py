@@ -113,6 +113,8 @@ class Output:
         Changes of state within these samples, in order.
     channel_names
         Of the channels; default g1, g2, ...
+
+    What is not asked for is not made: one sample at a time, ten views would cost more than judging it.
     """
 
     def __init__(
@@ -122,26 +124,56 @@ class Output:
         self.n = n
         self.events = events
         self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
-        self.stamp: NDArray[np.int64] = rows["stamp"]
+
+    @property
+    def stamp(self) -> NDArray[np.int64]:
         """(N,) ns."""
-        self.instant: NDArray[np.int64] = rows["instant"]
+        return self.rows["stamp"]
+
+    @property
+    def instant(self) -> NDArray[np.int64]:
         """(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."""
-        self.rate: Array = rows["rate"]
+        return self.rows["instant"]
+
+    @property
+    def rate(self) -> Array:
         """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
-        self.valid: NDArray[np.bool_] = rows["valid"].view(_FLAG)
+        return self.rows["rate"]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
         """(N,) whether there is a fused rate."""
-        self.statistic: Array = rows["statistic"]
+        return self.rows["valid"].view(_FLAG)
+
+    @property
+    def statistic(self) -> Array:
         """(N,) the detector's; NaN where the sample could not be judged."""
-        self.threshold: Array = rows["threshold"]
+        return self.rows["statistic"]
+
+    @property
+    def threshold(self) -> Array:
         """(N,) the detector's; NaN where the sample could not be judged."""
-        self.alarm: NDArray[np.bool_] = rows["alarm"].view(_FLAG)
+        return self.rows["threshold"]
+
+    @property
+    def alarm(self) -> NDArray[np.bool_]:
         """(N,) the detector's, before confirmation."""
-        self.state: NDArray[np.uint8] = rows["state"][:, :n]
+        return self.rows["alarm"].view(_FLAG)
+
+    @property
+    def state(self) -> NDArray[np.uint8]:
         """(N, n) ChannelState of each channel after the sample."""
-        self.residual: Array = rows["residual"][:, :n]
+        return np.asarray(self.rows["state"][:, : self.n])
+
+    @property
+    def residual(self) -> Array:
         """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
-        self.level: Array = rows["level"]
+        return np.asarray(self.rows["residual"][:, : self.n])
+
+    @property
+    def level(self) -> Array:
         """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
+        return self.rows["level"]
 
     @property
     def covariance(self) -> Array:
