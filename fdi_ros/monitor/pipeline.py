@@ -221,8 +221,9 @@ class Pipeline:
         first = row = 0
         while row < len(rows):
             row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
-            self._events["row"][:count] -= first
-            events += events_of(self._events[:count])
+            if count:
+                self._events["row"][:count] -= first
+                events += events_of(self._events[:count])
             if waits:
                 self.supply()
                 # The level of the row before was not known; otherwise this changes nothing.
@@ -237,7 +238,7 @@ class Pipeline:
         count = len(z)
         if z.shape[1] != n:
             raise ConfigError(f"samples have shape {z.shape}, expected (N, {n})")
-        if (stamp[1:] <= stamp[:-1]).any():
+        if count > 1 and (stamp[1:] <= stamp[:-1]).any():
             raise ConfigError("stamps of the samples do not increase")
         if count:
             first, end, last = int(stamp[0]), int(stamp[-1]), int(self._last_stamp[0])
