@@ -39,8 +39,7 @@ from fdi_ros.system.yaml_file import read_yaml
 COLUMNS = "columns.yaml"
 GUIDE = 'docs/flight_logs.md, "Tables of text"'
 KIND = "columns"
-_PORTION = 1 << 21
-"""Bytes that are read at once."""
+_PORTION = 1 << 21  # bytes that are read at once
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _DEGREES = math.pi / 180.0
 _RATE_UNITS = {"rad/s": 1.0, "rad_s": 1.0, "radps": 1.0, "deg/s": _DEGREES, "deg_s": _DEGREES, "dps": _DEGREES}
@@ -55,14 +54,10 @@ _OTHER = re.compile(r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \
 class Columns(NamedTuple):
     """Which columns of a table are read."""
 
-    time: int
-    """Index of the column."""
-    tick: float
-    """Seconds of one unit of it; 0: by the size of the first time."""
-    imus: tuple[tuple[int, int, int], ...]
-    """Indices of the rates about x, y and z of each."""
-    factors: tuple[float, ...]
-    """Rates of each IMU are multiplied by this for rad/s."""
+    time: int  # index of the column
+    tick: float  # seconds of one unit of it; 0: by the size of the first time
+    imus: tuple[tuple[int, int, int], ...]  # indices of the rates about x, y and z of each
+    factors: tuple[float, ...]  # rates of each IMU are multiplied by this for rad/s
 
 
 class CsvLog(FlightLog):

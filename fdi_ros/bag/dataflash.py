@@ -40,22 +40,18 @@ from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, per_time, po
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
-Rows = NDArray[np.void]
-"""Records of a log, by field."""
-_PORTION = 1 << 22
-"""Bytes that are read at once, much more than the longest record."""
+Rows = NDArray[np.void]  # records of a log, by field
+_PORTION = 1 << 22  # bytes that are read at once, much more than the longest record
 _FMT = 128
 _FMT_SIZE = 89
-_HEAD = 3
-"""Bytes of a record before its values."""
+_HEAD = 3  # bytes of a record before its values
 _TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
     | {"i": "<i4", "I": "<u4", "e": "<i4", "E": "<u4", "L": "<i4", "q": "<i8", "Q": "<u8"}
     | {"g": "<f2", "f": "<f4", "d": "<f8", "n": "S4", "N": "S16", "Z": "S64", "a": "S64"}
 )
 """NumPy types of the letters of a FMT record."""
-_NUMBERS = "bBdfghHiIqQ"
-"""Types that are the number itself."""
+_NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
 _HUNDREDTHS = "cCeE"
 _TYPES_OF = {"Message": "Z", "Label": "Z", "UnitIds": "N", "MultIds": "N", "I": "B"}
 """Columns that are read and may not be any number, and their types."""
@@ -69,8 +65,7 @@ _VALUES = {
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
 _TABLES = {"FMTU": ("FmtType", "UnitIds", "MultIds"), "UNIT": ("Id", "Label"), "MULT": ("Id", "Mult")}
 """Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
-_OTHERS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode"), **_TABLES}
-"""Columns of further messages that are read."""
+_OTHERS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode"), **_TABLES}  # columns of further messages that are read
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
@@ -83,8 +78,7 @@ _FIRMWARE = re.compile(r"(?i)(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Bl
 """What a MSG record says of the vehicle, as in ``APM:Copter V3.2`` or ``ArduPlane V4.5.7``."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
-_FIX = 3
-"""GPS status from which on the time is known: a fix in three dimensions."""
+_FIX = 3  # GPS status from which on the time is known: a fix in three dimensions
 
 
 @compiled
@@ -135,10 +129,8 @@ class _Message(NamedTuple):
     """A kind of message that is read."""
 
     name: str
-    fields: np.dtype[np.void]
-    """Columns that are read, within a whole record."""
-    columns: Sequence[tuple[str, str]]
-    """Names and types of all columns, in their order."""
+    fields: np.dtype[np.void]  # columns that are read, within a whole record
+    columns: Sequence[tuple[str, str]]  # names and types of all columns, in their order
 
 
 class DataflashLog(FlightLog):
@@ -185,8 +177,7 @@ class DataflashLog(FlightLog):
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
         self._messages: dict[int, _Message] = {}
-        self._unknown: dict[int, str] = {}
-        """Of messages of IMUs that cannot be read: why."""
+        self._unknown: dict[int, str] = {}  # of messages of IMUs that cannot be read: why
         self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _TABLES}
 
     def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:

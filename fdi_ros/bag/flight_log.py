@@ -34,20 +34,13 @@ from fdi_ros.system.text import shown
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
-_COARSE_RATE = 0.5
-"""Hz; means may be logged no more seldom."""
-_MAX_TIME_STEP = 10_000_000
-"""us; a sample that far from those logged before and after it has a damaged time."""
-_TOGETHER = 1 << 10
-"""Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
-_FEWEST_IMUS = 2
-"""One has nothing to be compared with."""
-_MOST_COMPARED = 16
-"""Instances of one kind, more than any autopilot has, that are looked at for copies."""
-_MOST_NAMES = 6
-"""Messages that are named of a log without IMUs."""
-_MOST_TEXTS = 1000
-"""Texts of a log that are kept: the first ones."""
+_COARSE_RATE = 0.5  # Hz; means may be logged no more seldom
+_MAX_TIME_STEP = 10_000_000  # us; a sample that far from those logged before and after it has a damaged time
+_TOGETHER = 1 << 10  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
+_FEWEST_IMUS = 2  # one has nothing to be compared with
+_MOST_COMPARED = 16  # instances of one kind, more than any autopilot has, that are looked at for copies
+_MOST_NAMES = 6  # messages that are named of a log without IMUs
+_MOST_TEXTS = 1000  # texts of a log that are kept: the first ones
 
 
 class FlightLog(BagFile):
@@ -56,41 +49,29 @@ class FlightLog(BagFile):
     `BagError` if it has no two IMUs that are logged fast enough.
     """
 
-    stack: ClassVar[str]
-    """What writes such logs."""
-    magic: ClassVar[bytes]
-    """First bytes of a file."""
-    kinds: ClassVar[tuple[str, ...]]
-    """Messages that samples of every IMU are logged in."""
+    stack: ClassVar[str]  # what writes such logs
+    magic: ClassVar[bytes]  # first bytes of a file
+    kinds: ClassVar[tuple[str, ...]]  # messages that samples of every IMU are logged in
     settings: ClassVar[Mapping[str, str]]
     """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
-    one_imu: ClassVar[str]
-    """Sentence for a log of a single IMU, with a place for what of it is logged."""
+    one_imu: ClassVar[str]  # sentence for a log of a single IMU, with a place for what of it is logged
     slowest: ClassVar[float] = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-    coarse: ClassVar[str] = ""
-    """Kind of message with means of the rate, read where nothing better is there."""
+    coarse: ClassVar[str] = ""  # kind of message with means of the rate, read where nothing better is there
     counted_by: ClassVar[str] = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: ClassVar[str] = ""
     """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
-    most: ClassVar[int] = 0
-    """Bytes of a log that is read whole; 0: it is read in portions, and may have any size."""
+    most: ClassVar[int] = 0  # bytes of a log that is read whole; 0: it is read in portions, and may have any size
 
     def __init__(self, path: Path, damage: Damage) -> None:
         super().__init__(path, damage, self.magic, f"is no log of {self.stack}")
-        self.end = self.size
-        """The log is read up to there, bytes."""
-        self.unread: dict[str, str] = {}
-        """Messages of IMUs that are there and cannot be read, by name, and why."""
-        self.counts: Counter[str] = Counter()
-        """Records of every message, by name."""
-        self.vehicle = ""
-        """Kind of vehicle by the name of its firmware; empty: not known."""
-        self.start_utc: int | None = None
-        """UTC of the start of the autopilot, us since 1970; None: not known."""
-        self.said: list[LogText] = []
-        """What the autopilot said up to the place that was read, us."""
+        self.end = self.size  # the log is read up to there, bytes
+        self.unread: dict[str, str] = {}  # messages of IMUs that are there and cannot be read, by name, and why
+        self.counts: Counter[str] = Counter()  # records of every message, by name
+        self.vehicle = ""  # kind of vehicle by the name of its firmware; empty: not known
+        self.start_utc: int | None = None  # UTC of the start of the autopilot, us since 1970; None: not known.
+        self.said: list[LogText] = []  # what the autopilot said up to the place that was read, us
         try:
             if self.most and self.end > self.most:
                 raise BagError(
@@ -103,8 +84,7 @@ class FlightLog(BagFile):
             self.close()
             raise
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
-        self._shift = 0 if dated else self.start_utc or 0
-        """Added to stamps, us; 0: they are dates, or no date is known."""
+        self._shift = 0 if dated else self.start_utc or 0  # added to stamps, us; 0: they are dates, or no date is known
         self.texts = tuple(one._replace(stamp=self._log_time(one.stamp)) for one in self.said)
         """What the autopilot said, with the times of recording, ns."""
         self.topics = tuple(Topic(_topic(one), IMU, count=self._tracks[one].count) for one in self._sources)

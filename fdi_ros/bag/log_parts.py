@@ -15,18 +15,13 @@ from numpy.typing import NDArray
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
 
-FLU = np.array([1.0, -1.0, -1.0])
-"""From FRD."""
-FEWEST = 20
-"""Samples by which the rate of a source can be judged."""
-_TOLERANCE = 0.95
-"""Of that rate; clocks and loggers are not exact."""
+FLU = np.array([1.0, -1.0, -1.0])  # from FRD
+FEWEST = 20  # samples by which the rate of a source can be judged
+_TOLERANCE = 0.95  # of that rate; clocks and loggers are not exact
 _MAX_INTERVAL_RATIO = 1.5
 """Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
-_MAX_STEP_BACK = 1_000_000
-"""us; a log goes on as long as its times step back by no more."""
-_BESIDE = 17
-"""Samples whose median says where a log has come to: no few damaged times move it."""
+_MAX_STEP_BACK = 1_000_000  # us; a log goes on as long as its times step back by no more
+_BESIDE = 17  # samples whose median says where a log has come to: no few damaged times move it
 
 
 class Source(NamedTuple):
@@ -40,14 +35,10 @@ class ImuSamples(NamedTuple):
     """k samples of one IMU, in FLU."""
 
     source: Source
-    stamp: Int
-    """(k,) us since the start of the autopilot, or since 1970."""
-    rate: Array
-    """(k, 3) rad/s."""
-    acceleration: Array
-    """(k, 3) m/s^2; NaN: not logged with the rate."""
-    end: Int
-    """(k,) where the record of each ends in the file, bytes; 0: not known."""
+    stamp: Int  # (k,) us since the start of the autopilot, or since 1970
+    rate: Array  # (k, 3) rad/s
+    acceleration: Array  # (k, 3) m/s^2; NaN: not logged with the rate.
+    end: Int  # (k,) where the record of each ends in the file, bytes; 0: not known
 
     def at(self, rows: NDArray[np.bool_] | slice) -> ImuSamples:
         """Return some of the samples; rows (k,) says which."""
@@ -59,10 +50,8 @@ class ImuSamples(NamedTuple):
 class LogText(NamedTuple):
     """What the autopilot said of itself."""
 
-    stamp: int
-    """us as of samples; of a recording ns."""
-    kind: str
-    """Message it was logged in: MSG, ERR, or the severity."""
+    stamp: int  # us as of samples; of a recording ns
+    kind: str  # message it was logged in: MSG, ERR, or the severity
     text: str
 
 
@@ -78,22 +67,15 @@ def _nothing() -> Int:
 class Track:
     """What was seen of one source: how fast it is logged, and where its time steps back for good."""
 
-    slowest: float
-    """Samples per second that it must be logged at."""
+    slowest: float  # samples per second that it must be logged at
     count: int = 0
-    fast: int = 0
-    """Samples that follow the one before without a gap."""
-    fast_time: int = 0
-    """us between these and the ones before."""
+    fast: int = 0  # samples that follow the one before without a gap
+    fast_time: int = 0  # us between these and the ones before
     first: int = 0
-    last: int = 0
-    """Stamps of the first and the last, us."""
-    come: int | None = None
-    """Stamp up to which the log has come, us; None: at its start."""
-    stamp: Int = field(default_factory=_nothing)
-    """Of the last samples, us."""
-    end: Int = field(default_factory=_nothing)
-    """Where the records of these end, bytes."""
+    last: int = 0  # stamps of the first and the last, us
+    come: int | None = None  # stamp up to which the log has come, us; None: at its start.
+    stamp: Int = field(default_factory=_nothing)  # of the last samples, us
+    end: Int = field(default_factory=_nothing)  # where the records of these end, bytes
 
     def add(self, stamp: Int) -> None:
         """Take in the stamps (k,) of further samples."""

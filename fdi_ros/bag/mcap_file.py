@@ -33,10 +33,8 @@ from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
-_PREFIX = 9
-"""Bytes of a record before its content: opcode, length of the content."""
-_HEAD = 22
-"""Bytes of a message record before the message: channel, sequence, log time, publish time."""
+_PREFIX = 9  # bytes of a record before its content: opcode, length of the content
+_HEAD = 22  # bytes of a message record before the message: channel, sequence, log time, publish time
 
 
 def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) -> tuple[bytes, str]:
@@ -118,24 +116,19 @@ _CHUNK = struct.Struct("<QQQII")
 _FIRST, _RUN = 1 << 16, 1 << 22
 """Messages outside chunks are read in runs of at most this many bytes; tried with fewer first."""
 _STOPS = tuple(bytes([opcode]) for opcode in (CHUNK, STATISTICS, FOOTER))
-_TOGETHER = 1 << 16
-"""Pieces are handed on together until they hold so many bytes: each batch has its cost."""
+_TOGETHER = 1 << 16  # pieces are handed on together until they hold so many bytes: each batch has its cost
 
 
 class Piece(NamedTuple):
     """A chunk, or a run of messages outside chunks: what is read at once."""
 
-    start_time: int
-    """ns."""
+    start_time: int  # ns
     offset: int
-    size: int
-    """Bytes in the file."""
-    raw_size: int
-    """Bytes when decompressed."""
+    size: int  # bytes in the file
+    raw_size: int  # bytes when decompressed
     crc: int = 0
     compression: str = ""
-    cut: bool = False
-    """The file ends within it."""
+    cut: bool = False  # the file ends within it
 
 
 class McapFile(BagFile):

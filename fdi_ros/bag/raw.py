@@ -23,11 +23,9 @@ from fdi_ros.system.text import shown
 from fdi_ros.system.trusted_file import open_regular
 from fdi_ros.system.yaml_file import read_yaml
 
-MOST_SHOWN = 400
-"""Characters of what is said of one place."""
+MOST_SHOWN = 400  # characters of what is said of one place
 _COLUMNS = ("topic", "log_time", "offset", "length")
-NO_HORIZON = 2**63 - 1
-"""Horizon of the last batch: nothing comes after it."""
+NO_HORIZON = 2**63 - 1  # horizon of the last batch: nothing comes after it
 
 
 @dataclass(frozen=True)
@@ -37,28 +35,20 @@ class Topic:
     name: str
     type: str
     encoding: str = "cdr"
-    count: int = 0
-    """Number of messages."""
+    count: int = 0  # number of messages
 
 
 @dataclass(frozen=True)
 class Batch:
     """k messages of the topics asked for, in the order in which they lie in the file."""
 
-    buffer: Bytes
-    """The bytes that the messages lie in, (B,)."""
-    topic: Int
-    """(k,) index into the topics asked for."""
-    log_time: Int
-    """(k,) time of recording, ns."""
-    offset: Int
-    """(k,) first byte of the message in the buffer."""
-    length: Int
-    """(k,) bytes."""
-    horizon: int
-    """No later batch brings a message recorded before this, ns."""
-    progress: float
-    """Share of the recording read up to here, 0 to 1."""
+    buffer: Bytes  # the bytes that the messages lie in, (B,)
+    topic: Int  # (k,) index into the topics asked for
+    log_time: Int  # (k,) time of recording, ns
+    offset: Int  # (k,) first byte of the message in the buffer
+    length: Int  # (k,) bytes
+    horizon: int  # no later batch brings a message recorded before this, ns
+    progress: float  # share of the recording read up to here, 0 to 1
 
     def __len__(self) -> int:
         return len(self.topic)
@@ -107,8 +97,7 @@ class Damage:
     lines: list[str] = field(default_factory=list)
     more: int = 0
 
-    MOST = 20
-    """Lines kept; the rest is counted."""
+    MOST = 20  # lines kept; the rest is counted
 
     def add(self, line: str) -> None:
         """Note one place, in words fit to be shown; a line already there is not repeated."""
@@ -134,10 +123,8 @@ class BagFile(ABC):
     `BagError` if it cannot be opened, is empty, or does not begin with ``magic``, for which the refusal is said.
     """
 
-    topics: tuple[Topic, ...]
-    """One that several publishers wrote may come several times."""
-    start_time: int
-    """Time of recording of the first message, ns; without messages `NO_HORIZON`."""
+    topics: tuple[Topic, ...]  # one that several publishers wrote may come several times
+    start_time: int  # time of recording of the first message, ns; without messages `NO_HORIZON`
 
     def __init__(self, path: Path, damage: Damage, magic: bytes, refusal: str) -> None:
         self.path, self._damage = path, damage
@@ -176,10 +163,8 @@ SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
 """Of flight logs, tables and bags of ROS 1, in capitals too: each is a recording of its own, never part of a folder."""
 EXPECTED = "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
-LFS = b"version https://git-lfs."
-"""What a file begins with that git has put in the place of a large one."""
-MADE_BY_FDI = "fdi_ros"
-"""Key in the custom data of the metadata.yaml of an output bag."""
+LFS = b"version https://git-lfs."  # what a file begins with that git has put in the place of a large one
+MADE_BY_FDI = "fdi_ros"  # key in the custom data of the metadata.yaml of an output bag
 
 
 @dataclass(frozen=True)
@@ -187,10 +172,8 @@ class RecordingFiles:
     """Where a recording lies."""
 
     paths: tuple[Path, ...]
-    compressed: bool = False
-    """Each message is compressed by itself."""
-    made_by_fdi: bool = False
-    """The folder is one that ``fdi replay --output`` has written."""
+    compressed: bool = False  # each message is compressed by itself
+    made_by_fdi: bool = False  # the folder is one that ``fdi replay --output`` has written
 
 
 def find_files(path: Path, damage: Damage) -> RecordingFiles:

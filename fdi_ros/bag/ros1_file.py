@@ -30,8 +30,7 @@ from fdi_ros.sources import source_of_type
 from fdi_ros.system.limits import CHUNK_BYTES, PORTION_BYTES, ROS1_INDEX_BYTES
 
 MAGIC = b"#ROSBAG V2.0\n"
-_TOGETHER = 4096
-"""Messages handed on at once."""
+_TOGETHER = 4096  # messages handed on at once
 _WRONG = (
     *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
     *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),

@@ -27,10 +27,8 @@ from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE
 
-_ROWS = 4096
-"""Messages read at once."""
-_TICK = 10_000
-"""Steps of SQLite from one look at the clock of signals and steps to the next."""
+_ROWS = 4096  # messages read at once
+_TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
 
 
 class SqliteFile(BagFile):
@@ -44,8 +42,7 @@ class SqliteFile(BagFile):
         # SQLite opens the file itself.
         self.file.close()
         self.compressed = compressed
-        self._open = contextlib.ExitStack()
-        """What is to be closed: the database, then the folder of its copy."""
+        self._open = contextlib.ExitStack()  # what is to be closed: the database, then the folder of its copy
         self._left = most
         self._steps = STEPS + STEPS_PER_BYTE * self.size
         try:

@@ -29,17 +29,13 @@ from fdi_ros.system.limits import TLOG_BYTES
 
 _HEARTBEAT, _STATUSTEXT = 0, 253
 _AUTOPILOT_COMPONENT = 1
-_MARKS = (0xFE, 0xFD)
-"""First bytes of messages of MAVLink 1 and 2."""
+_MARKS = (0xFE, 0xFD)  # first bytes of messages of MAVLink 1 and 2
 _TIME = 8
-_LEAST = _TIME + 8
-"""Bytes of the shortest record."""
-_TOGETHER = 1 << 16
-"""Samples of a source handed on at once, about."""
+_LEAST = _TIME + 8  # bytes of the shortest record
+_TOGETHER = 1 << 16  # samples of a source handed on at once, about
 _MAX_DELAY_SPREAD = 3_600_000_000
 """us; a message that came by so much more or less late than half of the others has a damaged time."""
-_LATEST = 2.0**53
-"""us; up to there a time is exact in the memory of samples."""
+_LATEST = 2.0**53  # us; up to there a time is exact in the memory of samples
 
 
 class Tlog(FlightLog):

@@ -38,23 +38,18 @@ from fdi_ros.system.installation import require
 from fdi_ros.system.limits import ULOG_BYTES, ULOG_FIELDS, ULOG_MESSAGE_COST, ULOG_OTHER_BYTES, ULOG_TOPIC_COST
 
 MAGIC = b"ULog\x01\x12\x35"
-_HEAD = 3
-"""Bytes of a message before its content: two of its size, one of its kind."""
+_HEAD = 3  # bytes of a message before its content: two of its size, one of its kind
 _SUBSCRIPTION, _DATA = b"AD"
-_DEEPEST = 16
-"""Formats within formats."""
-_TOGETHER = 1 << 14
-"""Messages handed on at once, about."""
+_DEEPEST = 16  # formats within formats
+_TOGETHER = 1 << 14  # messages handed on at once, about
 _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
 _WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 """What pyulog raises of a damaged file."""
-_MEAN_TIME = 100_000
-"""us over which PX4 takes the means of vehicle_imu_status."""
-_FIX = 3
-"""fix_type from which on the time is known: a fix in three dimensions."""
+_MEAN_TIME = 100_000  # us over which PX4 takes the means of vehicle_imu_status
+_FIX = 3  # fix_type from which on the time is known: a fix in three dimensions
 
 
 Columns = Mapping[str, NDArray[Any]]
@@ -66,10 +61,8 @@ class _Bounded(io.BytesIO):
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
-        self.reached = 0
-        """Up to there the file was read, bytes."""
-        self.cut = False
-        """It ends within a message."""
+        self.reached = 0  # up to there the file was read, bytes
+        self.cut = False  # it ends within a message
         self._left = ULOG_OTHER_BYTES
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -97,8 +90,7 @@ class Ulog(FlightLog):
     coarse = _STATUS
     selected = _SELECTED
     most = ULOG_BYTES
-    _topics: dict[Source, Columns] | None = None
-    """Messages of IMUs."""
+    _topics: dict[Source, Columns] | None = None  # messages of IMUs
 
     def portions(self) -> Iterator[Portion]:
         """Return the samples, some of each topic together; where they end in the file is not known."""

@@ -10,10 +10,8 @@ import signal
 import time
 from types import FrameType
 
-STOPPED = 130
-"""Exit code, as a shell has it of what the keyboard has interrupted."""
-PATIENCE = 2.0
-"""s in which further signals do not disturb the end: what is half written is removed."""
+STOPPED = 130  # exit code, as a shell has it of what the keyboard has interrupted
+PATIENCE = 2.0  # s in which further signals do not disturb the end: what is half written is removed
 
 
 def heeded() -> list[signal.Signals]:

@@ -18,22 +18,17 @@ from typing import Any, NamedTuple
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.system.installation import resolve, shipped_files
 
-Options = Mapping[str, Any]
-"""What argparse is told of an argument."""
+Options = Mapping[str, Any]  # what argparse is told of an argument
 
 
 class Verb(NamedTuple):
     """One verb."""
 
     meaning: str
-    examples: Sequence[str]
-    """The first is the one to begin with."""
-    arguments: Mapping[str, Options]
-    """By name, several names with spaces between; what is not said is as in `SHARED`."""
-    run: Callable[[Namespace], int]
-    """Returns the exit code; what needs NumPy is imported in it."""
-    libraries: Sequence[str] = ()
-    """That the verb needs and a live node does not."""
+    examples: Sequence[str]  # the first is the one to begin with
+    arguments: Mapping[str, Options]  # by name, several names with spaces between; what is not said is as in `SHARED`
+    run: Callable[[Namespace], int]  # returns the exit code; what needs NumPy is imported in it
+    libraries: Sequence[str] = ()  # that the verb needs and a live node does not
 
     def add_to(self, parser: ArgumentParser) -> None:
         """Have a parser take the arguments."""
@@ -53,8 +48,7 @@ class _FaultKinds:
 
 
 _CONFIG = "ROS 2 parameter file{}, a shipped one by its name alone; may be repeated, later ones win"
-DETECTOR_NAMES = ", ".join(reversed(DETECTORS))
-"""For a help, the one that flies first."""
+DETECTOR_NAMES = ", ".join(reversed(DETECTORS))  # for a help, the one that flies first
 FLAG = {"action": "store_true"}
 FILE = {"type": Path, "metavar": "FILE"}
 SHARED: Mapping[str, Options] = {
@@ -93,8 +87,7 @@ def shared(*names: str) -> dict[str, Options]:
 
 
 PART = shared("--start", "--end")
-RESULTS = shared("--json", "--force", "--quiet")
-"""What every verb takes that has results."""
+RESULTS = shared("--json", "--force", "--quiet")  # what every verb takes that has results
 WORKERS = shared("--workers", "--scheduler")
 
 

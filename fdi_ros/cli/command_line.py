@@ -49,10 +49,8 @@ VERBS = {
     "shipped": SHIPPED,
     "compile": COMPILE,
 }
-FIRST = ("inspect", "setup", "replay", "watch")
-"""What one needs first."""
-DEFECT = 70
-"""EX_SOFTWARE of sysexits.h."""
+FIRST = ("inspect", "setup", "replay", "watch")  # what one needs first
+DEFECT = 70  # EX_SOFTWARE of sysexits.h
 EXIT_CODES = (
     "Exit codes: 0 done, and a verdict that is good; 1 a replay that does not meet its --check; 2 something asked for"
     " or read is wrong, said in one line; 3 a verdict that somebody must act on; 4 one that leaves something open;"

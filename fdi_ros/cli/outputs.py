@@ -36,10 +36,8 @@ from fdi_ros.system.trusted_file import open_regular
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TIMED_FORMAT = "{desc}, {elapsed}"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
-SAID_EVERY = 10.0
-"""How often the share done is said where there is no terminal, s."""
-_TICK = 1.0
-"""How often the time is drawn anew, s."""
+SAID_EVERY = 10.0  # how often the share done is said where there is no terminal, s
+_TICK = 1.0  # how often the time is drawn anew, s
 
 
 class Progress:
@@ -129,8 +127,7 @@ def bar_of(arguments: argparse.Namespace) -> CompileBar | None:
 
 # Files and words ------------------------------------------------------------------------------------------------------
 
-_HEAD = 1 << 16
-"""Bytes at the begin of a file in which the mark of a result is looked for."""
+_HEAD = 1 << 16  # bytes at the begin of a file in which the mark of a result is looked for
 
 
 class Kind(Enum):
@@ -140,12 +137,10 @@ class Kind(Enum):
     CSV = rb"stamp,rate_x,rate_y,rate_z,std_x,|monitor,channel,kind,size,fault,at_s,"
     PAGE = rb'\s*(?i:<!doctype html>)[^\0]*?<meta name="generator" content="fdi_ros">'
     PARAMETERS = rb"(?:(?:[ \t]*#[^\n]*|---[^\n]*|[ \t]*)\n)*?[ \t]*#[^\n]*\bmade by fdi (?:inspect|setup|calibrate)\b"
-    FOLDER = rb""
-    """An output bag: recognised by its metadata."""
+    FOLDER = rb""  # an output bag: recognised by its metadata
 
 
-_KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}
-"""What is written where options of these names say."""
+_KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}  # what is written where options of these names say
 
 
 class Outputs:

@@ -18,10 +18,8 @@ from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.system.installation import resolve, shipped_files
 
-MADE = "diagnostics.yaml"
-"""The file that can be made for nodes."""
-_NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
-"""Full name of a node."""
+MADE = "diagnostics.yaml"  # the file that can be made for nodes
+_NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # full name of a node
 _ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
 """In the file, a regular expression of statuses of any monitor."""
 

@@ -22,18 +22,14 @@ from fdi_ros.compiling.compiled import missing
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
-_PASS = "numba:run_pass"
-"""Every compilation, and nothing that is only loaded, goes through the passes of the compiler."""
-_WHOLE = "numba:compile"
-"""One function, with all that it calls."""
+_PASS = "numba:run_pass"  # every compilation, and nothing that is only loaded, goes through the passes of the compiler
+_WHOLE = "numba:compile"  # one function, with all that it calls
 WORDS = "compiling what every sample passes through, once: half a minute to two (fdi compile does it beforehand)"
-TICK = 0.5
-"""How often the share done is shown anew, s."""
+TICK = 0.5  # how often the share done is shown anew, s
 YOUNG_OBJECTS = 7000
 """The compiler makes millions of objects that last: looking for garbage among them ten times as often as this, which is
 Python's default, is a seventh of its time. More seldom still costs memory and saves nothing."""
-LOG_PERIOD = 10.0
-"""How often it is logged, s."""
+LOG_PERIOD = 10.0  # how often it is logged, s
 
 
 class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
@@ -43,10 +39,8 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
         self.depth = 0
         self.seconds = 0.0
         self.begun = 0.0
-        self.collected = gc.get_threshold()
-        """When garbage is collected while nothing is compiled."""
-        self.hooks: list[Callable[[bool], None]] = []
-        """Called when the compiler begins, and when it has ended."""
+        self.collected = gc.get_threshold()  # when garbage is collected while nothing is compiled
+        self.hooks: list[Callable[[bool], None]] = []  # called when the compiler begins, and when it has ended
 
     def on_start(self, event: Any) -> None:
         self.depth += 1

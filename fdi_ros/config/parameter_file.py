@@ -20,8 +20,7 @@ from fdi_ros.config.config import PARAMETERS, Config, is_monitor, parameters_in
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.yaml_file import parse_yaml, read_yaml
 
-WIDTH = 110
-"""Columns of a file; a value without a comment beside it may be longer."""
+WIDTH = 110  # columns of a file; a value without a comment beside it may be longer
 _PLAIN = re.compile(r"[A-Za-z_/~][A-Za-z0-9_/~.*-]*")
 """Texts that need no quotes, unless they are one of these words: the parser of ROS takes more of them than PyYAML."""
 _WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "~"}

@@ -19,30 +19,24 @@ from fdi_ros.errors import FdiError
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
-REQUIRED = dataclasses.MISSING
-"""Default of a field that must be given."""
+REQUIRED = dataclasses.MISSING  # default of a field that must be given
 
 
 @dataclass(frozen=True)
 class Field:
     """What a value may be."""
 
-    kind: str
-    """One of: bool, int, float, text, numbers, texts; or another one, which its reader checks."""
+    kind: str  # one of: bool, int, float, text, numbers, texts; or another one, which its reader checks
     default: Any
     low: float = -math.inf
     high: float = math.inf
-    choices: tuple[str, ...] = ()
-    """Of a text; empty: any text."""
+    choices: tuple[str, ...] = ()  # of a text; empty: any text
     unit: str = ""
     description: str = ""
-    runtime: bool = False
-    """Of a parameter: whether it may be changed while the node runs."""
-    per: str = ""
-    """Of a list: channel or triad, for each of which it has `each` values; empty: it may be of any length."""
+    runtime: bool = False  # of a parameter: whether it may be changed while the node runs
+    per: str = ""  # of a list: channel or triad, for each of which it has `each` values; empty: it may be of any length
     each: int = 1
-    other_lengths: tuple[int, ...] = ()
-    """Lengths that such a list may have besides."""
+    other_lengths: tuple[int, ...] = ()  # lengths that such a list may have besides
 
     @property
     def unit_suffix(self) -> str:
@@ -120,12 +114,9 @@ def _check_number(field: Field, kind: str, value: Any, name: str, error: type[Fd
 # Sections of the settings: a frozen dataclass each, a ROS parameter a field -------------------------------------------
 
 
-LEAST_NOISE = 1e-9
-"""Of a sample, rad/s: less is that of rounding, of a value that does not change."""
-_PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}
-"""One value per channel, or one for all."""
-_PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}
-"""One value per triad, or none."""
+LEAST_NOISE = 1e-9  # of a sample, rad/s: less is that of rounding, of a value that does not change
+_PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}  # one value per channel, or one for all
+_PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}  # one value per triad, or none
 
 
 class Input(NamedTuple):
@@ -133,8 +124,7 @@ class Input(NamedTuple):
 
     section: str
     """Of its settings: ``channels`` for messages of all channels, ``imus`` for messages of three-axis units."""
-    source: str
-    """Module in `fdi_ros.sources`, and class there, that reads it."""
+    source: str  # module in `fdi_ros.sources`, and class there, that reads it
 
 
 INPUTS = {"channels": Input("channels", "channels:ChannelsSource"), "imus": Input("imus", "imus:ImuSource")}

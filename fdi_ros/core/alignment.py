@@ -52,21 +52,15 @@ from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Co
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
-MAX_BRIDGE = 0.25
-"""Longest span between two messages that is interpolated, as a share of the timeout."""
-MAX_STEPS = 2.5
-"""And in usual message intervals: one lost message is bridged, two are not."""
+MAX_BRIDGE = 0.25  # longest span between two messages that is interpolated, as a share of the timeout
+MAX_STEPS = 2.5  # and in usual message intervals: one lost message is bridged, two are not
 MAX_STAMP = 1 << 61
 """ns, before and after zero: beyond all stamps that an Imu can carry, and no sum or difference of stamps overflows."""
-MAX_SPAN = 10**13
-"""Longest skew and timeout, ns."""
+MAX_SPAN = 10**13  # longest skew and timeout, ns
 
-_UNKNOWN = 1 << 62
-"""Step before the first message of a time base, ns."""
-_NONE, _ALL = -_UNKNOWN, _UNKNOWN
-"""Before and after all stamps, ns."""
-_ROOM = 8192
-"""Samples that are formed together at most."""
+_UNKNOWN = 1 << 62  # step before the first message of a time base, ns
+_NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
+_ROOM = 8192  # samples that are formed together at most
 _IDLE, _FORMING, _RESTARTING = range(3)
 
 
@@ -443,8 +437,7 @@ class Alignment:
     """An aligner for messages in arrays; parameters as for `new_aligner`."""
 
     def __init__(self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> None:
-        self.rows = new_aligner(units, max_skew, timeout, delays)
-        """The `Aligner`, (1,)."""
+        self.rows = new_aligner(units, max_skew, timeout, delays)  # the `Aligner`, (1,)
         self.units = units
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:

@@ -38,8 +38,7 @@ from fdi_ros.core.parity import invert
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Portion, Sensors, ValueGroup
 from fdi_ros.model.samples import MAX_RATE, Array
 
-DEFAULT_DURATION = 2_000_000_000
-"""Of the average of the bias where the settings give none, ns."""
+DEFAULT_DURATION = 2_000_000_000  # of the average of the bias where the settings give none, ns
 
 
 def restart_bias(core: NDArray[Any]) -> None:
@@ -49,35 +48,24 @@ def restart_bias(core: NDArray[Any]) -> None:
     bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
 
 
-LEAST_ROWS = 10
-"""Samples that an average takes at least."""
-LEAST_GIVEN = 4
-"""A channel gives one value in so many samples at least: a unit may be slower than the others."""
+LEAST_ROWS = 10  # samples that an average takes at least
+LEAST_GIVEN = 4  # a channel gives one value in so many samples at least: a unit may be slower than the others
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
 """Where the bias comes from; or why the last average was refused."""
-GROUP = 8
-"""Values taken together, of which the largest and the smallest are left out."""
-MIDDLE_SQUARE = 0.3995
-"""Mean square of the middle six of eight normal values about their mean, in variances of one."""
-END = 5
-"""One of so many portions is left out at either end."""
+GROUP = 8  # values taken together, of which the largest and the smallest are left out
+MIDDLE_SQUARE = 0.3995  # mean square of the middle six of eight normal values about their mean, in variances of one
+END = 5  # one of so many portions is left out at either end
 EFFICIENCY = 0.82
 """Variance of the plain mean over that of this average, in white noise: 0.934 by the groups, 0.88 by the portions."""
-USUAL = 0.005
-"""Usual size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s."""
+USUAL = 0.005  # usual size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s
 FALSE_TURN = 0.003
 """Probability that biases are taken for a turn, averaged over the sizes that they may have. A vehicle with such
 biases is refused each time, until they are given by ``bias.fixed`` or followed in motion."""
-FALSE_SWAY = 0.001
-"""Probability that noise is taken for motion; then the next average is taken."""
-PRIOR = 3
-"""Degrees of freedom of what is known of the size of biases beforehand."""
-LEAST_SQUARE = 1e-30
-"""(rad/s)^2; instead of zero, to divide by."""
-_RATE = 3
-"""Dimensions of a body rate."""
-_PLANE = 1e-3
-"""Axes whose H'H has a determinant below this many cubes of its mean eigenvalue do not span space."""
+FALSE_SWAY = 0.001  # probability that noise is taken for motion; then the next average is taken
+PRIOR = 3  # degrees of freedom of what is known of the size of biases beforehand
+LEAST_SQUARE = 1e-30  # (rad/s)^2; instead of zero, to divide by
+_RATE = 3  # dimensions of a body rate
+_PLANE = 1e-3  # axes whose H'H has a determinant below this many cubes of its mean eigenvalue do not span space
 
 
 def prepare_limits(bias: Any) -> None:

@@ -21,20 +21,13 @@ from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSetti
 from fdi_ros.core.subsets import LARGEST_RATE
 from fdi_ros.model.samples import Array
 
-PERIOD = 1_000_000_000
-"""From one comparison to the next, ns."""
-ROWS = 24
-"""Changes that are compared; quantised values of two gyros at rest may agree by chance in fewer."""
-FEW = 8
-"""Of these so many first: mostly they tell that there is no copy."""
-MAX_LAG = 20
-"""Samples by which a copy may come later."""
-HITS = 2
-"""Comparisons that make a copy."""
-EXPLAINED = 1e-9
-"""A copy leaves less than this share of the square of what changes."""
-ROUNDING = 1e-12
-"""A channel of which no more than this share is its own adds nothing to what the others explain."""
+PERIOD = 1_000_000_000  # from one comparison to the next, ns
+ROWS = 24  # changes that are compared; quantised values of two gyros at rest may agree by chance in fewer
+FEW = 8  # of these so many first: mostly they tell that there is no copy
+MAX_LAG = 20  # samples by which a copy may come later
+HITS = 2  # comparisons that make a copy
+EXPLAINED = 1e-9  # a copy leaves less than this share of the square of what changes
+ROUNDING = 1e-12  # a channel of which no more than this share is its own adds nothing to what the others explain
 LEAST_NOISE = 0.02
 """Changes smaller than this share of what the noise makes are smooth: what explains them may be the motion."""
 

@@ -22,8 +22,7 @@ from fdi_ros.core.states import NON_FINITE_LASTING
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
-SURE_DRIFT = 4.0
-"""Standard deviations by which a bias is beyond its limit before that counts."""
+SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit before that counts
 
 
 @compiled
@@ -128,8 +127,7 @@ def units_of(settings: PathSettings, channels: int) -> int:
 # Declarations --------------------------------------------------------------------------------------------------------
 
 
-RETURN_MEAN = 0.5
-"""A channel returns only if, averaged over the clean time, it is off by less than this many noise_std."""
+RETURN_MEAN = 0.5  # a channel returns only if, averaged over the clean time, it is off by less than this many noise_std
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""

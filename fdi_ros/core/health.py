@@ -25,8 +25,7 @@ from fdi_ros.core.records import Core, Current, Health, HealthSettings, PathSett
 from fdi_ros.core.states import FINE, FROZEN, MISSING, NON_FINITE, NON_FINITE_LASTING, OUT_OF_RANGE, SILENT
 from fdi_ros.core.subsets import fill_rate
 
-NOT_BAD = -(1 << 62)
-"""Instead of the stamp at which a run of non-finite values began."""
+NOT_BAD = -(1 << 62)  # instead of the stamp at which a run of non-finite values began
 
 
 @compiled
@@ -83,8 +82,7 @@ DOUBTED_SHARE, INTERMITTENT_SHARE = 0.15, 0.25
 drops, up to 10 %, neither is reached."""
 RETURNING = 3
 """After a value that is not finite the next ones are left out of the rate, where enough are left: all but the third."""
-LEAST_LEAVES = 4.0
-"""And if so many went away lately at least: one hole is none that comes and goes."""
+LEAST_LEAVES = 4.0  # and if so many went away lately at least: one hole is none that comes and goes
 
 
 @compiled
@@ -153,17 +151,14 @@ def intermittent_channels(health: Health, n: int, share: float) -> int:
 LEAST_MOTION = 6.0
 """Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
 beyond one step of a quantised sensor: so far it may turn without a new value."""
-STEPS = 3.0
-"""Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
+STEPS = 3.0  # of a quantised sensor: it repeats its value by chance until the body has moved by so many
 RESTS, AT_REST = 3.0, 1e-3
 """At rest the rate is within so many standard deviations of a channel, and so many rad/s, of zero."""
-COARSE_STEP = 0.5
-"""Steps of so many standard deviations are coarse."""
+COARSE_STEP = 0.5  # steps of so many standard deviations are coarse
 ALL_REPEAT = 100_000_000
 """ns that all channels repeat their values before none of them is believed; in coarse steps ``stuck_time``, if that is
 longer: gyros without noise repeat for longer in a steady turn."""
-LEAST_SENSITIVITY = 1e-3
-"""Below it a channel's own error does not show in its residual."""
+LEAST_SENSITIVITY = 1e-3  # below it a channel's own error does not show in its residual
 
 
 @compiled

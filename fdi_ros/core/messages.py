@@ -29,18 +29,15 @@ from fdi_ros.model.samples import Array, Bytes, Int
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP = range(5)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
 FIRST_OWN = 5
-ENCAPSULATION = 4
-"""Bytes before the first field."""
-LAST_STAMP = (2**31 - 1) * 1_000_000_000
-"""Latest time that the header of a message can hold, to the second, ns."""
+ENCAPSULATION = 4  # bytes before the first field
+LAST_STAMP = (2**31 - 1) * 1_000_000_000  # latest time that the header of a message can hold, to the second, ns
 
 IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
 _WORD = (1 << 32) - 1
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
-"""Elements of a symmetric (3, 3) matrix by rows, in its upper triangle."""
+_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # elements of a symmetric (3, 3) matrix by rows, in its upper triangle
 _IN_ORDER = np.arange(MAX_CHANNELS)
 _UPPER = [0, 1, 2, 4, 5, 8]
 
@@ -156,12 +153,9 @@ def byte_order(data: bytes) -> str:
 class Decoded(NamedTuple):
     """What k messages hold; of one that is malformed: zeros."""
 
-    code: Bytes
-    """(k,) `GOOD`, or what is wrong."""
-    stamp: Int
-    """(k,) ns; 0 for messages that carry none."""
-    values: Array
-    """(k, c) rad/s."""
+    code: Bytes  # (k,) `GOOD`, or what is wrong
+    stamp: Int  # (k,) ns; 0 for messages that carry none
+    values: Array  # (k, c) rad/s
 
     @classmethod
     def nothing(cls, k: int, columns: int) -> Decoded:
@@ -237,8 +231,7 @@ class ImuTemplate:
         body = (0.0, 0.0, 0.0, 1.0, *absent, *(0.0,) * 12, *(0.0,) * 3, *absent)
         self.bytes = np.frombuffer(bytearray(head + struct.pack(f"<{IMU_DOUBLES}d", *body)), dtype=np.uint8)
         """The message, to be copied or filled in place."""
-        self.at = len(head) + 8 * IMU_BEFORE_RATE
-        """Where the rate begins."""
+        self.at = len(head) + 8 * IMU_BEFORE_RATE  # where the rate begins
 
     def fill(self, stamp: int, rate: Sequence[float], covariance: Sequence[float]) -> bytes:
         """Return the message: stamp ns, rate (3,) rad/s, covariance (9,) by rows, symmetric, (rad/s)^2."""
@@ -255,8 +248,7 @@ class ChannelsTemplate:
         self.count = count
         self.bytes = np.frombuffer(bytearray(head + bytes(8 * count)), dtype=np.uint8)
         """The message, to be copied or filled in place."""
-        self.at = len(head)
-        """Where the values begin."""
+        self.at = len(head)  # where the values begin
 
     def fill(self, values: Iterable[float]) -> bytes:
         """Return the message with these values."""

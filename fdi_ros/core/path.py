@@ -39,8 +39,7 @@ NOISY, NOISIER = 3.0, 1.4
 RAIL_MARGIN = 0.9
 """A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
 WAITING = -1
-RAIL_LIMIT = 10.0
-"""A value out of range is fed to the detector as so many ranges at most."""
+RAIL_LIMIT = 10.0  # a value out of range is fed to the detector as so many ranges at most
 
 
 @compiled
@@ -343,8 +342,7 @@ NEVER = -1
 AHEAD_OF_CLOCK = 1_000_000_000
 """A live stamp is ahead of the clock by so much at most, ns: clocks of two computers may differ, and a simulator's has
 steps."""
-STEP_BACK = 100_000_000
-"""A clock set back by more than this is followed, ns; less is waited out."""
+STEP_BACK = 100_000_000  # a clock set back by more than this is followed, ns; less is waited out
 
 
 @compiled

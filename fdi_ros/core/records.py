@@ -35,18 +35,13 @@ from fdi_ros.compiling.record import (
     record,
 )
 
-MAX_PENDING = 1024
-"""Messages of one unit that wait at most."""
-RING = MAX_PENDING + 2
-"""Messages kept of one unit: those that wait, one too many, and the one before them."""
-RESTAMP_SAMPLES = 1024
-"""Kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz."""
-BIAS_PORTIONS = 15
-"""Into which the time of the average at the start is divided."""
+MAX_PENDING = 1024  # messages of one unit that wait at most
+RING = MAX_PENDING + 2  # messages kept of one unit: those that wait, one too many, and the one before them
+RESTAMP_SAMPLES = 1024  # kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
+BIAS_PORTIONS = 15  # into which the time of the average at the start is divided
 ACCELERATION_SAMPLES = 1024
 """Samples that the window of the angular acceleration spans at most; of a longer one the last so many count."""
-DECISION_SAMPLES = 1000
-"""Samples in the longest window of the votes."""
+DECISION_SAMPLES = 1000  # samples in the longest window of the votes
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
 

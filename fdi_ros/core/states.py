@@ -20,20 +20,13 @@ FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = ma
 class ChannelState(IntEnum):
     """State of one channel; the number is what ``~/integrity`` carries."""
 
-    OK = 0
-    """Delivers, is checked against the others and agrees."""
-    SUSPECT = 1
-    """Left out of the fused rate for now: under suspicion, not confirmed."""
-    AMBIGUOUS = 2
-    """One of a named set of channels is faulty; the evidence cannot tell which."""
-    FAULTY = 3
-    """Declared faulty and left out."""
-    STALE = 4
-    """Gives nothing, or nothing new."""
-    UNCHECKED = 5
-    """Delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run."""
-    EXCLUDED = 6
-    """Taken out by the operator."""
+    OK = 0  # delivers, is checked against the others and agrees
+    SUSPECT = 1  # left out of the fused rate for now: under suspicion, not confirmed
+    AMBIGUOUS = 2  # one of a named set of channels is faulty; the evidence cannot tell which
+    FAULTY = 3  # declared faulty and left out
+    STALE = 4  # gives nothing, or nothing new
+    UNCHECKED = 5  # delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run
+    EXCLUDED = 6  # taken out by the operator
 
 
 class Reason(str, Enum):
@@ -66,8 +59,7 @@ _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
 """State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
 _OF_CONDITION = (_DISAGREES, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _FROZEN, _NO_DATA, _NON_FINITE)
 """Why, by `Condition`."""
-_OF_DECISION = (_NONE, _DISAGREES, _STUCK, _NON_FINITE, _DRIFTED, _INTERMITTENT)
-"""By why a channel was declared."""
+_OF_DECISION = (_NONE, _DISAGREES, _STUCK, _NON_FINITE, _DRIFTED, _INTERMITTENT)  # by why a channel was declared
 
 
 @compiled

@@ -46,18 +46,14 @@ from fdi_ros.estimator.noise import (
 from fdi_ros.estimator.shared_noise import update_shared
 from fdi_ros.model.samples import Array
 
-PER_BLOCK = (0, 1, 6, 48)
-"""Blocks in a value of each time scale; 0: samples."""
+PER_BLOCK = (0, 1, 6, 48)  # blocks in a value of each time scale; 0: samples
 STANDS = 0.6
 """Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case."""
-ENDS = 2.0
-"""Log odds of the likeliest hypothesis below which a case ends, once it is old enough to tell."""
-RENAME = 16
-"""Channels are named again when the time since the onset has grown by this part."""
+ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends, once it is old enough to tell
+RENAME = 16  # channels are named again when the time since the onset has grown by this part
 SETTLED, SETTLED_AMONG_FEW, SETTLED_TOGETHER = 0.2, 0.5, 1.0
 """s that a name must stand, of one channel, where few check it, and of two: several faults look like one at first."""
-FEW_CHECKS = 3
-"""Channels beyond three so few that three faults explain anything."""
+FEW_CHECKS = 3  # channels beyond three so few that three faults explain anything
 CLEAR = 5000.0
 """Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
@@ -67,16 +63,12 @@ LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
 """A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
-LARGEST_STEP = 0.015
-"""By so much at once at most: motors that start move biases by some 5 mrad/s, and no more."""
-FASTEST = 2.5
-"""And so many times as fast as that for a moment."""
+LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biases by some 5 mrad/s, and no more
+FASTEST = 2.5  # and so many times as fast as that for a moment
 RUINED = math.e * LARGEST_MOVE
 """After a move that was none, as if they had moved so far: for `WARMS` no other is believed."""
-UNEXPLAINED_SHARE = 0.2
-"""So it is where the best hypothesis of a fault leaves at least this share of the chi-square."""
-TURNED = 0.3
-"""And beyond it so much of theirs: what is known of the sensors changes while they are watched."""
+UNEXPLAINED_SHARE = 0.2  # so it is where the best hypothesis of a fault leaves at least this share of the chi-square
+TURNED = 0.3  # and beyond it so much of theirs: what is known of the sensors changes while they are watched
 
 
 @record

@@ -22,14 +22,10 @@ from fdi_ros.estimator.noise import FAR, LONG
 SIZES = 6
 SMALLEST = 0.2
 """Smallest size of a fault, in standard deviations at its time scale; each next one is twice as large, up to 6.4."""
-FIRST_LONG = 2
-"""Sizes left out at the longest time scale: less than 0.8 there is a walk of the bias."""
-STEP_LIMIT = 7.0
-"""A value counts as this many standard deviations at most (Huber 1965)."""
-KEPT = 64
-"""Values of each time scale that are looked back at."""
-CEILING = 1e6
-"""Sums stay below so many times the threshold: what has passed is forgotten."""
+FIRST_LONG = 2  # sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
+STEP_LIMIT = 7.0  # a value counts as this many standard deviations at most (Huber 1965)
+KEPT = 64  # values of each time scale that are looked back at
+CEILING = 1e6  # sums stay below so many times the threshold: what has passed is forgotten
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
 Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
 Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]

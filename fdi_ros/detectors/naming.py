@@ -44,12 +44,9 @@ is large for what it stands for: of three parallel gyros, two with the same faul
 opposite one, and only the odds of such a coincidence keep a healthy gyro from being named."""
 TWO_CHECKS = 0.05
 """Of the odds of pairs where there are two checks: two of five explain anything, and no fault would ever be named."""
-GAIN_STD, DELAY_STD = 0.1, 0.01
-"""Of a unit that is wrong as a whole: gain, and delay in s."""
-SPREAD = 1.3
-"""Logarithm that each amplitude costs, see above."""
-MISFIT = 0.004
-"""Share of the largest error by which the model may be wrong: axes and scale factors."""
+GAIN_STD, DELAY_STD = 0.1, 0.01  # of a unit that is wrong as a whole: gain, and delay in s
+SPREAD = 1.3  # logarithm that each amplitude costs, see above
+MISFIT = 0.004  # share of the largest error by which the model may be wrong: axes and scale factors
 FIT, FIT_PER_CHECK = 6.0, 2.5
 """Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom."""
 SET_MARGIN = 5.0

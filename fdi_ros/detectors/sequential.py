@@ -83,18 +83,15 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import MAX_RATE
 from fdi_ros.model.thresholds import FalseAlarmRate
 
-LEAST_TIME = 0.02
-"""s; that a fault lasts before it is declared."""
+LEAST_TIME = 0.02  # s; that a fault lasts before it is declared
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
-HOLE, SLOW = 1.5 * BLOCK_TIME, 2.5
-"""A block begins anew after so many s, and so many periods, without a sample."""
+HOLE, SLOW = 1.5 * BLOCK_TIME, 2.5  # a block begins anew after so many s, and so many periods, without a sample
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
-SHORT = 1.0 - 1e-9
-"""What is shown of the threshold where the sums have reached it, and there is no alarm."""
+SHORT = 1.0 - 1e-9  # what is shown of the threshold where the sums have reached it, and there is no alarm
 
 
 @compiled

@@ -45,10 +45,8 @@ from fdi_ros.model.samples import Array
 
 QUIET, LIVED = 3.0, 2.0
 """At rest the variance of blocks is at most so many times what it was at rest before, once that was so many s."""
-REST_STD = 3e-4
-"""rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates."""
-UNLEARNED = 0.003
-"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
+REST_STD = 3e-4  # rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates
+UNLEARNED = 0.003  # rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn
 REST_CHI, REST_LAST = 1.6, 12.0
 """At rest the scatter of those is at most so many times that of noise, the square of their mean at most `THREE_SIGMA`
 variances and of the last one's distance from it so many."""
@@ -173,12 +171,9 @@ def predict_from(params: Constants, kf: Estimator, seconds: float, states: Error
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
-PEAK = 0.8
-"""What a peak of motion fades to with every block."""
-TAKE_OFF, SURE = 0.002, 25.0
-"""A delay is sure beyond so many s, and the square of so many standard deviations."""
-LONGEST_DELAY = 0.06
-"""s that are made up for at most."""
+PEAK = 0.8  # what a peak of motion fades to with every block
+TAKE_OFF, SURE = 0.002, 25.0  # a delay is sure beyond so many s, and the square of so many standard deviations
+LONGEST_DELAY = 0.06  # s that are made up for at most
 
 
 @compiled

@@ -27,8 +27,7 @@ from fdi_ros.model.samples import Array
 ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
 """By what a state is multiplied in a channel: one; the body rate about an axis; the angular acceleration along the
 channel, negative. All but the first are of motion, and zero at rest."""
-GIVEN = math.nan
-"""In the table: whoever uses the states says how large the errors are."""
+GIVEN = math.nan  # in the table: whoever uses the states says how large the errors are
 
 
 class StateKind(NamedTuple):
@@ -36,18 +35,13 @@ class StateKind(NamedTuple):
 
     name: str
     unit: str
-    per_unit: bool
-    """One for each unit but the first, against which the others are; else one for each channel."""
+    per_unit: bool  # one for each unit but the first, against which the others are; else one for each channel
     by: tuple[int, ...]
     """By what each of its states is multiplied; none: one state, which is the rate of change of `feeds`."""
-    prior: float
-    """Standard deviation before anything is shown, where `prepare_layout` is given no other."""
-    walk: float = 0.0
-    """Random walk, per sqrt(s), where none other is given."""
-    memory: float = 0.0
-    """s, after which a rate of change has faded: a Gauss-Markov process."""
-    feeds: str = ""
-    """Name of the kind whose rate of change this is."""
+    prior: float  # standard deviation before anything is shown, where `prepare_layout` is given no other
+    walk: float = 0.0  # random walk, per sqrt(s), where none other is given
+    memory: float = 0.0  # s, after which a rate of change has faded: a Gauss-Markov process
+    feeds: str = ""  # name of the kind whose rate of change this is
 
 
 ERROR_KINDS = (

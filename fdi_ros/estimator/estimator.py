@@ -45,31 +45,25 @@ BLOCK_TIME, LONG_TIME = 0.04, 2.0
 BEGINS = 16.0
 """Motion begins where the square of the rate is so many of its variances, and `THREE_SIGMA` times what no rate
 explains: a fault looks like motion too."""
-SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
-"""s between snapshots; of each tier every eighth goes on to the next."""
-REST_BLOCKS = 25
-"""Blocks without motion that are rest."""
+SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8  # s between snapshots; of each tier every eighth goes on to the next
+REST_BLOCKS = 25  # blocks without motion that are rest
 SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
 """Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
-LEAST_SHARE = 0.02
-"""Share of noise in the variance of a statistic, at least: what is less is rounding."""
+LEAST_SHARE = 0.02  # share of noise in the variance of a statistic, at least: what is less is rounding
 CHECKABLE = 0.01
 """Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
 ten times as large."""
 CHECKABLE_AT = 2.0 * BLOCK_TIME * 100.0
 """How often what is not known of the states counts at 100 Hz: twice the samples of a block."""
-SENSITIVE = 1e-6
-"""Share of a channel's own variance in its parity, below which a fault does not show."""
+SENSITIVE = 1e-6  # share of a channel's own variance in its parity, below which a fault does not show
 Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
 Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
 Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
-SLOW_TURN = 1e-4
-"""(rad/s)^2; below it nothing grows with the motion."""
-SPIKE = 4
-"""Samples that a spike lasts at most: delays spread it over neighbours."""
+SLOW_TURN = 1e-4  # (rad/s)^2; below it nothing grows with the motion
+SPIKE = 4  # samples that a spike lasts at most: delays spread it over neighbours
 
 
 @record

@@ -23,38 +23,29 @@ from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, S
 from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 
-SCALES = 4
-"""Samples, blocks, 0.25 s, 2 s."""
+SCALES = 4  # samples, blocks, 0.25 s, 2 s
 SAMPLE, BLOCK, QUARTER, LONG = range(SCALES)
 REST, MOTION = range(2)
-LAGS = 3
-"""Of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later."""
+LAGS = 3  # of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later
 THREE_SIGMA, FAR = 9.0, 100.0
 """Squares of three standard deviations, which one of 370 normal values exceeds, and of ten, which none does."""
 BURST = 0.75
 """The variance of the moment counts where it exceeds the learned one by more than it scatters in white noise."""
-QUIETEST = 0.1
-"""Of the variance expected: less is not believed, or the noise would be unknown when it comes back."""
+QUIETEST = 0.1  # of the variance expected: less is not believed, or the noise would be unknown when it comes back
 QUIETEST_BLOCK, LOUDEST = 0.03, 1e4
 """And that of blocks at least, and at most: beyond it is no noise that anything could be told in."""
-UNKNOWN = 16.0
-"""By how much the variance of long times may exceed that of blocks, before anything was measured."""
+UNKNOWN = 16.0  # by how much the variance of long times may exceed that of blocks, before anything was measured
 FASTER = 16.0
 """Four times as fast as ever: vibration and what is not linear are others, and the noise of a hover says nothing."""
 WILD, TAME = 5.0, 3.0
 """A value beyond so many standard deviations followed by one below so many is a wild one, and no fault."""
-WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
-"""What is known of their frequency before any was seen: so many in so many."""
-SURELY = 0.8
-"""Share of a level of long times that is no scatter of its estimate, which is from some 80 values at most."""
-TRUST = 50.0
-"""Degrees of freedom that the learned noise counts for at most."""
+WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0  # what is known of their frequency before any was seen: so many in so many
+SURELY = 0.8  # share of a level of long times that is no scatter of its estimate, which is from some 80 values at most
+TRUST = 50.0  # degrees of freedom that the learned noise counts for at most
 TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
 """Samples over which the weight of the tails is averaged, and that the first guess counts for."""
-TAIL_SCATTER = 2.8
-"""Standard deviation of those products in white noise, cut at `FAR`."""
-LEARNED_IN = 64.0
-"""Samples for each degree of freedom to be earned."""
+TAIL_SCATTER = 2.8  # standard deviation of those products in white noise, cut at `FAR`
+LEARNED_IN = 64.0  # samples for each degree of freedom to be earned
 
 ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
 ByLevel = Annotated[NDArray[np.float64], "f8", (SCALES + LAGS, MAX_CHANNELS)]
@@ -107,8 +98,7 @@ class Noise:
     share: Channels  # of the variance of a block's statistic that is noise
 
 
-PAST = 4
-"""Corrected values before, 20 ms apart, that a fourth difference is of with the present one."""
+PAST = 4  # corrected values before, 20 ms apart, that a fourth difference is of with the present one
 
 
 @record

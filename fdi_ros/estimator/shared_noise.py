@@ -34,25 +34,19 @@ from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
-MEMORY = 2.0
-"""Half seconds that everything here is a mean of."""
-FARTHEST = 10.0
-"""Standard deviations beyond which an innovation counts less, and three of the rate of differences."""
+MEMORY = 2.0  # half seconds that everything here is a mean of
+FARTHEST = 10.0  # standard deviations beyond which an innovation counts less, and three of the rate of differences
 LINE = 1.0 / 6.0
 """Excess of the inverse of the dimensions at which all is taken for a line: of two dimensions in a parity of three."""
-INCOHERENT, COHERENT = 0.25, 0.75
-"""Squared correlation that chance reaches in a second, and from which all is coherent."""
+INCOHERENT, COHERENT = 0.25, 0.75  # squared correlation that chance reaches in a second, and from which all is coherent
 STEADY = 4.0
 """Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
 parallel channels see a tenth more or less makes a variance wrong by a sixth there."""
-UNEQUAL = 0.15
-"""By how much units see vibration differently; logs show 0.04 to 0.6."""
-INDEPENDENT = 4.0
-"""Values of a block that are independent of one another."""
+UNEQUAL = 0.15  # by how much units see vibration differently; logs show 0.04 to 0.6
+INDEPENDENT = 4.0  # values of a block that are independent of one another
 NEAR_SINGULAR, TINY_RATE = 1e-3, 1e-11
 """Added to Q, share of it and of a square in (rad/s)^2: an axis about which nothing is measured."""
-FOURTH = math.sqrt(70.0)
-"""Standard deviation of a fourth difference of white noise, over its own."""
+FOURTH = math.sqrt(70.0)  # standard deviation of a fourth difference of white noise, over its own
 
 
 @compiled

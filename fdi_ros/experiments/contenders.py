@@ -63,13 +63,11 @@ def _products(z: Array, forms: Array) -> Array:
 
 BOUND = 3.0
 """Guaranteed bound of a channel in a study, in noise_std: what a user who takes 3 sigma for the limit would set."""
-LOOSE_BOUNDS = 0.2
-"""Loose threshold of `guaranteed`, in bounds, from which its own is found."""
+LOOSE_BOUNDS = 0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
 """Methods that leave several suspects and rank them by their scores; of others the largest normalised error counts."""
 
-NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
-"""Methods whose scores are the normalised residuals ``|w_i|``."""
+NORMALISED_SCORES = ("likelihood_ratio", "chi_square")  # methods whose scores are the normalised residuals ``|w_i|``
 
 Method = Detector | ChiSquare
 
@@ -80,14 +78,10 @@ METHODS: dict[str, Any] = {**{name: detector_class(name) for name in DETECTORS},
 class Evaluation(NamedTuple):
     """Verdicts of one method on N samples at its loose threshold."""
 
-    ratio: Array
-    """(N,) statistic over threshold; alarm where it reaches the factor found. NaN without an alarm."""
-    suspects: Mask
-    """(N, n)"""
-    isolated: Mask
-    """(N,)"""
-    named: NDArray[np.intp]
-    """(N,) the worst of the suspects; -1 without suspects."""
+    ratio: Array  # (N,) statistic over threshold; alarm where it reaches the factor found. NaN without an alarm.
+    suspects: Mask  # (N, n)
+    isolated: Mask  # (N,)
+    named: NDArray[np.intp]  # (N,) the worst of the suspects; -1 without suspects
     best: NDArray[np.intp] | None
     """(N,) the channel of the largest normalised residual, alarm or not; None: the method does not give it."""
 

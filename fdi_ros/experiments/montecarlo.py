@@ -64,8 +64,7 @@ def _built(kind: str, settings: str, preparation: str) -> tuple[AnyProtocol, Pre
     return PROTOCOLS[kind](json.loads(settings)), json.loads(preparation)
 
 
-FORMAT = 1
-"""Of the JSON."""
+FORMAT = 1  # of the JSON
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,9 @@ class SectionResult:
 
     kind: str
     settings: Mapping[str, Any]
-    found: Preparation
-    """What the first stage gave."""
+    found: Preparation  # what the first stage gave
     not_run: Refusals
-    cells: list[Figures]
-    """Of each cell of the second stage."""
+    cells: list[Figures]  # of each cell of the second stage
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,7 @@ class StudyResult:
     """All figures and settings of a study."""
 
     format: int
-    fdi_ros: str
-    """Version of the package."""
+    fdi_ros: str  # version of the package
     study: str
     title: str
     seed: int

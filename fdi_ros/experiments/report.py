@@ -18,22 +18,18 @@ LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
 SIZE = "fault, standard deviations"
 
-Say = Callable[[Any], str]
-"""Words of the figures of a method, or of the limit, in a cell."""
+Say = Callable[[Any], str]  # words of the figures of a method, or of the limit, in a cell
 ByDetector = tuple[str, Mapping[str, Any], Say]
 """A column of a table: its head, the figures of each detector, and their words; None: there are none."""
-Curve = tuple[Sequence[float], Sequence[Estimate]]
-"""x, and for each x a figure with its confidence interval."""
+Curve = tuple[Sequence[float], Sequence[Estimate]]  # x, and for each x a figure with its confidence interval
 
 
 class Group(NamedTuple):
     """Cells of a section that are on one geometry."""
 
-    mounting: str
-    """Name of the geometry."""
+    mounting: str  # name of the geometry
     cells: Sequence[Figures]
-    settings: Mapping[str, Any]
-    """Of the section."""
+    settings: Mapping[str, Any]  # of the section
 
     @property
     def faults(self) -> list[Figures]:
@@ -41,8 +37,7 @@ class Group(NamedTuple):
         return [cell for cell in self.cells if cell["size"]]
 
 
-Shows = Callable[[Group], list[Section]]
-"""How the cells of a protocol are shown."""
+Shows = Callable[[Group], list[Section]]  # how the cells of a protocol are shown
 
 
 def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:

@@ -20,18 +20,15 @@ from numpy.typing import NDArray
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 
-STEEPEST = 1.5
-"""Largest slope of the smooth step 3 u^2 - 2 u^3, at its middle."""
+STEEPEST = 1.5  # largest slope of the smooth step 3 u^2 - 2 u^3, at its middle
 
 
 @dataclass(frozen=True)
 class Motion:
     """Body rate as a smooth function of time: holds and smooth steps between knots."""
 
-    time: Array
-    """Knots, (K,) s, strictly increasing."""
-    rate: Array
-    """Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last."""
+    time: Array  # knots, (K,) s, strictly increasing
+    rate: Array  # body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last.
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
@@ -85,24 +82,15 @@ def _phase(kind: str, max_rate: float, rng: np.random.Generator) -> list[tuple[A
 class GyroErrors:
     """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit."""
 
-    noise_std: float = 0.0025
-    """White noise of one sample, rad/s."""
-    bias_std: float = 0.01
-    """Bias at switch-on, rad/s."""
-    bias_walk: float = 2e-5
-    """Random walk of the bias, rad/s per square root of a second."""
-    scale_std: float = 0.001
-    """Scale factor, dimensionless."""
-    misalignment_std: float = 0.001
-    """Angle between true and nominal axis, rad, in each of the two directions across it."""
-    delay_std: float = 0.0002
-    """Sampling instant of a chip against the stamp, s."""
-    resolution: float = float(np.radians(1 / 16.4))
-    """Step of the converter, rad/s; 0: none."""
-    max_rate: float = 34.9
-    """Range of the converter, rad/s."""
-    channels_per_chip: int = 3
-    """Channels that are sampled together."""
+    noise_std: float = 0.0025  # white noise of one sample, rad/s
+    bias_std: float = 0.01  # bias at switch-on, rad/s
+    bias_walk: float = 2e-5  # random walk of the bias, rad/s per square root of a second
+    scale_std: float = 0.001  # scale factor, dimensionless
+    misalignment_std: float = 0.001  # angle between true and nominal axis, rad, in each of the two directions across it
+    delay_std: float = 0.0002  # sampling instant of a chip against the stamp, s
+    resolution: float = float(np.radians(1 / 16.4))  # step of the converter, rad/s; 0: none
+    max_rate: float = 34.9  # range of the converter, rad/s
+    channels_per_chip: int = 3  # channels that are sampled together
 
     def draw(self, geometry: Geometry, rng: np.random.Generator) -> Gyros:
         """Make one unit: draw all that stays as it is from switch-on."""

@@ -45,8 +45,7 @@ class Section:
     """One set of trials of a study."""
 
     kind: str
-    settings: Mapping[str, Any]
-    """Every setting of the kind, defaults filled in; plain values that JSON can hold."""
+    settings: Mapping[str, Any]  # every setting of the kind, defaults filled in; plain values that JSON can hold
 
 
 @dataclass(frozen=True)
@@ -158,16 +157,11 @@ def _is_axis(value: Any) -> bool:
     return len(value) == 3 and all(isinstance(x, (int, float)) for x in value)
 
 
-Cell = TypeVar("Cell")
-"""What distinguishes one cell of a section from the others."""
-Counts = dict[str, Any]
-"""What trials gave: numbers, None, and lists or mappings by text of these."""
-Preparation = dict[str, Any]
-"""What the first stage gives; in the result under ``found``."""
-Figures = dict[str, Any]
-"""Of one cell of the second stage, in the order of the result; shares are an `Estimate`."""
-Refusals = Mapping[str, Mapping[str, str]]
-"""By geometry and method: why the method does not run."""
+Cell = TypeVar("Cell")  # what distinguishes one cell of a section from the others
+Counts = dict[str, Any]  # what trials gave: numbers, None, and lists or mappings by text of these
+Preparation = dict[str, Any]  # what the first stage gives; in the result under ``found``
+Figures = dict[str, Any]  # of one cell of the second stage, in the order of the result; shares are an `Estimate`
+Refusals = Mapping[str, Mapping[str, str]]  # by geometry and method: why the method does not run
 
 
 class Stage(IntEnum):

@@ -114,8 +114,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
 # Judged ---------------------------------------------------------------------------------------------------------------
 
 
-CALIBRATED = 1_000_000
-"""Samples that a calibration takes at most: the first ones of a long flight."""
+CALIBRATED = 1_000_000  # samples that a calibration takes at most: the first ones of a long flight
 
 
 Judged = tuple[Flight, Sequence[FlightEpisode], str]
@@ -218,8 +217,7 @@ class _Seen(Sink):
     """What a summary does not have: stamp of the first sample, and the noise of the channels."""
 
     def __init__(self, rate: float) -> None:
-        self.first: int | None = None
-        """ns."""
+        self.first: int | None = None  # ns
         self._rate, self._segments = rate, NoiseSegments(0)
         self.copies: set[tuple[str, str]] = set()
         """Units, with their topics, of which the second gives the values of the first."""

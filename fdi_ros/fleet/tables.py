@@ -31,10 +31,8 @@ from fdi_ros.system.result_file import plain, whole_file, write_text
 from fdi_ros.system.text import shown, storable
 from fdi_ros.system.trusted_file import open_regular
 
-Row = Mapping[str, Any]
-"""Values of a row by the names of the columns; None where nothing can be said."""
-VERSION = 3
-"""Of the columns: raised when one changes its name, type or meaning."""
+Row = Mapping[str, Any]  # values of a row by the names of the columns; None where nothing can be said.
+VERSION = 3  # of the columns: raised when one changes its name, type or meaning
 WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
 """The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
 
@@ -115,8 +113,7 @@ class Tables:
         except (BagError, OSError):
             self.give_up()
             raise
-        self.flights: dict[str, Row] = {row["path"]: row for row in flights}
-        """Rows by path."""
+        self.flights: dict[str, Row] = {row["path"]: row for row in flights}  # rows by path
         self._episodes: dict[str, list[Row]] = {path: [] for path in self.flights}
         for row in episodes:
             # Those whose flight was not written any more are of no use: it is judged again.
@@ -186,10 +183,8 @@ class Tables:
 # The page: first the flights that need a look, and why ----------------------------------------------------------------
 
 
-MOST_ROWS = 2000
-"""Flights in a table of the page; flights.parquet has all."""
-LOOKS, WHY = 10, 400
-"""Flights that need a person in a terminal, and characters of what is said of each."""
+MOST_ROWS = 2000  # flights in a table of the page; flights.parquet has all
+LOOKS, WHY = 10, 400  # flights that need a person in a terminal, and characters of what is said of each
 
 
 class Fleet:
@@ -201,8 +196,7 @@ class Fleet:
             return sets - declared, -declared, not row["error"], row["path"]
 
         self.flights = sorted(flights, key=rank)
-        self.looks = [row for row in self.flights if row["why"]]
-        """Those that need a person."""
+        self.looks = [row for row in self.flights if row["why"]]  # those that need a person
         self.calm = [row for row in self.flights if not row["why"]]
         self.judged = [row for row in flights if not row["error"]]
 

@@ -16,24 +16,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-NS, MS = 1_000_000_000, 1_000_000
-"""A second and a millisecond, ns."""
-DRIFT = 1e-4
-"""Clocks drift from one another by less: 100 ppm."""
-SLEW = 1e-3
-"""So fast the offset in use follows a better one, so that stamps do not step."""
-STEP = 20 * MS
-"""A better offset further away than this is taken at once, ns."""
-GRAIN = MS
-"""Step of the times in answers, at most, ns."""
-LONGEST = NS
-"""Round trips that take longer say nothing, ns."""
-SURE = 3
-"""Times or answers in a row that contradict what was known before they are believed: a single one may be wrong."""
-_KEPT = 64
-"""Round trips, and requests under way, at most."""
-FIRST_FOR, FIRST_EVERY, THEN_EVERY = 20, NS // 10, NS // 2
-"""So many requests at an interval, then at another, ns."""
+NS, MS = 1_000_000_000, 1_000_000  # a second and a millisecond, ns
+DRIFT = 1e-4  # clocks drift from one another by less: 100 ppm
+SLEW = 1e-3  # so fast the offset in use follows a better one, so that stamps do not step
+STEP = 20 * MS  # a better offset further away than this is taken at once, ns
+GRAIN = MS  # step of the times in answers, at most, ns
+LONGEST = NS  # round trips that take longer say nothing, ns
+SURE = 3  # times or answers in a row that contradict what was known before they are believed: a single one may be wrong
+_KEPT = 64  # round trips, and requests under way, at most
+FIRST_FOR, FIRST_EVERY, THEN_EVERY = 20, NS // 10, NS // 2  # so many requests at an interval, then at another, ns
 
 
 class TimeSync:
@@ -45,11 +36,9 @@ class TimeSync:
     def reset(self) -> None:
         """Forget all: the remote clock has begun anew."""
         self._sent: deque[int] = deque(maxlen=_KEPT)
-        self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)
-        """When it ended, offset, half the round trip; ns."""
+        self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)  # when it ended, offset, half the round trip; ns
         self._best: tuple[int, int, int] | None = None
-        self._odd = 0
-        """Answers in a row that contradict those before."""
+        self._odd = 0  # answers in a row that contradict those before
         self._requests = 0
         self._next = 0
         self._used: float | None = None
@@ -148,8 +137,7 @@ class BootClock:
 
     def __init__(self) -> None:
         self.reset()
-        self.restarts = 0
-        """Steps found."""
+        self.restarts = 0  # steps found
 
     def reset(self) -> None:
         """Begin anew with the next time."""

@@ -29,10 +29,8 @@ from fdi_ros.system import trusted_file
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
 """States of a channel that is not used at all; under doubt for a moment are also healthy ones."""
-_STEP = 20 * MS
-"""The policy is asked so often while a declaration is young, ns."""
-_BEFORE = NS + HEALED
-"""Time of the policy at the start of a recording, ns."""
+_STEP = 20 * MS  # the policy is asked so often while a declaration is young, ns
+_BEFORE = NS + HEALED  # time of the policy at the start of a recording, ns
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS
 """Parameters are read in turn so often, ns; what was said longer ago counts as not known."""
 SILENT, ABSENT = NS // 2, 5 * NS
@@ -46,8 +44,7 @@ TEXTS = {
     "stays": (CRITICAL, "stays: "),
 }
 """Severity and words, by the kind of action."""
-LARGEST = 4096
-"""Bytes of the file, at most."""
+LARGEST = 4096  # bytes of the file, at most
 
 
 def format_imu(unit: int, channels: Sequence[str]) -> str:
@@ -60,12 +57,9 @@ class Declarations:
     """What a monitor says of some IMUs, three channels each, and since when."""
 
     def __init__(self, count: int) -> None:
-        self.heard = 0
-        """When the monitor was heard last, ns."""
-        self.begun = 0
-        """Since when it has been heard without a break, ns."""
-        self.channels: list[int | None] = [None] * (3 * count)
-        """When each that is FAULTY by name was declared, ns."""
+        self.heard = 0  # when the monitor was heard last, ns
+        self.begun = 0  # since when it has been heard without a break, ns
+        self.channels: list[int | None] = [None] * (3 * count)  # when each that is FAULTY by name was declared, ns
         self._ok = [False] * count
         self._well: list[int | None] = [None] * count
 
@@ -104,8 +98,7 @@ class Failover:
         """Estimated error of each channel, as the monitor last reported it, rad/s; NaN: it reported none."""
         self.reported = 0
         """When the monitor last reported as a whole, of these IMUs, ns; 0: it has not, or of others since."""
-        self.is_alone = False
-        """Whether nobody but the monitor publishes what is taken for its declarations."""
+        self.is_alone = False  # whether nobody but the monitor publishes what is taken for its declarations
         self.declarations = Declarations(count)
         self._values: list[tuple[bool, int] | None] = [None] * count
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0

@@ -23,14 +23,11 @@ from fdi_ros.mavlink.clock import MS, NS
 
 YOUNG = NS
 """A declaration is acted on up to this age, ns: with what is older the vehicle has flown, and the pilot decides."""
-HEALED = 2 * NS
-"""So long an IMU that is out must have been well before it changes places with a faulty one, ns."""
+HEALED = 2 * NS  # so long an IMU that is out must have been well before it changes places with a faulty one, ns
 GROUNDED = 2 * NS
 """A vehicle is disarmed when its heartbeats have all said so for so long, ns: a single forged one is not enough."""
-RETRY, TRIES = 100 * MS, 10
-"""Between two attempts to set a parameter, ns, and their number."""
-AGAIN = 10 * NS
-"""An IMU that could not be put back is tried again after so long, ns."""
+RETRY, TRIES = 100 * MS, 10  # between two attempts to set a parameter, ns, and their number
+AGAIN = 10 * NS  # an IMU that could not be put back is tried again after so long, ns
 SETTLED = 2 * NS
 """What was sent so long ago has arrived, or never will, ns: what is heard later is the truth, or somebody else's."""
 
@@ -38,33 +35,24 @@ SETTLED = 2 * NS
 class FailoverUnit(NamedTuple):
     """What is known of one IMU; times in ns."""
 
-    use: bool | None = None
-    """Whether its parameter says that it is in use; None: the autopilot has not said of late."""
-    heard: int = 0
-    """When the autopilot said so last."""
-    declared: int | None = None
-    """When the newest of its channels that are FAULTY by name was declared; None: none is."""
-    ok: bool = False
-    """Whether all its channels are OK: healthy and checked."""
+    use: bool | None = None  # whether its parameter says that it is in use; None: the autopilot has not said of late.
+    heard: int = 0  # when the autopilot said so last
+    declared: int | None = None  # when the newest of its channels that are FAULTY by name was declared; None: none is.
+    ok: bool = False  # whether all its channels are OK: healthy and checked
     well: int | None = None
     """Since when none of its channels is FAULTY, without data or taken out by an operator; None: one is."""
-    delivers: bool = False
-    """Whether its samples come."""
+    delivers: bool = False  # whether its samples come
 
 
 class Known(NamedTuple):
     """What is known now."""
 
     units: tuple[FailoverUnit, ...]
-    linked: bool = False
-    """Whether an ArduPilot is heard that sends each IMU under its own name."""
+    linked: bool = False  # whether an ArduPilot is heard that sends each IMU under its own name
     armed: bool = False
-    disarmed: int = 0
-    """For how long all its heartbeats have said that it is not armed, ns."""
-    monitored: bool = False
-    """Whether the monitor, and nobody else in its place, reports."""
-    restore: bool = False
-    """An operator asks now for all to be put back."""
+    disarmed: int = 0  # for how long all its heartbeats have said that it is not armed, ns
+    monitored: bool = False  # whether the monitor, and nobody else in its place, reports
+    restore: bool = False  # an operator asks now for all to be put back
 
 
 class Order(NamedTuple):
@@ -73,8 +61,7 @@ class Order(NamedTuple):
     use: bool
     tries: int = 0
     begun: int = 0
-    sent: int = 0
-    """First and last attempt."""
+    sent: int = 0  # first and last attempt
     confirmed: bool = False
 
     @property
@@ -87,10 +74,8 @@ class Order(NamedTuple):
 class FailoverState:
     """What was decided before, by IMU."""
 
-    orders: dict[int, Order] = field(default_factory=dict)
-    """Of those that are, or may be, out of use by our hand."""
-    seen: dict[int, bool] = field(default_factory=dict)
-    """What each parameter said last."""
+    orders: dict[int, Order] = field(default_factory=dict)  # of those that are, or may be, out of use by our hand
+    seen: dict[int, bool] = field(default_factory=dict)  # what each parameter said last
     left_alone: set[int] = field(default_factory=set)
     """Those that somebody else has taken out or put back: left alone until the vehicle is disarmed."""
     answered: dict[int, int] = field(default_factory=dict)
@@ -109,12 +94,10 @@ class FailoverState:
 class Action(NamedTuple):
     """What is to be done."""
 
-    kind: str
-    """``set``; or what is to be told: ``out``, ``back``, ``not out``, ``not back``, ``changed``, ``stays``."""
+    kind: str  # ``set``; or what is to be told: ``out``, ``back``, ``not out``, ``not back``, ``changed``, ``stays``
     unit: int
     use: bool = False
-    why: str = ""
-    """Why an IMU that was declared stays in use."""
+    why: str = ""  # why an IMU that was declared stays in use
 
 
 def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:

@@ -22,14 +22,10 @@ from typing import NamedTuple
 
 Vector = tuple[float, float, float]
 
-STANDARD_GRAVITY = 9.80665
-"""m/s^2."""
-GYRO_UPDATED = 0b111000
-"""Bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new."""
-ARDUPILOT, PX4 = 3, 12
-"""MAV_AUTOPILOT of a HEARTBEAT."""
-NO_AUTOPILOT = 8
-"""The same of a component that is none."""
+STANDARD_GRAVITY = 9.80665  # m/s^2
+GYRO_UPDATED = 0b111000  # bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new
+ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT of a HEARTBEAT
+NO_AUTOPILOT = 8  # the same of a component that is none
 MOST_UNITS = 4
 
 
@@ -38,24 +34,15 @@ class ImuMessage(NamedTuple):
 
     name: str
     number: int
-    kind: str
-    """Messages of one kind tell several units of one sort apart."""
-    size: int
-    """Bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away."""
-    head: struct.Struct
-    """Time, acceleration and rate, three each, with which it begins."""
-    microseconds: int
-    """In one unit of the time."""
-    gyro: float
-    """rad/s in one unit of the rate."""
-    acceleration: float
-    """m/s^2 in one unit of the acceleration."""
-    unit: int = -1
-    """Of which IMU, from 0; -1: it says itself."""
-    unit_at: int = -1
-    """Where it does, bytes."""
-    updated_at: int = -1
-    """Where it says which fields are new, bytes; -1: nowhere."""
+    kind: str  # messages of one kind tell several units of one sort apart
+    size: int  # bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away.
+    head: struct.Struct  # time, acceleration and rate, three each, with which it begins
+    microseconds: int  # in one unit of the time
+    gyro: float  # rad/s in one unit of the rate
+    acceleration: float  # m/s^2 in one unit of the acceleration
+    unit: int = -1  # of which IMU, from 0; -1: it says itself
+    unit_at: int = -1  # where it does, bytes
+    updated_at: int = -1  # where it says which fields are new, bytes; -1: nowhere
 
 
 _MILLI = (1e-3, 1e-3 * STANDARD_GRAVITY)
@@ -73,8 +60,7 @@ MESSAGES: dict[int, ImuMessage] = {
     )
 }
 """By message id."""
-IMU_MESSAGES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")
-"""Kinds of messages, the finest first."""
+IMU_MESSAGES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")  # kinds of messages, the finest first
 RESOLUTION = {
     "SCALED_IMU": "1 mrad/s, 1 ms",
     "RAW_IMU": "1 mrad/s, 1 us",
@@ -91,14 +77,10 @@ def numbers(kind: str) -> tuple[int, ...]:
 class ImuSample(NamedTuple):
     """One sample of one IMU, in the body frame of REP-103: x to the front, y to the left, z up."""
 
-    unit: int
-    """From 0."""
-    stamp: int
-    """ns, as read on the clock of the autopilot."""
-    rate: Vector
-    """rad/s."""
-    acceleration: Vector
-    """m/s^2."""
+    unit: int  # from 0
+    stamp: int  # ns, as read on the clock of the autopilot
+    rate: Vector  # rad/s
+    acceleration: Vector  # m/s^2
 
 
 def read(number: int, payload: bytes) -> ImuSample | None:
@@ -119,8 +101,7 @@ def read(number: int, payload: bytes) -> ImuSample | None:
     return ImuSample(unit, stamp, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
 
 
-SCALED, RAW = 26, 27
-"""Messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it."""
+SCALED, RAW = 26, 27  # messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it
 
 
 def stands_in(number: int, autopilot: int) -> bool:

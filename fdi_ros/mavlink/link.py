@@ -28,12 +28,9 @@ from fdi_ros.mavlink.clock import NS
 from fdi_ros.system.installation import require
 from fdi_ros.system.trusted_file import open_regular
 
-MOST_AT_ONCE = 1 << 15
-"""Bytes that are read before others get their turn."""
-MOST_WAITING = 1 << 12
-"""Bytes that wait to be sent: half a second of a slow line. What is more is dropped."""
-RETRY = NS
-"""Between two attempts to open a link, ns."""
+MOST_AT_ONCE = 1 << 15  # bytes that are read before others get their turn
+MOST_WAITING = 1 << 12  # bytes that wait to be sent: half a second of a slow line. What is more is dropped.
+RETRY = NS  # between two attempts to open a link, ns
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN)
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
@@ -44,15 +41,11 @@ class Link(ABC):
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self.trouble = "not open yet"
-        """Why it is not open, in words; empty: it is."""
-        self.dropped = 0
-        """Messages that could not be sent."""
-        self.opened = 0
-        """How often it was opened."""
+        self.trouble = "not open yet"  # why it is not open, in words; empty: it is
+        self.dropped = 0  # messages that could not be sent
+        self.opened = 0  # how often it was opened
         self._attempt = 0
-        self._handle: Any = None
-        """The socket or the serial port; None: there is none."""
+        self._handle: Any = None  # the socket or the serial port; None: there is none.
         self._waiting = bytearray()
 
     @abstractmethod
@@ -250,16 +243,11 @@ def open_link(url: str) -> Link:
 
 
 KEY_BYTES = 32
-BLOCK = 13
-"""Bytes of a signature: link id, time, and 6 of the digest."""
-EPOCH = 1_420_070_400
-"""s: times count from 2015 on, in steps of 10 us."""
-STEPS = 100_000
-"""Of time, in a second."""
-LATE = 60 * STEPS
-"""A sender not heard before may be so far behind."""
-_SENDERS = 16
-"""Links of the one autopilot that are kept apart, at most."""
+BLOCK = 13  # bytes of a signature: link id, time, and 6 of the digest
+EPOCH = 1_420_070_400  # s: times count from 2015 on, in steps of 10 us
+STEPS = 100_000  # of time, in a second
+LATE = 60 * STEPS  # a sender not heard before may be so far behind
+_SENDERS = 16  # links of the one autopilot that are kept apart, at most
 
 
 def now_in_steps(seconds: float) -> int:
@@ -293,8 +281,7 @@ class Verifier:
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._latest: dict[tuple[int, int, int], int] = {}
-        """Time of the last message, by link id, system and component."""
+        self._latest: dict[tuple[int, int, int], int] = {}  # time of the last message, by link id, system and component
         self.behind = 0.0
         """s by which the message of the last check was too old, though signed with the key; 0: it was not."""
 

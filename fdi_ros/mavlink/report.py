@@ -20,8 +20,7 @@ from fdi_ros.mavlink.streams import ENOUGH
 from fdi_ros.mavlink.vehicle import UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
-LOSSY = 0.05
-"""Share of messages lost on the link that is worth a warning."""
+LOSSY = 0.05  # share of messages lost on the link that is worth a warning
 
 
 class Reporter:
@@ -119,20 +118,13 @@ class Reporter:
         )
 
 
-CRITICAL, WARNING, INFO = 2, 4, 6
-"""MAV_SEVERITY."""
-LENGTH = 50
-"""Characters of a STATUSTEXT."""
-EVERY = NS
-"""Between two texts, ns."""
-AT_ONCE = 5
-"""Texts that may follow one another at once after a quiet time."""
-SETTLE = NS // 5
-"""What changes within so long is put together, ns."""
-SILENT = 3 * NS
-"""A monitor that reports nothing for so long is silent, ns."""
-FROZEN = "FROZEN"
-"""In place of the state of a channel that is not declared: its unit gives old values."""
+CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
+LENGTH = 50  # characters of a STATUSTEXT
+EVERY = NS  # between two texts, ns
+AT_ONCE = 5  # texts that may follow one another at once after a quiet time
+SETTLE = NS // 5  # what changes within so long is put together, ns
+SILENT = 3 * NS  # a monitor that reports nothing for so long is silent, ns
+FROZEN = "FROZEN"  # in place of the state of a channel that is not declared: its unit gives old values
 _STATES = {
     "FAULTY": (CRITICAL, "faulty, left out"),
     "AMBIGUOUS": (CRITICAL, "one of them faulty"),
@@ -161,13 +153,11 @@ class Announcer:
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
         self._now: dict[str, tuple[str, str]] = {**dict.fromkeys(channels, ("OK", "")), WHOLE: ("", "")}
         """State of each channel, with the set that it is one of, and what is wrong with the whole, empty: nothing."""
-        self._said = dict(self._now)
-        """The same as the ground station knows it."""
+        self._said = dict(self._now)  # the same as the ground station knows it
         self._apart = dict.fromkeys(channels, "")
         """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
         self._heard = 0
-        self._changed: int | None = None
-        """When the first of what has changed since the last texts did, ns."""
+        self._changed: int | None = None  # when the first of what has changed since the last texts did, ns
         self._tokens, self._filled = float(AT_ONCE), 0
 
     def hear(self, lines: Sequence[StatusLine], now: int) -> None:

@@ -17,26 +17,20 @@ from fdi_ros.mavlink.clock import NS
 
 SET_MESSAGE_INTERVAL = 511
 DEFAULT_INTERVAL = 0
-PATIENCE = NS
-"""So long an acknowledgement is waited for, ns."""
+PATIENCE = NS  # so long an acknowledgement is waited for, ns
 TRIES = 3
 AGAIN, AGAIN_REFUSED = 10 * NS, 60 * NS
 """What comes too slowly is asked for again after so long, and what was refused, ns."""
-ENOUGH = 0.8
-"""Of the rate asked for."""
-RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in progress", "cancelled")
-"""MAV_RESULT."""
+ENOUGH = 0.8  # of the rate asked for
+RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in progress", "cancelled")  # MAV_RESULT
 _HOPEFUL = ("not asked yet", RESULTS[5])
 
 
 @dataclass
 class _Wanted:
-    interval: int
-    """us; `DEFAULT_INTERVAL`: the autopilot's own."""
-    answer: str = _HOPEFUL[0]
-    """What the autopilot says to it."""
-    asked: int = 0
-    """When it was last asked for, ns."""
+    interval: int  # us; `DEFAULT_INTERVAL`: the autopilot's own
+    answer: str = _HOPEFUL[0]  # what the autopilot says to it
+    asked: int = 0  # when it was last asked for, ns
     tries: int = 0
 
 
@@ -45,8 +39,7 @@ class Streams:
 
     def __init__(self) -> None:
         self._wanted: dict[int, _Wanted] = {}
-        self._queue: dict[int, None] = {}
-        """Messages to be asked for, in this order."""
+        self._queue: dict[int, None] = {}  # messages to be asked for, in this order
         self._current: int | None = None
 
     def want(self, messages: Iterable[int], interval: int) -> None:

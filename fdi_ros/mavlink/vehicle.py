@@ -40,44 +40,28 @@ HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 AUTOPILOT_COMPONENT = 1
 GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128
 """MAV_TYPE, MAV_STATE and a bit of MAV_MODE_FLAG of a HEARTBEAT."""
-REAL32 = 9
-"""MAV_PARAM_TYPE; ArduPilot takes any, and knows its own."""
-LOST = 3 * NS
-"""An autopilot that says nothing for so long is lost, ns."""
-UNSYNCHRONISED = 2 * NS
-"""So long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns."""
-CHOICE = 3 * NS
-"""So long kinds of messages are looked at before one is chosen, ns."""
-OLDEST, NEWEST = 10 * NS, NS
-"""Samples older than this when they come, or so far in the future, are refused, ns."""
-STAND_IN = 2 * NS
-"""Without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns."""
-WINDOW = 2 * NS
-"""Time over which rates are measured, ns."""
-MOST_LATE = 8
-"""Messages late in a row after which the count has begun anew."""
-_PEERS = 8
-"""Addresses whose bytes are put together, at most."""
-_LEFT = 1 << 12
-"""Bytes that pymavlink's parser may carry on; it frees them only when it has used the very last."""
-LARGEST = 3.4e38
-"""Of a float that a message holds."""
+REAL32 = 9  # MAV_PARAM_TYPE; ArduPilot takes any, and knows its own.
+LOST = 3 * NS  # an autopilot that says nothing for so long is lost, ns
+UNSYNCHRONISED = 2 * NS  # so long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns
+CHOICE = 3 * NS  # so long kinds of messages are looked at before one is chosen, ns
+OLDEST, NEWEST = 10 * NS, NS  # samples older than this when they come, or so far in the future, are refused, ns
+STAND_IN = 2 * NS  # without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns
+WINDOW = 2 * NS  # time over which rates are measured, ns
+MOST_LATE = 8  # messages late in a row after which the count has begun anew
+_PEERS = 8  # addresses whose bytes are put together, at most
+_LEFT = 1 << 12  # bytes that pymavlink's parser may carry on; it frees them only when it has used the very last
+LARGEST = 3.4e38  # of a float that a message holds
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
     """What an autopilot is asked for."""
 
-    system: int = 0
-    """System id; 0: that of the first autopilot that is heard and gives gyros, until it is lost."""
-    component: int = 191
-    """Own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER."""
-    kind: str = ""
-    """Kind of messages to be used; empty: the one that shows the most units."""
-    rate: float = 50.0
-    """Hz."""
-    key: bytes = b""
-    """For signing; empty: nothing is signed, and signatures are not looked at."""
+    system: int = 0  # system id; 0: that of the first autopilot that is heard and gives gyros, until it is lost
+    component: int = 191  # own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER
+    kind: str = ""  # kind of messages to be used; empty: the one that shows the most units
+    rate: float = 50.0  # Hz
+    key: bytes = b""  # for signing; empty: nothing is signed, and signatures are not looked at
 
 
 @dataclass
@@ -85,18 +69,13 @@ class UnitTrack:
     """What was seen of one IMU."""
 
     received: int = 0
-    repeated: int = 0
-    """Samples at a time that was there already, or is past."""
-    impossible: int = 0
-    """Samples at times that cannot be."""
-    last: int = 0
-    """When the last sample came, ns."""
-    time: int = -1
-    """Time of the last sample on the autopilot's clock, ns."""
+    repeated: int = 0  # samples at a time that was there already, or is past
+    impossible: int = 0  # samples at times that cannot be
+    last: int = 0  # when the last sample came, ns
+    time: int = -1  # time of the last sample on the autopilot's clock, ns
     stamp: int = -1
     """Of the last sample that was given out, ns: later ones have later stamps, also where a better offset is found."""
-    arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
-    """When samples came, ns."""
+    arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))  # when samples came, ns
 
     def rate(self, now: int) -> float:
         """Return the samples a second of late."""
@@ -127,34 +106,24 @@ class Vehicle:
         self, settings: VehicleSettings, send: Callable[[bytes, Any], None], seconds: Callable[[], float]
     ) -> None:
         self.settings = settings
-        self.system = settings.system or None
-        """System id in use; None: no autopilot was heard yet."""
-        self.autopilot = NO_AUTOPILOT
-        """MAV_AUTOPILOT."""
-        self.kind = settings.kind
-        """Kind of messages in use; empty: not chosen yet."""
+        self.system = settings.system or None  # system id in use; None: no autopilot was heard yet.
+        self.autopilot = NO_AUTOPILOT  # MAV_AUTOPILOT
+        self.kind = settings.kind  # kind of messages in use; empty: not chosen yet
         self.sync, self.clock, self.streams = TimeSync(), BootClock(), Streams()
         self.units: dict[int, UnitTrack] = {}
-        self.magnetometers: set[int] = set()
-        """Units of which only a magnetometer came."""
-        self.others: dict[int, int] = {}
-        """Other autopilots on the link: when each was last heard, ns, by system id."""
+        self.magnetometers: set[int] = set()  # units of which only a magnetometer came
+        self.others: dict[int, int] = {}  # other autopilots on the link: when each was last heard, ns, by system id
         self.counts: Counter[str] = Counter()
-        self.events: deque[str] = deque(maxlen=32)
-        """What has happened, in words, for the log."""
-        self.heard = 0
-        """When it was last heard, ns; 0: never."""
+        self.events: deque[str] = deque(maxlen=32)  # what has happened, in words, for the log
+        self.heard = 0  # when it was last heard, ns; 0: never
         self.armed = self.gives_gyros = False
         """Whether its last heartbeat says that it is armed; whether it has sent any gyros."""
-        self.disarmed = 0
-        """For how long all its heartbeats have said that it is not armed, ns."""
-        self.begun = 0
-        """How often a conversation with it began: what it said of parameters before may no longer be so."""
+        self.disarmed = 0  # for how long all its heartbeats have said that it is not armed, ns
+        self.begun = 0  # how often a conversation with it began: what it said of parameters before may no longer be so
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
         """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
         self.peer: Any = None
-        self.behind = 0.0
-        """s by which the last signature that was too old was so."""
+        self.behind = 0.0  # s by which the last signature that was too old was so
         self._behind_from: Any = None
         self._mavlink = dialect()
         self._send, self._seconds = send, seconds
@@ -168,11 +137,9 @@ class Vehicle:
         self._seen: set[tuple[str, int]] = set()
         """Kinds of messages and units of which samples came, until a kind is chosen."""
         self._first_imu = self._found = self._beat = self._checked = 0
-        self._scaled_at = 0
-        """When SCALED_IMU of IMU 1 came last, or was asked for, ns."""
+        self._scaled_at = 0  # when SCALED_IMU of IMU 1 came last, or was asked for, ns
         self._sequence: int | None = None
-        self._late = 0
-        """Late messages in a row."""
+        self._late = 0  # late messages in a row
         self._lost = self._chosen = False
         self._disarmed_at: int | None = None
         self._interval = round(1e6 / settings.rate)

@@ -21,8 +21,7 @@ from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 
-DEFAULT_PROBABILITY = 1e-6
-"""Per sample."""
+DEFAULT_PROBABILITY = 1e-6  # per sample
 DEFAULT_RUN_LENGTH, MIN_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 2.0, 1e15
 """Samples; the default is one false alarm in 1000 hours at 100 Hz."""
 OPTIONS = ("run_length", "false_alarm_probability", "false_alarms_per_hour", "sample_rate")
@@ -225,12 +224,10 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
     return newer
 
 
-DETECTION = 0.99
-"""Probability with which the smallest detectable error is seen in one sample."""
+DETECTION = 0.99  # probability with which the smallest detectable error is seen in one sample
 IN_PLANE = 0.1
 """Directions in parity space whose third singular value is below are in one plane: mounts are known no better."""
-MOST_SETS = 4
-"""Sets of channels that are listed."""
+MOST_SETS = 4  # sets of channels that are listed
 
 
 def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:

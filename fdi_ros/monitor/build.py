@@ -30,12 +30,10 @@ from fdi_ros.sources import source_of
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
 and where all channels arrive in one message, s."""
-BOUND_IN_NOISE = 4.0
-"""Default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples."""
+BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples
 
 
-REST_NOISE = 4.0
-"""At rest the standard deviation of a channel is at most this many noise_std."""
+REST_NOISE = 4.0  # at rest the standard deviation of a channel is at most this many noise_std
 RETURN_PROBABILITY = 1e-6
 """Probability with which a healthy channel disagrees by chance in one sample, where it is to return."""
 

@@ -26,21 +26,15 @@ Values = tuple[tuple[str, str], ...]
 
 PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
-WHOLE = "monitor"
-"""Name of the line about all, after the prefix."""
-INPUT = "input "
-"""What the name of the line about an input topic begins with, after the prefix."""
-FAR_FROM_NOW = 1.0
-"""Stamps further than this from the clock of the monitor are not of this clock, s."""
-OLD = 86400.0
-"""Stamps that far behind the clock are of a recording, most likely, s."""
+WHOLE = "monitor"  # name of the line about all, after the prefix
+INPUT = "input "  # what the name of the line about an input topic begins with, after the prefix
+FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
+OLD = 86400.0  # stamps that far behind the clock are of a recording, most likely, s
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN = 4.0
-"""A delay between units is reported from so many of its standard deviations on."""
+CERTAIN = 4.0  # a delay between units is reported from so many of its standard deviations on
 LEAST_DELAY = 0.001
 """And from so much on, s: less is usual between drivers, and in turns of 10 rad/s^2 no more than 0.01 rad/s."""
-NEARLY = 0.8
-"""A bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault."""
+NEARLY = 0.8  # a bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault
 
 
 class Level(IntEnum):
@@ -85,32 +79,19 @@ class InputStatus:
     name: str
     topic: str
     received: int
-    rate: float
-    """Messages per second, lately."""
-    silent: float | None
-    """Since the last message, s; None: there was none yet."""
-    live: bool
-    """Whether it delivers, by the stamps of the others and by the clock."""
-    arrives: bool = False
-    """Whether messages arrive, of use or not."""
-    lag: float = 0.0
-    """How far its stamps stay behind those of the other inputs, s."""
-    max_lag: float = math.inf
-    """What is still one instant, s."""
-    offset: float | None = None
-    """Clock of the monitor minus its last stamp, s; None: its messages carry no stamp."""
-    counts: Mapping[str, int] = field(default_factory=dict)
-    """All that was not taken as it came, by kind."""
-    recent: Mapping[str, int] = field(default_factory=dict)
-    """The same since the last regular report."""
-    error: str = ""
-    """Why the last malformed message was refused."""
-    unstamped: bool = False
-    """Whether its headers have no stamp."""
-    parted: bool = False
-    """Whether its clock and that of the only other input that delivers went apart."""
-    sources: str = ""
-    """What is wrong with who publishes on it: more than one does, or another input reads it, too."""
+    rate: float  # messages per second, lately
+    silent: float | None  # since the last message, s; None: there was none yet.
+    live: bool  # whether it delivers, by the stamps of the others and by the clock
+    arrives: bool = False  # whether messages arrive, of use or not
+    lag: float = 0.0  # how far its stamps stay behind those of the other inputs, s
+    max_lag: float = math.inf  # what is still one instant, s
+    offset: float | None = None  # clock of the monitor minus its last stamp, s; None: its messages carry no stamp.
+    counts: Mapping[str, int] = field(default_factory=dict)  # all that was not taken as it came, by kind
+    recent: Mapping[str, int] = field(default_factory=dict)  # the same since the last regular report
+    error: str = ""  # why the last malformed message was refused
+    unstamped: bool = False  # whether its headers have no stamp
+    parted: bool = False  # whether its clock and that of the only other input that delivers went apart
+    sources: str = ""  # what is wrong with who publishes on it: more than one does, or another input reads it, too
 
 
 _LEVELS = {

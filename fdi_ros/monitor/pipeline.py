@@ -38,8 +38,7 @@ from fdi_ros.monitor.output import Event, Output, events_of
 from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.system.text import html_table
 
-EVENTS = 1024
-"""Events that the sample path writes down at once."""
+EVENTS = 1024  # events that the sample path writes down at once
 
 
 class Pipeline:
@@ -63,8 +62,7 @@ class Pipeline:
         self.channel_names = self.geometry.channel_names
         self.core = build_core(config, self.geometry, self.noise)
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
-        self.subsets = prepare_subsets(self.geometry, self.noise)
-        """What every set of channels can do, (2^n,)."""
+        self.subsets = prepare_subsets(self.geometry, self.noise)  # what every set of channels can do, (2^n,)
         self._events = allocate(EventRow, EVENTS)
         self._last_stamp = self.core["last_stamp"]
         self._in_flight = False

@@ -34,10 +34,8 @@ from fdi_ros.sources import SOURCES, Source, source_of
 # Whether they keep coming ---------------------------------------------------------------------------------------------
 
 
-RATE_TOLERANCE = 0.1
-"""Relative difference to the configured rate that is reported."""
-RATE_WINDOWS = 4
-"""So many measurements in a row must agree with each other: a pause or a loss is no rate."""
+RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
+RATE_WINDOWS = 4  # so many measurements in a row must agree with each other: a pause or a loss is no rate
 
 
 class Watchdog:
@@ -46,8 +44,7 @@ class Watchdog:
     def __init__(self, timeout: int) -> None:
         self.timeout = timeout
         self.silent = False
-        self.at = 0
-        """Clock time at which the counter last moved, to the precision of the checks, ns."""
+        self.at = 0  # clock time at which the counter last moved, to the precision of the checks, ns
         self._count = -1
 
     def check(self, count: int, now: int) -> bool:
@@ -67,8 +64,7 @@ class SampleRateCheck:
     """Compares the rate of the samples, by their stamps, with the configured one, Hz, which all times are made for."""
 
     def __init__(self, configured: float) -> None:
-        self.words = ""
-        """What is wrong, for people; empty: nothing is known to be."""
+        self.words = ""  # what is wrong, for people; empty: nothing is known to be
         self._configured = configured
         self._before: tuple[int, int] | None = None
         self._rates: deque[float] = deque(maxlen=RATE_WINDOWS)
@@ -111,12 +107,9 @@ class Receiver:
         config, n = pipeline.config, pipeline.geometry.n
         self.pipeline = pipeline
         self.source = source_of(config)
-        self.aligner = new_aligner(*self.source.alignment)
-        """Record of the alignment, (1,)."""
-        self.live = allocate(Live)
-        """Record of what was received, (1,)."""
-        self.errors = [""] * len(self.source.topics)
-        """Why the last malformed message of each topic was refused."""
+        self.aligner = new_aligner(*self.source.alignment)  # record of the alignment, (1,)
+        self.live = allocate(Live)  # record of what was received, (1,)
+        self.errors = [""] * len(self.source.topics)  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
         self.messages = {output: template.bytes for output, template in self.encoder.templates.items()}
@@ -222,8 +215,7 @@ class Receiver:
 # Compiled or loaded before the first ----------------------------------------------------------------------------------
 
 
-_FEW = 5
-"""Channels for a method that does not take six."""
+_FEW = 5  # channels for a method that does not take six
 
 
 def warm_detector(name: str) -> None:

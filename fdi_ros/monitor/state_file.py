@@ -31,19 +31,15 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.system import trusted_file
 
 FORMAT = 3
-BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
-"""What a state file begins with."""
-MAX_BYTES = 1 << 20
-"""Bytes of a state file at most; what is longer is damaged."""
+BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
+MAX_BYTES = 1 << 20  # bytes of a state file at most; what is longer is damaged
 PLAUSIBLE = 5.0
 """An error is believed up to so many of the standard deviations that it had beforehand, beside its walk since."""
 MOVED = 2.0
 """Errors are saved again when one is off the saved one by so many of its standard deviations, or known so many times
 better. In between, the random walk that the age stands for on restoring covers it."""
-DIGITS = 9
-"""Of the figures saved."""
-RETRY = 1.0
-"""What could not be saved is tried again after so long, s."""
+DIGITS = 9  # of the figures saved
+RETRY = 1.0  # what could not be saved is tried again after so long, s
 
 
 def configuration_hash(config: Config) -> str:
@@ -63,12 +59,9 @@ DAMAGED = (ValueError, KeyError, TypeError, AttributeError, RecursionError, Over
 class Errors:
     """Estimated errors of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
 
-    value: Array
-    """(N,)"""
-    covariance: Array
-    """(N, N)"""
-    late: Array
-    """(units,) delays taken off the stamps, s."""
+    value: Array  # (N,)
+    covariance: Array  # (N, N)
+    late: Array  # (units,) delays taken off the stamps, s
 
     @classmethod
     def of(cls, detector: Detector) -> Errors | None:
@@ -128,14 +121,10 @@ class Errors:
 class SavedState:
     """What outlives the process, in the fields of the file; channels by name."""
 
-    bias: dict[str, float] | None
-    """rad/s; None: being learned."""
-    errors: Errors | None
-    """What is estimated of the errors of the sensors; None: nothing yet, or by no method."""
-    in_motion: bool
-    """Whether the biases are as given, after a start in motion."""
-    known: list[str]
-    """Channels whose bias is known."""
+    bias: dict[str, float] | None  # rad/s; None: being learned.
+    errors: Errors | None  # what is estimated of the errors of the sensors; None: nothing yet, or by no method.
+    in_motion: bool  # whether the biases are as given, after a start in motion
+    known: list[str]  # channels whose bias is known
     declared: dict[str, Any]
     """``faulty``: channels declared faulty, and why, one of `WHY`; ``ambiguous``: a set of which one is faulty."""
 
@@ -236,12 +225,9 @@ class StateFile:
             raise ConfigError(f"state_max_age is {max_age:g} s, expected > 0 s")
         self.path = path
         self.max_age = max_age
-        self.words = "not read yet"
-        """What became of the file, for people."""
-        self.is_rejected = False
-        """Whether there is a file that was not taken over; the next save moves it aside."""
-        self.failed = False
-        """Whether the state could not be saved when that was last tried."""
+        self.words = "not read yet"  # what became of the file, for people
+        self.is_rejected = False  # whether there is a file that was not taken over; the next save moves it aside
+        self.failed = False  # whether the state could not be saved when that was last tried
         self._kept: SavedState | None = None
         self._not_before = 0.0
 

@@ -47,12 +47,10 @@ class Condition:
     """One condition, as it was written."""
 
     text: str
-    name: str
-    """Of a quantity, or of a state of channels."""
+    name: str  # of a quantity, or of a state of channels
     sign: str = ""
     bound: float = math.nan
-    channels: tuple[str, ...] = ()
-    """That are asked for: one, or those of a unit; empty: it is about a quantity."""
+    channels: tuple[str, ...] = ()  # that are asked for: one, or those of a unit; empty: it is about a quantity
 
     def reasons(self, judgement: Judgement) -> list[str]:
         """Return why it does not hold, one line per reason; empty: it does."""

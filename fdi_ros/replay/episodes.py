@@ -23,8 +23,7 @@ from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""
-HOLE = 1.0
-"""A fault is not injected where samples are missing for longer than this while it is watched, s."""
+HOLE = 1.0  # a fault is not injected where samples are missing for longer than this while it is watched, s
 
 
 class Stretches:
@@ -57,13 +56,10 @@ DECLARED = ("FAULTY", "AMBIGUOUS")
 class Step:
     """Who was declared how from a time on, within an episode."""
 
-    at_s: float
-    """s from the first message."""
-    state: str
-    """FAULTY: every one of the channels; AMBIGUOUS: one of them; STALE: they give nothing."""
+    at_s: float  # s from the first message
+    state: str  # FAULTY: every one of the channels; AMBIGUOUS: one of them; STALE: they give nothing.
     channels: tuple[str, ...]
-    who: str
-    """The channels in words."""
+    who: str  # the channels in words
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,8 @@ class Candidate:
     """A channel that would explain what was seen, and how large its error then was."""
 
     channel: str
-    axis: str
-    """Of the body: x, -y, or a direction."""
-    size: Size | None
-    """None: the others do not tell."""
+    axis: str  # of the body: x, -y, or a direction
+    size: Size | None  # none: the others do not tell
 
 
 @dataclass(frozen=True)
@@ -82,8 +76,7 @@ class Apart:
     """Two channels that alone measure one axis, and by how much they differ."""
 
     channels: tuple[str, ...]
-    who: str
-    """The two in words."""
+    who: str  # the two in words
     size: Size
 
 
@@ -91,14 +84,10 @@ class Apart:
 class RateMeanwhile:
     """What the fused rate did during an episode."""
 
-    published: float
-    """Share of the samples with a rate."""
-    std_before_rad_s: float | None
-    """Root of the trace of its covariance half a second before; None: there was no rate."""
-    std_rad_s: float | None
-    """The same on average during the episode."""
-    level_rad_s: float | None
-    """Largest protection level of an axis meanwhile; None: there was a sample without one."""
+    published: float  # share of the samples with a rate
+    std_before_rad_s: float | None  # root of the trace of its covariance half a second before; None: there was no rate.
+    std_rad_s: float | None  # the same on average during the episode
+    level_rad_s: float | None  # largest protection level of an axis meanwhile; None: there was a sample without one.
 
 
 @dataclass(frozen=True)
@@ -106,45 +95,32 @@ class Evidence:
     """What the declaration rests on."""
 
     reason: str
-    ratio: float | None
-    """Largest statistic, as a share of its threshold; None: no sample was judged."""
-    alarms: int
-    """Samples with an alarm."""
-    last_alarm_s: float | None
-    """Last sample with an alarm, s from the first message."""
+    ratio: float | None  # largest statistic, as a share of its threshold; None: no sample was judged.
+    alarms: int  # samples with an alarm
+    last_alarm_s: float | None  # last sample with an alarm, s from the first message
 
 
 @dataclass(frozen=True)
 class Episode:
     """A fault as the monitor told of it, from its first declaration on; times in s from the first message."""
 
-    stretch: int
-    """Number of the stretch it lies in, from 1."""
-    state: str
-    """What it came to: FAULTY, AMBIGUOUS or STALE."""
-    channels: tuple[str, ...]
-    """All that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went."""
-    who: str
-    """The channels in words."""
+    stretch: int  # number of the stretch it lies in, from 1
+    state: str  # what it came to: FAULTY, AMBIGUOUS or STALE
+    channels: tuple[str, ...]  # all that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went.
+    who: str  # the channels in words
     start_s: float
-    since_s: float
-    """Since when it has been these channels, in this state."""
-    end_s: float
-    """When nothing of it stood any more, or the end of the stretch."""
-    stands: bool
-    """It stood at the end of the stretch."""
-    steps: tuple[Step, ...]
-    """How it came to that, the last one included."""
+    since_s: float  # since when it has been these channels, in this state
+    end_s: float  # when nothing of it stood any more, or the end of the stretch
+    stands: bool  # it stood at the end of the stretch
+    steps: tuple[Step, ...]  # how it came to that, the last one included
     candidates: tuple[Candidate, ...]
     """What explains it: the channels above, and how large their errors were; one by one."""
     apart: Apart | None
     """AMBIGUOUS, where two channels alone measure an axis: the two that surely differ, and by how much."""
     evidence: Evidence
     rate: RateMeanwhile
-    words: str = ""
-    """The whole in one sentence."""
-    injected: tuple[str, ...] = ()
-    """Injected faults that explain it."""
+    words: str = ""  # the whole in one sentence
+    injected: tuple[str, ...] = ()  # injected faults that explain it
 
     @property
     def duration_s(self) -> float:
@@ -166,14 +142,11 @@ class Episode:
 class Stretch:
     """A part of a recording without a long gap, judged as a recording of its own."""
 
-    start_s: float
-    """s from the first message."""
+    start_s: float  # s from the first message
     end_s: float
     samples: int
-    judged: int
-    """Samples that were judged."""
-    watched_s: float
-    """Time that was judged while nothing stood declared, s."""
+    judged: int  # samples that were judged
+    watched_s: float  # time that was judged while nothing stood declared, s
 
 
 @dataclass(frozen=True)
@@ -181,10 +154,8 @@ class Story:
     """All that happened in a recording."""
 
     stretches: tuple[Stretch, ...]
-    episodes: tuple[Episode, ...]
-    """In the order of time; the first ones where there are very many."""
-    more: int = 0
-    """Episodes beyond these."""
+    episodes: tuple[Episode, ...]  # in the order of time; the first ones where there are very many
+    more: int = 0  # episodes beyond these
 
     @property
     def declared(self) -> list[Episode]:
@@ -197,19 +168,15 @@ class Story:
         return [(a.end_s, b.start_s) for a, b in zip(self.stretches, self.stretches[1:], strict=False)]
 
 
-NOTHING_HAPPENED = Story((), ())
-"""Of a recording without samples."""
+NOTHING_HAPPENED = Story((), ())  # of a recording without samples
 
 
 # In words -------------------------------------------------------------------------------------------------------------
 
 
-MOST_TOLD = 5
-"""Episodes told of at the top; all are in the tables."""
-TOO_SMALL = "too small to measure"
-"""A size that is below its standard error."""
-FEW_CHANNELS = 3
-"""Sets up to this size are told channel by channel."""
+MOST_TOLD = 5  # episodes told of at the top; all are in the tables
+TOO_SMALL = "too small to measure"  # a size that is below its standard error
+FEW_CHANNELS = 3  # sets up to this size are told channel by channel
 
 
 def size_words(size: Size | None, unit: Unit = RADIANS) -> str:

@@ -24,8 +24,7 @@ from fdi_ros.replay.outcomes import ALONE, finite, outcome_of
 from fdi_ros.replay.size import SQUARED
 from fdi_ros.replay.summary import UNCHECKED_STATES, ChannelResult, FaultEffect, Outcome, Scores, StateChange
 
-GRACE = 1.0
-"""A declaration this long after the stop of a fault is attributed to it, s."""
+GRACE = 1.0  # a declaration this long after the stop of a fault is attributed to it, s
 _DECLARED = (*ALONE, ChannelState.AMBIGUOUS)
 _UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES])
 """By state, whether nothing checks a channel."""
@@ -38,16 +37,12 @@ class Followed:
         self.fault, self.channels = fault, channels
         struck = tuple(names[i] for i in channels)
         self._asked = Outcome(fault.channel, struck, fault.kind.name, fault.size, fault.start, finite(fault.stop))
-        self._found: dict[str, Any] = {}
-        """What is to be changed of that."""
+        self._found: dict[str, Any] = {}  # what is to be changed of that
         self.declared_before: bool | None = None
         """Whether all its channels were declared when it began; None: it has not begun."""
-        self.detected_stamp: int | None = None
-        """Of the first declaration that names one of its channels, ns."""
-        self._declared: dict[str, bool] = {}
-        """Channels that were declared, and whether by themselves."""
-        self.false: set[str] = set()
-        """States in which healthy channels were declared while it lasted."""
+        self.detected_stamp: int | None = None  # of the first declaration that names one of its channels, ns
+        self._declared: dict[str, bool] = {}  # channels that were declared, and whether by themselves
+        self.false: set[str] = set()  # states in which healthy channels were declared while it lasted
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
         """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
@@ -91,16 +86,14 @@ class Evaluation:
         self._unexplained: list[StateChange] = []
         self._events: list[StateChange] = []
         self.samples = self._judged = self._with_rate = self._alarms = 0
-        self._unchecked = np.zeros(geometry.n)
-        """Samples in which nothing checked the channel."""
+        self._unchecked = np.zeros(geometry.n)  # samples in which nothing checked the channel
         self._residuals = np.zeros((2, geometry.n))
         """Of each channel while it is OK: sum of the squared residuals, and their number."""
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
         self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
-        self.last = 0
-        """Stamp of the last sample, ns."""
+        self.last = 0  # stamp of the last sample, ns
         self._effects = np.zeros((2, 3))
         """Of the faults before and after detection, and without a monitor: sum of the squares, and their number."""
 

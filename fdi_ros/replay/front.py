@@ -25,8 +25,7 @@ from fdi_ros.setup.starting_config import assumed_config, starting_config_of
 Source = str | PathLike[str]
 ConfigSource = Config | str | PathLike[str] | None
 """Settings, or a parameter file; None: what ``fdi inspect`` writes for the recording."""
-Injected = Fault | str | Mapping[str, Any]
-"""A fault, or its words, or a mapping with the same keys."""
+Injected = Fault | str | Mapping[str, Any]  # a fault, or its words, or a mapping with the same keys
 
 
 def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:

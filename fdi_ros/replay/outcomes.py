@@ -18,23 +18,17 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.output import Output
 
-ALONE = (ChannelState.FAULTY, ChannelState.STALE)
-"""States by which a channel is declared by itself."""
+ALONE = (ChannelState.FAULTY, ChannelState.STALE)  # states by which a channel is declared by itself
 
 
 class OutcomeKind(str, Enum):
     """What came of one injected fault; the values are the words of the files that hold outcomes."""
 
-    ISOLATED = "named"
-    """The faulty channel was declared by itself."""
-    AMBIGUOUS = "in a set"
-    """It was one of an ambiguity group, and not declared by itself."""
-    MISSED = "silent"
-    """Nothing was declared."""
-    FALSE_GROUP = "false set"
-    """Only groups without it were declared."""
-    FALSE_ISOLATION = "wrong"
-    """A healthy channel was declared by itself."""
+    ISOLATED = "named"  # the faulty channel was declared by itself
+    AMBIGUOUS = "in a set"  # it was one of an ambiguity group, and not declared by itself
+    MISSED = "silent"  # nothing was declared
+    FALSE_GROUP = "false set"  # only groups without it were declared
+    FALSE_ISOLATION = "wrong"  # a healthy channel was declared by itself
 
 
 def outcome_of(false_isolation: bool, isolated: bool, in_set: bool, false_group: bool) -> OutcomeKind:
@@ -52,10 +46,8 @@ class Scored(NamedTuple):
     """What came of one fault, and when."""
 
     outcome: OutcomeKind
-    isolated_after: float
-    """Until the channel was declared by itself, s; inf: it was not."""
-    detected_after: float
-    """Until it was declared by itself or in a group, s; inf: it was not."""
+    isolated_after: float  # until the channel was declared by itself, s; inf: it was not
+    detected_after: float  # until it was declared by itself or in a group, s; inf: it was not
 
 
 def standing(output: Output) -> tuple[Mask, Mask]:
@@ -89,8 +81,7 @@ def _first(declared: Mask, since: Array) -> float:
 # Counts of trials, which add up whatever blocks they come from, and the estimates made of them ------------------------
 
 
-Z95 = 1.959963984540054
-"""Normal quantile of a two-sided 95 % interval."""
+Z95 = 1.959963984540054  # normal quantile of a two-sided 95 % interval
 
 
 def added(a: Any, b: Any) -> Any:

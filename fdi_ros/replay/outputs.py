@@ -104,10 +104,8 @@ class InputWatch:
         )
 
 
-NODE = "/fdi_node"
-"""What ``~`` stands for: the node as it is called by default, in no namespace."""
-DIAGNOSTICS_PERIOD = 1_000_000_000
-"""ns."""
+NODE = "/fdi_node"  # what ``~`` stands for: the node as it is called by default, in no namespace
+DIAGNOSTICS_PERIOD = 1_000_000_000  # ns
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -126,10 +124,8 @@ class OutputBag(Sink):
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
         self._encoder = Encoder(config.body_frame, channels)
         self._watch = InputWatch(config)
-        self._shift = 0
-        """Stamp of a sample minus that of its message, ns."""
-        self._later = 0
-        """Time of recording minus stamp, ns: what is written stands beside the message that brought it."""
+        self._shift = 0  # stamp of a sample minus that of its message, ns
+        self._later = 0  # time of recording minus stamp, ns: what is written stands beside the message that brought it
 
     def __enter__(self) -> OutputBag:
         self._writer.open()

@@ -40,20 +40,14 @@ from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system.installation import there
 from fdi_ros.system.text import date_of
 
-HOLE = 1.0
-"""No curve is drawn over a longer time without a sample, s."""
-SEES_AXIS = 0.3
-"""Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
-LOG_FROM = 10.0
-"""A statistic that exceeds its threshold by more is shown on a logarithmic scale."""
+HOLE = 1.0  # no curve is drawn over a longer time without a sample, s
+SEES_AXIS = 0.3  # share of a body axis in a channel's own axis from which on the channel's reading of it is shown
+LOG_FROM = 10.0  # a statistic that exceeds its threshold by more is shown on a logarithmic scale
 _AXES = "xyz"
 _INK = "var(--text)"
-MOST_ROWS = 1000
-"""Of the table of events; the first ones."""
-MOST_CARDS = 200
-"""Episodes shown; JSON has all."""
-SHOWN_AROUND = 2.0
-"""What the link of an episode shows before and after it, at least, s."""
+MOST_ROWS = 1000  # of the table of events; the first ones
+MOST_CARDS = 200  # episodes shown; JSON has all.
+SHOWN_AROUND = 2.0  # what the link of an episode shows before and after it, at least, s
 
 
 class Report(Sink):
@@ -75,8 +69,7 @@ class Report(Sink):
         self._first_states: list[str] = []
         self._spectrum = Spectrum(self.names, rate) if there("scipy") else None
         self._peak = {"statistic": 0.0, "threshold": 0.0}
-        self._origin: int | None = None
-        """Stamp that times count from, ns."""
+        self._origin: int | None = None  # stamp that times count from, ns
         self._last = 0.0
 
     def begin(self, samples: Samples) -> None:
@@ -291,10 +284,8 @@ def _plot(data: Sequence[Mapping[str, Any]], height: int, title: str, last: bool
 # States and marks over time ------------------------------------------------------------------------------------------
 
 
-MOST_CHANGES = 2000
-"""Changes of state shown at most."""
-MOST_MARKS = 200
-"""Declarations marked at most."""
+MOST_CHANGES = 2000  # changes of state shown at most
+MOST_MARKS = 200  # declarations marked at most
 IN_VIEW = 1.0
 """What residuals do so long after the begin of a fault, and after its detection, is not left off the scale, s."""
 STATES = {

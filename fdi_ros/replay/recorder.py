@@ -41,23 +41,19 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.size import CERTAIN, Batches
 
-Told = NDArray[np.uint8]
-"""States, of which those that say nothing are OK."""
+Told = NDArray[np.uint8]  # states, of which those that say nothing are OK
 ReasonOf = Callable[[set[int]], str]
 S = ChannelState
 _DECLARED, _TOLD, _HIDING = (S.AMBIGUOUS, S.FAULTY), (S.AMBIGUOUS, S.FAULTY, S.STALE), (S.STALE, S.SUSPECT)
 """States that declare; that an episode may have; that hide what is declared."""
 
 MOST_EPISODES = 1000
-MOST_STEPS = 20
-"""Of an episode: the first ones and the last."""
+MOST_STEPS = 20  # of an episode: the first ones and the last
 TOGETHER = 0.5
 """Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
 soon after a hole in the stream is part of the hole; and what the rate was before, is taken so long before, s."""
-_DIAGONAL = [0, 3, 5]
-"""Of a symmetric matrix, in its upper triangle."""
-HOLES = 0.1, 5.0
-"""A hole in the stream is longer than this, s, and than so many of the interval before."""
+_DIAGONAL = [0, 3, 5]  # of a symmetric matrix, in its upper triangle
+HOLES = 0.1, 5.0  # a hole in the stream is longer than this, s, and than so many of the interval before
 
 
 @dataclass
@@ -96,15 +92,13 @@ class Recorder:
         self._before: Told = np.zeros(geometry.n, dtype=np.uint8)
         self._tail = np.empty((0, 2))
         """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
-        self._interval = np.inf
-        """Last interval between two samples, s."""
+        self._interval = np.inf  # last interval between two samples, s
         self._open: list[_Open] = []
         self._episodes: list[Episode] = []
         self._more = 0
         self._stretches: list[Stretch] = []
         self._part: Stretch | None = None
-        self._resumed = np.nan
-        """First sample of the stretch or after the last hole in it, s; NaN: none has come."""
+        self._resumed = np.nan  # first sample of the stretch or after the last hole in it, s; NaN: none has come.
         self._gains: dict[tuple[bytes, int], Array | None] = {}
 
     def begin_stretch(self) -> None:

@@ -47,10 +47,8 @@ from fdi_ros.replay.summary import (
     Summary,
 )
 
-OnProgress = Callable[[float], None]
-"""Called with the share done, 0 to 1."""
-PORTION = 16384
-"""Samples judged at once where many are at hand: their outputs take little memory."""
+OnProgress = Callable[[float], None]  # called with the share done, 0 to 1
+PORTION = 16384  # samples judged at once where many are at hand: their outputs take little memory
 LAST_SAMPLES = 1_000_000_000
 """A channel whose values end no sooner than this before the recording delivers to its end, ns."""
 
@@ -102,8 +100,7 @@ class Walk:
 
     def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
         self.pipeline, self.sinks = pipeline, sinks
-        self.seconds = 0.0
-        """Spent in the pipeline."""
+        self.seconds = 0.0  # spent in the pipeline
         self._stretches = Stretches()
 
     def take(self, block: Block) -> None:
@@ -152,8 +149,7 @@ class Judge(Walk):
         super().__init__(pipeline, sinks)
         self.injector = injector
         self.evaluation = Evaluation(injector, pipeline.geometry)
-        self._intervals: list[tuple[float, int]] = []
-        """Of each piece: the usual one, ns, and how many samples have it."""
+        self._intervals: list[tuple[float, int]] = []  # of each piece: the usual one, ns, and how many samples have it
         self._recorder = Recorder(pipeline.geometry, pipeline.noise)
         self._degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
@@ -238,16 +234,12 @@ class Judge(Walk):
 class Request:
     """What is to be replayed."""
 
-    bag: Path
-    """rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file."""
+    bag: Path  # rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file
     config: Config
-    faults: tuple[Fault, ...] = ()
-    """To be injected."""
+    faults: tuple[Fault, ...] = ()  # to be injected
     start: float = 0.0
-    end: float = math.inf
-    """Part of the recording, s from its first message."""
-    period: int = 0
-    """The sinks look at the pipeline at multiples of this time of recording, ns; 0: never."""
+    end: float = math.inf  # part of the recording, s from its first message
+    period: int = 0  # the sinks look at the pipeline at multiples of this time of recording, ns; 0: never
 
 
 def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:

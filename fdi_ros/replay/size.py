@@ -20,51 +20,34 @@ from fdi_ros.model.samples import Array
 
 Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
 
-MOST = 512
-"""Batches kept; when there would be more, neighbours are put together."""
-FIRST_WIDTH = 0.1
-"""Of a batch, s."""
+MOST = 512  # batches kept; when there would be more, neighbours are put together
+FIRST_WIDTH = 0.1  # of a batch, s
 LONGER = 12
 """Batches that the standard error is taken from, put together of those kept: an error hangs together for less."""
-FEW = 4
-"""Batches from which on their scatter says something."""
-CERTAIN = 4.0
-"""A trend is one from so many of its standard errors on."""
-TREND = 0.3
-"""And from a change of such a share of the size on."""
-PASSED = 0.25
-"""An error has passed when it stays below such a share of what it was."""
-LASTING = 1.0
-"""Time over which the size at the declaration is taken, and for which an error must have stayed away, s."""
-ROUNDING = 1e-12
-"""Share of a mean square that is rounding."""
-SMALL = 0.5
-"""A mean below such a share of the scatter is not what the error is."""
-LOUD = 3.0
-"""An error is noise where it scatters so many times as much as the channel's noise lets it."""
-SQUARED = 1e150
-"""Squares of anything smaller are finite, and so are sums of very many."""
+FEW = 4  # batches from which on their scatter says something
+CERTAIN = 4.0  # a trend is one from so many of its standard errors on
+TREND = 0.3  # and from a change of such a share of the size on
+PASSED = 0.25  # an error has passed when it stays below such a share of what it was
+LASTING = 1.0  # time over which the size at the declaration is taken, and for which an error must have stayed away, s
+ROUNDING = 1e-12  # share of a mean square that is rounding
+SMALL = 0.5  # a mean below such a share of the scatter is not what the error is
+LOUD = 3.0  # an error is noise where it scatters so many times as much as the channel's noise lets it
+SQUARED = 1e150  # squares of anything smaller are finite, and so are sums of very many
 
 
 @dataclass(frozen=True)
 class Size:
     """The error of one channel while it stood declared, if it alone was wrong."""
 
-    rad_s: float
-    """With its sign; of what varies or is noise, root mean square."""
-    std_rad_s: float
-    """Standard error of that: by chance, and by the scale factors and biases that are not known."""
+    rad_s: float  # with its sign; of what varies or is noise, root mean square
+    std_rad_s: float  # standard error of that: by chance, and by the scale factors and biases that are not known
     course: Course
     """steady; growing, shrinking (then the size is that at the declaration); varying; noisy; proportional to the rate
     along the axis; gone before the end."""
-    last_rad_s: float
-    """In the last batch."""
-    slope_rad_s2: float | None = None
-    """Of what grows or shrinks."""
-    share_of_rate: float | None = None
-    """Of what is proportional to the rate: an error of the scale factor."""
-    gone_s: float | None = None
-    """Since when it has stayed away, s from the first message."""
+    last_rad_s: float  # in the last batch
+    slope_rad_s2: float | None = None  # of what grows or shrinks
+    share_of_rate: float | None = None  # of what is proportional to the rate: an error of the scale factor
+    gone_s: float | None = None  # since when it has stayed away, s from the first message
 
 
 class Batches:
@@ -79,8 +62,7 @@ class Batches:
         self._width = FIRST_WIDTH
         # Of each batch: samples, sum, sum of squares.
         self._sums = np.zeros((3, MOST))
-        self._with_rate = np.zeros(2)
-        """Sum of error times rate, and of the squared rate."""
+        self._with_rate = np.zeros(2)  # sum of error times rate, and of the squared rate
 
     def add(self, time: Array, error: Array, rate: Array) -> None:
         """Take in samples (N,): time, s; error and rate along the axis, rad/s; what is not finite does not count."""

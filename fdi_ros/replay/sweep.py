@@ -49,8 +49,7 @@ class Swept:
     """One kind of fault in one size."""
 
     kind: str
-    items: tuple[tuple[str, str], ...]
-    """Its numbers by name, as given."""
+    items: tuple[tuple[str, str], ...]  # its numbers by name, as given
 
     @property
     def size(self) -> float | None:
@@ -118,12 +117,9 @@ class Plan:
     """What is injected, when, and how long it is watched."""
 
     faults: tuple[Swept, ...]
-    times: int = 10
-    """Spread over the recording, for every channel."""
-    within: float = 5.0
-    """A fault is watched, and is to be found, for this long, s."""
-    seed: int = 1
-    """Of signs and of the random kinds."""
+    times: int = 10  # spread over the recording, for every channel
+    within: float = 5.0  # a fault is watched, and is to be found, for this long, s
+    seed: int = 1  # of signs and of the random kinds
 
 
 # The recording as it is -----------------------------------------------------------------------------------------------
@@ -134,16 +130,11 @@ class Baseline:
     """What the monitor says of a recording as it is, nothing injected."""
 
     judgement: Judgement
-    is_judged: Mask
-    """(N,)"""
-    doubtful: Mask
-    """(N,) a channel stands declared, by itself or in a set, or gives nothing."""
-    speed: Array
-    """(N,) fused rate, rad/s; NaN: none."""
-    begins: float
-    """When it first judges, s; NaN: never."""
-    duration: float
-    """From the first sample to the last, s."""
+    is_judged: Mask  # (N,)
+    doubtful: Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
+    speed: Array  # (N,) fused rate, rad/s; NaN: none.
+    begins: float  # when it first judges, s; NaN: never.
+    duration: float  # from the first sample to the last, s
 
     @property
     def judged(self) -> float:
@@ -202,26 +193,19 @@ def _rows_at(block: Block, at: float, watch: float) -> slice:
 # One fault, from the monitor as it stood before -----------------------------------------------------------------------
 
 
-LEAD = 1000
-"""Samples before a fault that kinds with a memory may look back on."""
+LEAD = 1000  # samples before a fault that kinds with a memory may look back on
 
 
 @dataclass(frozen=True)
 class Onset:
     """A time from which faults are injected, and all that the monitor remembers right before."""
 
-    at: float
-    """s from the first sample."""
-    origin: int
-    """Stamp of the first sample, ns."""
-    core: NDArray[Any]
-    """(1,) `fdi_ros.core.records.Core`."""
-    states: dict[int, NDArray[Any]]
-    """Memory of the detector for each set of channels, by its bits."""
-    block: Block
-    """Samples from some before the onset to the end of the watch."""
-    row: int
-    """First sample of these that is faulty."""
+    at: float  # s from the first sample
+    origin: int  # stamp of the first sample, ns
+    core: NDArray[Any]  # (1,) `fdi_ros.core.records.Core`
+    states: dict[int, NDArray[Any]]  # memory of the detector for each set of channels, by its bits
+    block: Block  # samples from some before the onset to the end of the watch
+    row: int  # first sample of these that is faulty
 
 
 @dataclass(frozen=True)
@@ -297,18 +281,13 @@ class Subject:
     name: str
     config: Config
     block: Block
-    channels: tuple[str, ...] = ()
-    """Names of all channels; those excluded are tried with no fault."""
-    baseline: Baseline | None = None
-    """None: the monitor does not run."""
-    refused: str = ""
-    """Why it does not run, or judges nothing; empty: it does."""
-    times: tuple[float, ...] = ()
-    """At which faults began, s."""
+    channels: tuple[str, ...] = ()  # names of all channels; those excluded are tried with no fault
+    baseline: Baseline | None = None  # none: the monitor does not run
+    refused: str = ""  # why it does not run, or judges nothing; empty: it does
+    times: tuple[float, ...] = ()  # at which faults began, s
     skipped: tuple[float, ...] = ()
     """At which none did, as something stands declared without one, or a channel gives nothing, s."""
-    speeds: tuple[float, ...] = ()
-    """Largest fused rate while the faults of each time are watched, rad/s; 0: none."""
+    speeds: tuple[float, ...] = ()  # largest fused rate while the faults of each time are watched, rad/s; 0: none
     trials: tuple[Trial, ...] = ()
 
     @property

@@ -29,10 +29,8 @@ from fdi_ros.report.layout import (
     section_text,
 )
 
-WANTED = 0.95
-"""Share of the faults of a size that is to be found for the size to count as found."""
-NOT_ORDERED = ("saturation",)
-"""Kinds of which a larger size is no larger fault."""
+WANTED = 0.95  # share of the faults of a size that is to be found for the size to count as found
+NOT_ORDERED = ("saturation",)  # kinds of which a larger size is no larger fault
 
 
 class Delays(NamedTuple):
@@ -48,12 +46,9 @@ class Line:
 
     swept: Swept
     trials: int
-    counts: dict[str, int]
-    """Trials by outcome."""
-    named_after: Delays
-    """Until the channel was declared by itself."""
-    found_after: Delays
-    """Until it was, or was one of a set."""
+    counts: dict[str, int]  # trials by outcome
+    named_after: Delays  # until the channel was declared by itself
+    found_after: Delays  # until it was, or was one of a set
 
     def count(self, named: bool) -> int:
         """Trials in which the channel was named; otherwise also those in which it was in a set."""
@@ -186,8 +181,7 @@ def write_csv(file: IO[str], results: Iterable[Subject], plan: Plan) -> None:
 # In words and tables --------------------------------------------------------------------------------------------------
 
 
-MOVES = 0.1
-"""Rate that a vehicle which is not at rest reaches while a fault is watched, rad/s."""
+MOVES = 0.1  # rate that a vehicle which is not at rest reaches while a fault is watched, rad/s
 
 
 def smallest_hint(plan: Plan) -> str:
@@ -335,10 +329,8 @@ def _figures(one: Subject, plan: Plan) -> Section:
 # The page ------------------------------------------------------------------------------------------------------------
 
 
-LEAST_SIZES = 3
-"""Of a kind for a curve; the map and the table show fewer as well."""
-Curve = tuple[str, str, Callable[[Line], float]]
-"""Name, dash and values of a line of a plot."""
+LEAST_SIZES = 3  # of a kind for a curve; the map and the table show fewer as well
+Curve = tuple[str, str, Callable[[Line], float]]  # name, dash and values of a line of a plot
 
 
 def sweep_page(results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[str, str]) -> str:

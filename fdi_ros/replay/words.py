@@ -37,14 +37,11 @@ from fdi_ros.report.layout import (
 from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.system.text import shown
 
-MOSTLY_JUDGED = 0.5
-"""Share of the samples that must have been judged for a replay to say something."""
+MOSTLY_JUDGED = 0.5  # share of the samples that must have been judged for a replay to say something
 LONGEST_UNCHECKED = 0.5
 """Share of a recording that a channel may be unchecked for without a break where the recording is called healthy."""
-LASTING = 1.0
-"""What a channel does at the end for less, s, is not told: recordings end with the power."""
-NOISIER = 3.0
-"""A channel is much noisier than the others where its residual is so many times their median."""
+LASTING = 1.0  # what a channel does at the end for less, s, is not told: recordings end with the power
+NOISIER = 3.0  # a channel is much noisier than the others where its residual is so many times their median
 
 
 def verdict(summary: Summary, unit: Unit = RADIANS) -> Verdict:
@@ -259,8 +256,7 @@ def _time(seconds: float | None) -> str:
 # Tables for a terminal -----------------------------------------------------------------------------------------------
 
 
-_MOST_TOLD = 20
-"""Episodes told of with all that is known."""
+_MOST_TOLD = 20  # episodes told of with all that is known
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:

@@ -16,16 +16,11 @@ import numpy as np
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import RADIANS, Section, Unit, colour_of, drawn
 
-PIECE = 512
-"""Samples of one of the spectra that are averaged."""
-AT_ONCE = 16 * PIECE
-"""Samples of which spectra are taken at once."""
-AROUND = 31
-"""Frequencies whose median is the baseline next to a line."""
-STANDS_OUT = 4.0
-"""A line has so many times the amplitude density that is usual next to it."""
-FLAT = 0.8
-"""What has more than this share of the usual amplitude density at half the sample rate goes on beyond it."""
+PIECE = 512  # samples of one of the spectra that are averaged
+AT_ONCE = 16 * PIECE  # samples of which spectra are taken at once
+AROUND = 31  # frequencies whose median is the baseline next to a line
+STANDS_OUT = 4.0  # a line has so many times the amplitude density that is usual next to it
+FLAT = 0.8  # what has more than this share of the usual amplitude density at half the sample rate goes on beyond it
 MOST_LINES = 3
 
 

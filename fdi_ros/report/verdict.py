@@ -13,12 +13,9 @@ from typing import NamedTuple, TextIO
 class Severity(Enum):
     """How bad a verdict is; the value is its class on a page."""
 
-    GOOD = "good"
-    """Nothing to do."""
-    UNKNOWN = "unknown"
-    """The data do not tell, or not enough."""
-    BAD = "bad"
-    """Somebody must act."""
+    GOOD = "good"  # nothing to do
+    UNKNOWN = "unknown"  # the data do not tell, or not enough
+    BAD = "bad"  # somebody must act
 
     @property
     def exit_code(self) -> int:
@@ -35,8 +32,7 @@ class Verdict(NamedTuple):
     """One line, and how bad it is."""
 
     severity: Severity
-    words: str
-    """Begins with the word of the verdict in capitals: ``HEALTHY: ...``."""
+    words: str  # begins with the word of the verdict in capitals: ``HEALTHY: ...``
 
 
 def with_first_line_coloured(text: str, severity: Severity, stream: TextIO) -> str:

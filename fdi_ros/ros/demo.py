@@ -34,8 +34,7 @@ ROOT = Path(__file__).parents[2]
 BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=18"
 SUFFIX = "_faulty"
-PATIENCE = 1200.0
-"""The player waits so long for the monitor, which compiles first, on a slow and busy machine, s."""
+PATIENCE = 1200.0  # the player waits so long for the monitor, which compiles first, on a slow and busy machine, s
 
 
 class Observer(Watcher):
@@ -47,10 +46,8 @@ class Observer(Watcher):
     def __init__(self, begin: float, end: float, fault: Fault, struck: set[str]) -> None:
         super().__init__("/fdi_node", "fdi_demo")
         self.fault, self.struck = fault, struck
-        self.delays: dict[str, float] = {}
-        """Time from the first faulty message to the declaration, s, by channel."""
-        self.others: set[str] = set()
-        """Healthy channels that were declared faulty."""
+        self.delays: dict[str, float] = {}  # time from the first faulty message to the declaration, s, by channel
+        self.others: set[str] = set()  # healthy channels that were declared faulty
         self._start, self._end, self._now = begin + fault.start, end, 0.0
         self.create_subscription(Clock, "/clock", self._on_clock, DEEP)
 

@@ -29,8 +29,7 @@ from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qo
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.sources import source_of
 
-LOOK_PERIOD = 0.05
-"""How often it is looked whether an output has found its first subscriber, s."""
+LOOK_PERIOD = 0.05  # how often it is looked whether an output has found its first subscriber, s
 
 
 class InjectorNode(CheckedNode):

@@ -25,18 +25,12 @@ from fdi_ros.ros.messages import BoundedLog
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
-DEPTH = 256
-"""Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
-LONGEST = 0.05
-"""Others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood."""
-ARRIVES = 0.1
-"""A topic on which the last check but one found no message is silent, s."""
-FLOOD = 5000
-"""Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
-FLOOD_TIME = 5.0
-"""So long after a flood has begun it is not looked whether it is over, s."""
-NAMED = 4
-"""Publishers of one topic that are named at most."""
+DEPTH = 256  # messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz
+LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
+ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
+FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
+FLOOD_TIME = 5.0  # so long after a flood has begun it is not looked whether it is over, s
+NAMED = 4  # publishers of one topic that are named at most
 
 
 class InputQueue:
@@ -49,16 +43,12 @@ class InputQueue:
     """
 
     def __init__(self, node: Node) -> None:
-        self.subscriptions: dict[Subscription[Any], Callable[[bytes], None]] = {}
-        """Each with what takes its messages."""
+        self.subscriptions: dict[Subscription[Any], Callable[[bytes], None]] = {}  # each with what takes its messages
         self.flooded = False
-        self.taken = 0
-        """Messages that came by an event of the executor in this turn."""
+        self.taken = 0  # messages that came by an event of the executor in this turn
         self._node = node
-        self._waiting = 0
-        """Events of messages that were drained."""
-        self._until = 0.0
-        """Until when it counts as flooded, steady time, s."""
+        self._waiting = 0  # events of messages that were drained
+        self._until = 0.0  # until when it counts as flooded, steady time, s
 
     def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> None:
         """Subscribe to the bytes of the messages of a topic."""
@@ -130,8 +120,7 @@ class InputTopic:
         self._name = receiver.source.names[number]
         self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._was_heard = self._was_unstamped = False
-        self._sources = ""
-        """What is wrong with who publishes on it; empty: nothing."""
+        self._sources = ""  # what is wrong with who publishes on it; empty: nothing
         self._rate, self._reported_at, self._reported_messages = 0.0, 0, 0
         self._reported_counts: dict[str, int] = {}
 

@@ -49,22 +49,15 @@ from fdi_ros.ros.process import Stop, guarded, make_executor
 from fdi_ros.sources.channels import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
-NAMES = ("imu_1", "imu_2", "imu_3")
-"""Of units where the settings name none, each on the topic ``NAME/data_raw``."""
-WAIT = 0.02
-"""The link is waited for at most so long, and the executor gets its turn as often, s."""
+NAMES = ("imu_1", "imu_2", "imu_3")  # of units where the settings name none, each on the topic ``NAME/data_raw``
+WAIT = 0.02  # the link is waited for at most so long, and the executor gets its turn as often, s
 INJECTED = "_faulty"
 """What the injector adds to the name of a topic: on the bench the monitor has its inputs from there."""
-PARTING = 4.0
-"""So long the end waits on the ground for IMUs to be put back, s."""
-MOST_CALLS = 32
-"""Callbacks of a turn of the executor."""
-_SEND_EVERY = 10_000_000
-"""What is to be sent is looked for so often, ns."""
-_LARGEST = 1 << 17
-"""Bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000."""
-_VALUE_EVERY = 450_000_000
-"""Between two NAMED_VALUE_FLOAT of a name, ns."""
+PARTING = 4.0  # so long the end waits on the ground for IMUs to be put back, s
+MOST_CALLS = 32  # callbacks of a turn of the executor
+_SEND_EVERY = 10_000_000  # what is to be sent is looked for so often, ns
+_LARGEST = 1 << 17  # bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000
+_VALUE_EVERY = 450_000_000  # between two NAMED_VALUE_FLOAT of a name, ns
 
 
 class AutopilotNode(CheckedNode):
@@ -89,8 +82,7 @@ class AutopilotNode(CheckedNode):
         self._opened = self._valued = self._due = 0
         self._trouble = self._link.trouble
         self._time = SystemTime()
-        self._called = False
-        """Whether the executor has found something to do."""
+        self._called = False  # whether the executor has found something to do
         channels = config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
         self._announcer = Announcer(channels) if params["statustext"] else None
         self._sends_values: bool = params["named_values"]

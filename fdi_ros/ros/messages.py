@@ -24,10 +24,8 @@ from fdi_ros.system.text import shown
 DEPTH = 256
 """Messages kept until they are sent: after a moment of waiting many are worked at once, and a writer that keeps fewer
 drops some."""
-REPORT_PERIOD = 1.0
-"""From one regular report of a node to the next, s."""
-OVERRIDABLE = tuple(output.topic.name for output in OUTPUTS)
-"""Topics whose QoS may be overridden."""
+REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
+OVERRIDABLE = tuple(output.topic.name for output in OUTPUTS)  # topics whose QoS may be overridden
 
 
 def output_qos() -> QoSProfile:
@@ -75,10 +73,8 @@ def prefix_of(node: Node) -> str:
     return f"{node.get_fully_qualified_name().lstrip('/')}: "
 
 
-MOST = 20
-"""Lines of one severity in one period: what anybody may cause with requests hides no declaration."""
-PERIOD = 1.0
-"""s."""
+MOST = 20  # lines of one severity in one period: what anybody may cause with requests hides no declaration
+PERIOD = 1.0  # s
 
 
 class BoundedLog(logging.Handler):

@@ -35,8 +35,7 @@ from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.system.text import shown
 
-CHECK_PERIOD = 0.05
-"""How often silence is checked for, and the state saved if it has changed, s."""
+CHECK_PERIOD = 0.05  # how often silence is checked for, and the state saved if it has changed, s
 LATE = 2
 """Periods after which the timer is not waited for any longer: other events are before it in the executor's queue."""
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -54,8 +53,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self._state_file = StateFile(Path(file), age) if file else None
         self.log.take_over()
         self._running: Running | None = None
-        self._checked_at = time.monotonic()
-        """Steady time of the last check, s."""
+        self._checked_at = time.monotonic()  # steady time of the last check, s
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
         self._receiver: Receiver | None = self._build()
         """The monitor: there from the start, and again from configure to cleanup."""

@@ -30,8 +30,7 @@ from fdi_ros.system.text import shown
 
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
-MOST_PARAMETERS = 256
-"""In one request: several times what any node has."""
+MOST_PARAMETERS = 256  # in one request: several times what any node has
 _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
     "depth": (),
@@ -55,8 +54,7 @@ class CheckedNode(Node):
         self.inputs = InputQueue(self)
         self._fields = fields
         super().__init__(name, **options)
-        self.log = BoundedLog(self.get_logger())
-        """For lines that something outside may cause as often as it likes."""
+        self.log = BoundedLog(self.get_logger())  # for lines that something outside may cause as often as it likes
         # A file gives no type, and so no value, for an empty array.
         given = {name: [] if one.value is None else one.value for name, one in self._parameter_overrides.items()}
         self.config = Config.from_parameters(

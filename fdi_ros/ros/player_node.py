@@ -30,16 +30,13 @@ from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop, guarded
 from fdi_ros.sources import source_of
 
-PATIENCE = 0.1
-"""A request, or a signal, waits at most this long for its answer, s."""
-SETTLING = 0.3
-"""Time for the subscribers that were found to have found the player, s."""
+PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
+SETTLING = 0.3  # time for the subscribers that were found to have found the player, s
 LONGEST_STEP, DISORDER = 60.0, 1.0
 """s without a message, more of which is not waited for; s by which messages may stand out of order."""
 MOST_BEHIND = 0.01
 """A message is late by at most so much, s: what is due meanwhile fits into a queue of 256 also at 10 kHz."""
-CLOCK_STEP = 1_000_000
-"""/clock is published at most this often, ns of recorded time."""
+CLOCK_STEP = 1_000_000  # /clock is published at most this often, ns of recorded time
 
 
 class PlayerNode(CheckedNode):

@@ -29,10 +29,8 @@ from fdi_ros.ros.inputs import InputTopic
 from fdi_ros.ros.messages import REPORT_PERIOD, BoundedLog, diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.node import CheckedNode
 
-REMEMBERED = 4096
-"""Samples whose latency is remembered."""
-MAX_AT_ONCE = 20
-"""Reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
+REMEMBERED = 4096  # samples whose latency is remembered
+MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
 END_OF_TIME = 2**62
 """The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 QUIET = 5.0
@@ -53,12 +51,9 @@ class _Line:
     """The last line of the log about a channel."""
 
     state: ChannelState = ChannelState.UNCHECKED
-    until: float = 0.0
-    """When the next one may come, s."""
-    left_out: int = 0
-    """Changes since that were not logged."""
-    present: ChannelState = ChannelState.UNCHECKED
-    """State after these."""
+    until: float = 0.0  # when the next one may come, s
+    left_out: int = 0  # changes since that were not logged
+    present: ChannelState = ChannelState.UNCHECKED  # state after these
 
 
 class ChangeLog:
@@ -142,8 +137,7 @@ class Running:
         """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
         self._due = 0.0
         """Steady time of the next regular report, s: the first at once, however soon there is another monitor."""
-        self._at_once = MAX_AT_ONCE
-        """Changes that may still be reported at once before it."""
+        self._at_once = MAX_AT_ONCE  # changes that may still be reported at once before it
         self._restarts = receiver.restarts
         self._bias_outcome = -1
         self._shifts: dict[int, tuple[int, int]] = {}

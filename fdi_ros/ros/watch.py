@@ -20,10 +20,8 @@ from fdi_ros.system.text import shown
 if TYPE_CHECKING:
     from fdi_ros.ros.watch_node import Picture, Watcher
 
-PERIOD = 0.1
-"""How often the view is drawn, s."""
-REGULAR = 10.0
-"""Line by line, the state of the whole is reported at least so often, s."""
+PERIOD = 0.1  # how often the view is drawn, s
+REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
 
 
 def watch(node: str = "", plain: bool = False) -> int:
@@ -101,11 +99,9 @@ class LineReport:
     """Reports a monitor line by line: each change, each new state of the whole, and a line now and then."""
 
     def __init__(self) -> None:
-        self._changed = 0
-        """Changes reported."""
+        self._changed = 0  # changes reported
         self._caption, self._said = "", ("", False)
-        self._due = 0.0
-        """When the state of the whole is reported again, s since 1970."""
+        self._due = 0.0  # when the state of the whole is reported again, s since 1970
 
     def lines(self, picture: Picture) -> list[str]:
         """Return what is new since the last time."""

@@ -25,16 +25,14 @@ from fdi_ros.ros.messages import read_diagnostics
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
-SERVICE = "/relearn_bias"
-"""A node with this service is a monitor: it is there before the node is configured."""
+SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there before the node is configured
 SETTLE = 1.0
 """Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
 STATES = tuple(state.name for state in ChannelState)
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 SILENT = {"fused": 1.0, "diagnostics": 3.0}
 """After so long without a message the last one is no longer shown as the present state, s."""
-REMEMBERED = 50
-"""Changes of state."""
+REMEMBERED = 50  # changes of state
 
 
 class Change(NamedTuple):
@@ -49,29 +47,19 @@ class Change(NamedTuple):
 class Picture:
     """What a monitor has published so far; the figures are those of the last message of each kind."""
 
-    monitor: str = ""
-    """Full name of the node."""
-    caption: str = ""
-    """What else is to be known, above all; empty: nothing."""
-    waiting: str = "looking for a monitor"
-    """What is waited for; empty: nothing."""
-    since: float = field(default_factory=time.monotonic)
-    """When waiting for it began, s, monotonic clock."""
+    monitor: str = ""  # full name of the node
+    caption: str = ""  # what else is to be known, above all; empty: nothing
+    waiting: str = "looking for a monitor"  # what is waited for; empty: nothing
+    since: float = field(default_factory=time.monotonic)  # when waiting for it began, s, monotonic clock
     whole: StatusLine = field(default_factory=lambda: StatusLine(Level.STALE, WHOLE, ""))
-    channels: Mapping[str, StatusLine] = field(default_factory=dict)
-    """By name."""
+    channels: Mapping[str, StatusLine] = field(default_factory=dict)  # by name
     inputs: Sequence[StatusLine] = ()
-    rate: tuple[float, float, float] | None = None
-    """Fused rate, rad/s."""
-    heard: dict[str, float] = field(default_factory=dict)
-    """When the last message of each kind came, s, monotonic clock."""
+    rate: tuple[float, float, float] | None = None  # fused rate, rad/s
+    heard: dict[str, float] = field(default_factory=dict)  # when the last message of each kind came, s, monotonic clock
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    changed: int = 0
-    """How many changes there were."""
-    ignored: int = 0
-    """Messages that no monitor sends: nothing was taken from them."""
-    ignored_why: str = ""
-    """Why the last of them."""
+    changed: int = 0  # how many changes there were
+    ignored: int = 0  # messages that no monitor sends: nothing was taken from them
+    ignored_why: str = ""  # why the last of them
 
     def is_silent(self, kind: str) -> bool:
         """Whether messages of a kind have stopped, or never came."""
@@ -112,8 +100,7 @@ class Watcher(Node):
         super().__init__(name, start_parameter_services=False)
         self.picture = Picture(monitor)
         self._callbacks = {Imu: self._on_fused, DiagnosticArray: self._on_diagnostics}
-        self._heard_on: dict[type, Subscription[Any]] = {}
-        """By message type; empty: nothing is listened to yet."""
+        self._heard_on: dict[type, Subscription[Any]] = {}  # by message type; empty: nothing is listened to yet
         self._found = math.inf
 
     def look(self) -> None:

@@ -23,10 +23,8 @@ COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Lev
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
 """What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
-LATEST = 8
-"""Changes of state that are drawn."""
-WIDE = 90
-"""Columns from which the biases have room."""
+LATEST = 8  # changes of state that are drawn
+WIDE = 90  # columns from which the biases have room
 
 
 def draw(picture: Picture, width: int) -> Group:

@@ -27,8 +27,7 @@ from fdi_ros.core.path import receive_arrived
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.sources.source import ArraySource
 
-MAX_DIMENSIONS = 16
-"""An array whose layout has more dimensions is no message of ours."""
+MAX_DIMENSIONS = 16  # an array whose layout has more dimensions is no message of ours
 _DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES = range(FIRST_OWN, FIRST_OWN + 4)
 
 

@@ -54,15 +54,11 @@ def resolve(path: str) -> Path:
     return given
 
 
-BAGS = ("mcap", "rosbags", "lz4", "zstandard")
-"""What reads and writes recordings."""
+BAGS = ("mcap", "rosbags", "lz4", "zstandard")  # what reads and writes recordings
 PROGRESS = ("tqdm",)
-POOL = (*PROGRESS, "joblib")
-"""What shares work among processes."""
-REQUIRED = (*BAGS, *POOL)
-"""Of setup.py, for every installation by pip."""
-PACKAGES = {"serial": "pyserial"}
-"""What pip calls a library that it calls otherwise than Python does."""
+POOL = (*PROGRESS, "joblib")  # what shares work among processes
+REQUIRED = (*BAGS, *POOL)  # of setup.py, for every installation by pip
+PACKAGES = {"serial": "pyserial"}  # what pip calls a library that it calls otherwise than Python does
 
 
 def require(who: str, libraries: Sequence[str]) -> None:

@@ -32,16 +32,13 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 from fdi_ros.errors import StudyError
 from fdi_ros.system.installation import require
 
-Job = tuple[Any, ...]
-"""Arguments of one call; picklable."""
+Job = tuple[Any, ...]  # arguments of one call; picklable
 Function = Callable[..., Any]
 Lost = Callable[[int, str], Any]
 """Makes the result of a job that is given up, from its index and one line that says why."""
 
-MAX_DEATHS = 3
-"""Processes that a job may kill until it is given up; that a job on a cluster is tried again."""
-MOST_WORKERS = 256
-"""Processes on this machine."""
+MAX_DEATHS = 3  # processes that a job may kill until it is given up; that a job on a cluster is tried again
+MOST_WORKERS = 256  # processes on this machine
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
 ONE_THREAD = dict.fromkeys((*(f"{name}_NUM_THREADS" for name in _THREADS), "VECLIB_MAXIMUM_THREADS"), "1")
 """Environment of a worker process: as many processes as cores are enough."""
@@ -140,8 +137,7 @@ def _follow(parent: int) -> None:
 # On a cluster ---------------------------------------------------------------------------------------------------------
 
 
-CONNECT_TIMEOUT = 10.0
-"""s."""
+CONNECT_TIMEOUT = 10.0  # s
 TLS = "tls://"
 
 

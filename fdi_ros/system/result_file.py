@@ -30,13 +30,11 @@ import numpy as np
 from fdi_ros.errors import BagError
 
 STANDARD_OUTPUT = Path("-")
-MADE_BY = {"generator": "fdi_ros"}
-"""First in every file of figures: a mark by which a former result is recognised."""
+MADE_BY = {"generator": "fdi_ros"}  # first in every file of figures: a mark by which a former result is recognised
 _OPEN_DESCRIPTOR = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
 """Names of what is open already, by whatever name it lies on the disk."""
 
-JUST_MADE = 1.0
-"""s; so young a folder may not be locked yet by who has made it."""
+JUST_MADE = 1.0  # s; so young a folder may not be locked yet by who has made it
 _SCRATCH = re.compile(r"\..+\.[0-9a-f]{8}")
 
 

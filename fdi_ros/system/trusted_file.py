@@ -20,8 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
-"""Bits of the mode by which others can write."""
+OTHERS = stat.S_IWGRP | stat.S_IWOTH  # bits of the mode by which others can write
 
 
 class DistrustError(OSError):

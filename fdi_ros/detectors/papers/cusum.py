@@ -94,13 +94,11 @@ def _single_threshold(run_length: float, reference: float) -> float:
     return x / (2 * reference) - mean_overshoot(reference)
 
 
-LARGEST = 2.0**18
-"""Standard deviations above which a sample is scaled down as a whole."""
+LARGEST = 2.0**18  # standard deviations above which a sample is scaled down as a whole
 MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
 SYSTEMATIC = 3.0
 """Standard deviations of bias, scale and timing errors that are taken for no fault, however long they last."""
-LEAST_FACTOR = 2.0**-24
-"""Smallest sum of factors that an average is divided by."""
+LEAST_FACTOR = 2.0**-24  # smallest sum of factors that an average is divided by
 
 
 # The method ----------------------------------------------------------------------------------------------------------

@@ -92,12 +92,9 @@ MOST_FAULTS = 2
 MOST_SETS = math.comb(MOST_CHANNELS, MOST_FAULTS)
 MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
 """None contains another: no family of such sets of at most four channels is larger (Sperner)."""
-MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
-"""Circuits through one channel, likewise."""
-ABSENT = MOST_CHANNELS
-"""Instead of a channel: its weight is zero."""
-WITHIN = 1 + ROUNDING
-"""A check this many times its bound still counts as within it: rounding is no fault."""
+MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)  # circuits through one channel, likewise
+ABSENT = MOST_CHANNELS  # instead of a channel: its weight is zero
+WITHIN = 1 + ROUNDING  # a check this many times its bound still counts as within it: rounding is no fault
 
 
 # The method ----------------------------------------------------------------------------------------------------------

@@ -126,8 +126,7 @@ class Projector(SingleFaultDetector):
         if one:
             self.Constants = OneNorm  # type: ignore[assignment]
             self.judge = judge_one_norm
-        self.basis = parity_basis(geometry.axes, construction)
-        """U2, (n, n - 3)."""
+        self.basis = parity_basis(geometry.axes, construction)  # u2, (n, n - 3)
         errors = _single_errors(self.basis, geometry.detectable)
         super().__init__(geometry, noise, options, largest=one, errors=errors, **rate)
         params = self.constants[0]
@@ -188,8 +187,7 @@ def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.
 
 Index = NDArray[np.intp]
 
-NOTHING = 1e-20
-"""k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero."""
+NOTHING = 1e-20  # k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero.
 
 
 @record
@@ -287,8 +285,7 @@ Four = tuple[float, float, float, float]
 
 CHANNELS = 5
 CRITERIA = ("determinant", "condition_number")
-MOST_STEPS = 40
-"""Newton steps for a root; five are usual."""
+MOST_STEPS = 40  # Newton steps for a root; five are usual
 NO_POWER = 1e-200
 """Added to every term, so that a sample of zeros divides nothing by zero; a condition number above its inverse is
 infinite."""

@@ -40,10 +40,8 @@ from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, max_normal_thresh
 MAX_RATIO = 1e6
 """Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,
 and weights further apart would leave no correct digit in the normal equations."""
-NONE = -1
-"""No channel."""
-SAME_FIT = 1e-6
-"""Chi-squares this close are equal but for rounding."""
+NONE = -1  # no channel
+SAME_FIT = 1e-6  # chi-squares this close are equal but for rounding
 
 
 @record

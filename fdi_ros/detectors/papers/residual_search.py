@@ -61,10 +61,8 @@ class ResidualSearch(SingleFaultDetector):
 
     Constants = SumsOfForms
     judge = judge_sums
-    criterion_squares: ClassVar[bool] = False
-    """The criterion sums squares, not absolute values."""
-    criterion_largest: ClassVar[bool] = False
-    """The worst channel has the largest figure, not the least."""
+    criterion_squares: ClassVar[bool] = False  # the criterion sums squares, not absolute values
+    criterion_largest: ClassVar[bool] = False  # the worst channel has the largest figure, not the least
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, *, tolerance: str = "calibrated", **rate: Any) -> None:
         paper = chosen("tolerance", tolerance, TOLERANCES) == "paper"

@@ -65,12 +65,9 @@ def value_of(form: Array, z: Array, n: int) -> float:
     return total
 
 
-TRIAL_FAULT = 50.0
-"""Size of the faults tried, in noise_std of their channel."""
-TRIAL_NOISE = 1.5
-"""The noise of the trials, in noise_std."""
-TRIALS = 200
-"""Trials per channel."""
+TRIAL_FAULT = 50.0  # size of the faults tried, in noise_std of their channel
+TRIAL_NOISE = 1.5  # the noise of the trials, in noise_std
+TRIALS = 200  # trials per channel
 
 
 @record

@@ -26,10 +26,8 @@ from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schem
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, settled
 
-RUN_LENGTH_MARGIN = 3.0
-"""The loose thresholds have a run length this many times shorter than the one asked for."""
-WINDOW_SHARE = 10
-"""A window of healthy samples is the run length over this."""
+RUN_LENGTH_MARGIN = 3.0  # the loose thresholds have a run length this many times shorter than the one asked for
+WINDOW_SHARE = 10  # a window of healthy samples is the run length over this
 
 
 class Delay(OnGeometries):

@@ -25,8 +25,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind, quantiles, score, share, standing
 
-NONE = "none"
-"""The cell in which every channel stays healthy."""
+NONE = "none"  # the cell in which every channel stays healthy
 DEFAULT_SIZES = {name: kind.study_size for name, kind in FAULT_KINDS.items() if kind.study_size is not None}
 """Of each kind that needs one, in its own unit."""
 
@@ -35,12 +34,9 @@ class Flown(NamedTuple):
     """One simulated flight."""
 
     block: Block
-    truth: Array
-    """True body rates, (N, 3) rad/s."""
-    channel: int | None
-    """The faulty one; None: all are healthy."""
-    onset: int
-    """Row at which the fault begins, or would."""
+    truth: Array  # true body rates, (N, 3) rad/s
+    channel: int | None  # the faulty one; None: all are healthy.
+    onset: int  # row at which the fault begins, or would
 
 
 class Flight(TrialProtocol[str]):

@@ -28,8 +28,7 @@ from fdi_ros.replay.outcomes import share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
-FALSE_ALARM_MARGIN = 4.0
-"""The loose thresholds have this many times the false-alarm rate asked for."""
+FALSE_ALARM_MARGIN = 4.0  # the loose thresholds have this many times the false-alarm rate asked for
 
 
 class Snapshot(OnGeometries):
