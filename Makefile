@@ -13,7 +13,7 @@ RUN = bash tools/run.sh
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "watch,logs,calibrate" "$(PYTHON)" compile
 	@$(RUN) python -c 'import rclpy' || { echo "make demo needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash first"; exit 1; }
-	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
+	@$(RUN) python examples/demo.py $(ARGS)
 
 test: venv ## all tests
 	@$(RUN) python -m fdi_ros.cli compile

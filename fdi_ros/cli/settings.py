@@ -149,8 +149,12 @@ COMPILE = Verb(
 
 def _watch(arguments: Namespace) -> int:
     """Show a monitor until interrupted."""
-    from fdi_ros.ros.watch import watch
+    from fdi_ros.ros.process import NO_ROS
 
+    try:
+        from fdi_ros.ros.watch import watch
+    except ImportError as error:
+        raise FdiError(f"watch {NO_ROS} ({error})") from error
     return watch(arguments.node, arguments.plain)
 
 

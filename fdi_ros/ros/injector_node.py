@@ -25,7 +25,6 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.receiver import warm_codec
-from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.sources import source_of
 
@@ -50,14 +49,13 @@ class InjectorNode(CheckedNode):
         self._source = source_of(self.config)
         # The first message must not wait for a compiler.
         warm_codec(self._source)
-        self._kind = message_class(self._source.type)
         self._unheard: dict[str, tuple[int, Any]] = {}
         """Topics whose output has no subscriber yet, each with its number and its output."""
         for k, topic in enumerate(self._source.topics):
             self.resolved(topic + suffix)
-            self._unheard[topic] = k, self.create_publisher(self._kind, topic + suffix, output_qos())
+            self._unheard[topic] = k, self.create_output(self._source.type, topic + suffix)
         self._look_timer = self.every(LOOK_PERIOD, self._look)
-        self._diagnostics = diagnostics_publisher(self)
+        self._diagnostics = self.create_diagnostics()
         self.create_timer(1.0, self._report)
         self._switch(self.values())
         self.create_service(Trigger, "~/start", partial(self._on_switch, True))
@@ -91,7 +89,7 @@ class InjectorNode(CheckedNode):
         for topic, (k, publisher) in tuple(self._unheard.items()):
             if publisher.get_subscription_count():
                 del self._unheard[topic]
-                self.inputs.open(self._kind, topic, partial(self._pass_on, k, publisher))
+                self.inputs.open(self._source.type, topic, partial(self._pass_on, k, publisher))
         if not self._unheard:
             self.destroy_timer(self._look_timer)
 
@@ -135,5 +133,5 @@ class InjectorNode(CheckedNode):
     def _report(self) -> None:
         level, words = (Level.WARN, self._injecting) if self._injecting else (Level.OK, "off")
         values = (("messages struck", str(self._struck)), ("malformed", str(self._malformed)))
-        line = StatusLine(level, prefix_of(self) + "injector", words, self.config.hardware_id, values)
+        line = StatusLine(level, self.prefix + "injector", words, self.config.hardware_id, values)
         self._diagnostics.publish(encode_diagnostics([line], self._now()))

@@ -36,15 +36,7 @@ from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.output import INTEGRITY
-from fdi_ros.ros.messages import (
-    REPORT_PERIOD,
-    diagnostics_publisher,
-    message_class,
-    output_qos,
-    prefix_of,
-    read_diagnostics,
-)
-from fdi_ros.ros.node import CheckedNode
+from fdi_ros.ros.node import REPORT_PERIOD, CheckedNode, message_class, read_diagnostics
 from fdi_ros.ros.process import Stop, guarded, make_executor
 from fdi_ros.sources.channels import ChannelsSource
 
@@ -74,11 +66,11 @@ class AutopilotNode(CheckedNode):
         self._vehicle = Vehicle(settings, self._link.send, time.time)
         names = config.imu_names if config.has_units else NAMES
         topics = config.topics if config.has_units else [f"{name}/data_raw" for name in NAMES]
-        outputs = [self.create_publisher(message_class(IMU), topic, output_qos()) for topic in topics]
+        outputs = [self.create_output(IMU, topic) for topic in topics]
         self._topics = [output.topic_name for output in outputs]
         self._units = list(zip(outputs, map(ImuMessageBytes, names), strict=True))
         self._reporter = Reporter(self._link, self._vehicle, names, self._topics)
-        self._diagnostics = diagnostics_publisher(self)
+        self._diagnostics = self.create_diagnostics()
         self._opened = self._valued = self._due = 0
         self._trouble = self._link.trouble
         self._time = SystemTime()
@@ -257,9 +249,9 @@ class AutopilotNode(CheckedNode):
         self._called = True
         self.log.begin_period()
         now, hardware = time.monotonic_ns(), self.config.hardware_id
-        lines = self._reporter.lines(prefix_of(self), hardware, now)
+        lines = self._reporter.lines(self.prefix, hardware, now)
         if self._failover is not None:
-            lines.append(StatusLine(*self._failover.status(f"{prefix_of(self)}failover", now), hardware, ()))
+            lines.append(StatusLine(*self._failover.status(f"{self.prefix}failover", now), hardware, ()))
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()))
 
     def destroy_node(self) -> None:

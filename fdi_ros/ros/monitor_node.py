@@ -25,11 +25,10 @@ from fdi_ros.config.settings import MONITOR
 from fdi_ros.errors import FdiError
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.monitor.build import alarm_probability
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.output import OUTPUTS, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver, warm_detector
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.ros.messages import OVERRIDABLE
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
@@ -46,7 +45,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
     """Gyro fault monitor; `FdiError` if a parameter is wrong or the settings do not fit each other."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("fdi_node", MONITOR, subscribes=True, publishes=OVERRIDABLE, **options)
+        topics = [output.topic.name for output in OUTPUTS]
+        super().__init__("fdi_node", MONITOR, subscribes=True, publishes=topics, **options)
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         file, age = (self.values()[name] for name in ("state_file", "state_max_age"))

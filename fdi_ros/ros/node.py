@@ -1,11 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all nodes have: parameters declared from the table that every command shares, and requests that are answered."""
+"""What all nodes have: parameters from the table that every command shares, requests that are answered, a bounded log.
+
+And topics: messages come in and go out as bytes. They may come from anywhere, and never stop a node.
+"""
 
 from __future__ import annotations
 
+import importlib
+import logging
 import math
+import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -16,18 +23,28 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
 from fdi_ros.config.settings import ALL_NODES, Field, check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError, FdiError
-from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.messages import BoundedLog
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine
 from fdi_ros.ros.process import Stop, spin
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
+DEPTH = 256
+"""Messages that a topic keeps, in and out, for a node that is busy for a moment: a quarter of a second at 1 kHz."""
+REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
+MOST_LINES = 20  # of one severity in one period: what anybody may cause with requests hides no declaration
+LOG_PERIOD = 1.0  # s
+LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
+FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
+FLOOD_TIME = 5.0  # so long after a flood has begun it is not looked whether it is over, s
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
 MOST_PARAMETERS = 256  # in one request: several times what any node has
@@ -38,6 +55,165 @@ _POLICIES = {
 }
 """What QoS may be overridden, and the values it may have."""
 _MAX_DEPTH = 100_000
+
+
+def message_class(name: str) -> Any:
+    """Return the class of a message type, ``sensor_msgs/msg/Imu``; `FdiError` if its package is not installed."""
+    package, _, kind = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except ImportError as error:
+        raise FdiError(f"messages of type {name} need the ROS package {package}: {error}") from error
+
+
+def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
+    """Return what a node, by its full name, says in a message of /diagnostics, where all speak.
+
+    The names are without that of the node. `ValueError` if a level is none.
+    """
+    prefix = f"{node.strip('/')}: "
+    found = []
+    for status in message.status:
+        if status.name.startswith(prefix):
+            level = ord(status.level)
+            if level > max(Level):
+                raise ValueError(f"level {level}, expected 0 to {max(Level)}")
+            values = tuple((pair.key, pair.value) for pair in status.values)
+            name = status.name.removeprefix(prefix)
+            found.append(StatusLine(Level(level), name, status.message, status.hardware_id, values))
+    return found
+
+
+class BoundedLog(logging.Handler):
+    """Logs so many lines a second at most, each of bounded length, and says how many were left out."""
+
+    def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._logger, self._clock = logger, clock
+        self._since = clock()
+        self._lines: Counter[str] = Counter()
+        self._left_out = 0
+
+    # The logger of ROS refuses another severity from the same line of code.
+    def info(self, words: str) -> None:
+        """Log what is as it should be."""
+        if self._has_room("info"):
+            self._logger.info(shown(words, LINE))
+
+    def warning(self, words: str) -> None:
+        """Log what somebody should know of."""
+        if self._has_room("warning"):
+            self._logger.warning(shown(words, LINE))
+
+    def error(self, words: str) -> None:
+        """Log what somebody should act on."""
+        if self._has_room("error"):
+            self._logger.error(shown(words, LINE))
+
+    def begin_period(self) -> None:
+        """Begin the next period if it is time, with a line on what was left out of the last one."""
+        now = self._clock()
+        if now - self._since < LOG_PERIOD:
+            return
+        left_out, self._since, self._left_out = self._left_out, now, 0
+        self._lines.clear()
+        if left_out:
+            self._lines["warning"] = 1
+            self._logger.warning(f"and {left_out} more lines, left out")
+
+    def _has_room(self, severity: str) -> bool:
+        self.begin_period()
+        has_room = self._lines[severity] < MOST_LINES
+        self._lines[severity] += has_room
+        self._left_out += not has_room
+        return has_room
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log what the package says; see `take_over`."""
+        self.info(record.getMessage())
+
+    def take_over(self) -> None:
+        """Take what the package logs, which then goes nowhere else."""
+        package = logging.getLogger("fdi_ros")
+        package.handlers, package.propagate = [self], False
+
+
+class InputQueue:
+    """The subscriptions of a node to raw messages: drained after every turn of the executor, and watched for a flood.
+
+    An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
+    microsecond. But the EventsExecutor keeps an event for every message that arrives, without bound, also for those
+    that were drained or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too
+    many events must be waiting, another kind of executor is to take over for some seconds.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.subscriptions: dict[Subscription[Any], Callable[[bytes], None]] = {}  # each with what takes its messages
+        self.flooded = False
+        self.taken = 0  # messages that came by an event of the executor in this turn
+        self._node = node
+        self._waiting = 0  # events of messages that were drained
+        self._until = 0.0  # until when it counts as flooded, steady time, s
+
+    def open(self, kind: str, topic: str, take: Callable[[bytes], None]) -> None:
+        """Subscribe to the bytes of the messages of a topic."""
+
+        def take_event(data: bytes) -> None:
+            self.taken += 1
+            self.subscriptions[subscription](data)
+
+        # A new QoS each time, as overrides are written into it.
+        qos = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
+        overriding = QoSOverridingOptions.with_default_policies()
+        subscription = self._node.create_subscription(
+            message_class(kind), topic, take_event, qos, qos_overriding_options=overriding, raw=True
+        )
+        self.subscriptions[subscription] = take
+
+    def close(self) -> None:
+        """Close all subscriptions."""
+        for one in self.subscriptions:
+            self._node.destroy_subscription(one)
+        self.subscriptions, self.flooded, self._waiting = {}, False, 0
+
+    def drain(self) -> int:
+        """Take what waits, in the order in which it arrived, and return how many messages that were.
+
+        What is not taken within `LONGEST`, or is more than two queues hold, stays for the next time.
+        """
+        takers = list(self.subscriptions.items())
+        taken, end = 0, time.monotonic() + LONGEST
+        heads = [_next(one) for one, _ in takers]
+        while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
+            _, k, data = min(waiting)
+            subscription, take = takers[k]
+            heads[k] = _next(subscription) if taken < 2 * DEPTH and time.monotonic() < end else None
+            taken += 1
+            take(data)
+        self._waiting += taken
+        return taken
+
+    def turn(self, now: float) -> None:
+        """Take what waits after a turn of an executor, at the steady time now, s, and see whether it is a flood."""
+        self.drain()
+        if self._waiting and not self.taken:
+            # The turn has used up the event of a message that was drained, or was a timer's.
+            self._waiting -= 1
+        self.taken = 0
+        if not self.flooded and self._waiting > FLOOD:
+            self.flooded, self._until = True, now + FLOOD_TIME
+            self._node.get_logger().warning(
+                "flooded with messages: inputs are polled while it lasts", throttle_duration_sec=10.0
+            )
+        elif self.flooded and now >= self._until:
+            self.flooded, self._waiting = False, 0
+
+
+def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:
+    """Take a message out of the queue: when it arrived, ns, and its bytes."""
+    with subscription.handle:
+        message = subscription.handle.take_message(subscription.msg_type, True)
+    return None if message is None else (message[1]["received_timestamp"], message[0])
 
 
 class CheckedNode(Node):
@@ -96,6 +272,24 @@ class CheckedNode(Node):
     def live(self, stop: Stop) -> None:
         """Work until stopped."""
         spin(self, stop)
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its statuses begin with: no two nodes of a system have the same."""
+        return f"{self.get_fully_qualified_name().lstrip('/')}: "
+
+    def create_output(self, kind: str, topic: str, **options: Any) -> Any:
+        """Publish messages of a type as REP-2003 wants sensor data published: reliable, for subscribers of either kind.
+
+        They are handed over as bytes.
+        """
+        # A new QoS each time, as overrides are written into it.
+        qos = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
+        return self.create_publisher(message_class(kind), topic, qos, **options)
+
+    def create_diagnostics(self) -> Any:
+        """Publish diagnostics; they are handed over as bytes."""
+        return self.create_publisher(message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10))
 
     def resolved(self, topic: str) -> str:
         """Return the full name of a topic, remapped; `ConfigError` if it is no name of a topic."""

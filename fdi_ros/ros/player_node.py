@@ -25,7 +25,6 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.config.settings import PLAYER
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.errors import BagError
-from fdi_ros.ros.messages import message_class, output_qos
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop, guarded
 from fdi_ros.sources import source_of
@@ -52,8 +51,7 @@ class PlayerNode(CheckedNode):
         source = source_of(self.config)
         self.recording = Recording(values["bag"])
         self.recording.require(source.topics, source.type)
-        kind = message_class(source.type)
-        self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in source.topics]
+        self.outputs = [self.create_output(source.type, topic) for topic in source.topics]
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
         self.create_service(Trigger, "~/pause", partial(self._on_pause, True))
         self.create_service(Trigger, "~/resume", partial(self._on_pause, False))

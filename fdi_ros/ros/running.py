@@ -13,24 +13,27 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe, encode_diagnostics
+from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, NEVER, SUPPLY, WORKED
+from fdi_ros.monitor.diagnostics import WHOLE, InputStatus, Level, StatusLine, describe, encode_diagnostics
 from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
-from fdi_ros.ros.inputs import InputTopic
-from fdi_ros.ros.messages import REPORT_PERIOD, BoundedLog, diagnostics_publisher, message_class, output_qos, prefix_of
-from fdi_ros.ros.node import CheckedNode
+from fdi_ros.ros.node import REPORT_PERIOD, BoundedLog, CheckedNode
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
+ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
+NAMED = 4  # publishers of one topic that are named at most
 END_OF_TIME = 2**62
 """The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 QUIET = 5.0
@@ -106,21 +109,102 @@ class ChangeLog:
             self._log.warning(line)
 
 
+class InputTopic:
+    """Status of one input topic of a monitor; number: among the topics of the receiver."""
+
+    def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
+        self.topic = topic
+        self._receiver, self._number = receiver, number
+        self._name = receiver.source.names[number]
+        self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
+        self._was_heard = self._was_unstamped = False
+        self._sources = ""  # what is wrong with who publishes on it; empty: nothing
+        self._rate, self._reported_at, self._reported_messages = 0.0, 0, 0
+        self._reported_counts: dict[str, int] = {}
+
+    @property
+    def _inlet(self) -> Any:
+        return self._receiver.live["inlets"][0, self._number]
+
+    @property
+    def _received(self) -> int:
+        return int(self._inlet["received"])
+
+    @property
+    def _is_unstamped(self) -> bool:
+        # One may be of 0 s, not several.
+        return self._inlet["stamp"] == 0 and self._receiver.counts(self._number).get("duplicate", 0) > 0
+
+    def status(self, now: int) -> InputStatus:
+        """Describe the topic at the clock time now, ns."""
+        counts, receiver, watchdog = self._receiver.counts(self._number), self._receiver, self._watchdog
+        stamp, lag = int(self._inlet["stamp"]), int(self._inlet["lag"])
+        return InputStatus(
+            name=self._name,
+            topic=self.topic,
+            received=self._received,
+            rate=self._rate,
+            silent=watchdog.seconds(now) if self._received else None,
+            live=receiver.is_live(self._number) and not watchdog.silent,
+            arrives=watchdog.seconds(now) < ARRIVES,
+            lag=max(lag, 0) / 1e9,
+            max_lag=receiver.source.max_lag,
+            offset=None if stamp == NEVER else (watchdog.at - stamp) / 1e9,
+            counts=counts,
+            recent={kind: count - self._reported_counts.get(kind, 0) for kind, count in counts.items()},
+            error=receiver.errors[self._number],
+            unstamped=self._is_unstamped,
+            parted=receiver.are_parted,
+            sources=self._sources,
+        )
+
+    def check(self, now: int, log: BoundedLog) -> bool:
+        """Log what is new at the clock time now, ns; return whether the topic fell silent, or came back."""
+        changed = self._watchdog.check(self._received, now)
+        if changed and not self._watchdog.silent:
+            log.info(f"{self._name}: messages on {self.topic}{' again' if self._was_heard else ''}")
+        elif changed and not self._received:
+            log.warning(f"{self._name}: no message yet on {self.topic}")
+        elif changed:
+            log.error(f"{self._name}: no message on {self.topic}")
+        self._was_heard |= self._received > 0
+        if self._is_unstamped and not self._was_unstamped:
+            self._was_unstamped = True
+            log.warning(f"{self.topic}: stamps are not set")
+        return changed
+
+    def check_sources(self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog) -> None:
+        """Log when more than one publisher comes to be on the topic, or an input before it reads the same one."""
+        before, self._sources = self._sources, ""
+        first = next(one for one in inputs if one.topic == self.topic)
+        if first is not self:
+            self._sources = f"{self._name} and {first._name} read the same topic {self.topic}"
+        elif len(found := node.get_publishers_info_by_topic(self.topic)) > 1:
+            names = sorted(f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in found[:NAMED])
+            self._sources = shown(f"{len(found)} publishers on {self.topic}, expected one: {', '.join(names)}", LINE)
+        if self._sources and self._sources != before:
+            log.warning(self._sources)
+
+    def count_anew(self, now: int) -> None:
+        """Begin to count anew what is recent, at the clock time now, ns."""
+        messages, before = self._received - self._reported_messages, self._reported_at
+        self._rate = 1e9 * messages / (now - before) if before and now > before else 0.0
+        self._reported_at, self._reported_messages = now, self._received
+        self._reported_counts = self._receiver.counts(self._number)
+        self._inlet["lag"] = NEVER
+
+
 class Running:
     """A configured monitor: the path of its messages, its outputs, and what an operator should know of it."""
 
     def __init__(self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None) -> None:
         self._node, self._state_file = node, state_file
+        overriding = QoSOverridingOptions.with_default_policies()
         self._outputs = {
-            output: node.create_publisher(
-                message_class(output.topic.type),
-                output.topic.name,
-                output_qos(),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+            output: node.create_output(output.topic.type, output.topic.name, qos_overriding_options=overriding)
             for output in OUTPUTS
         }
-        self._diagnostics = diagnostics_publisher(node)
+        self._diagnostics = node.create_diagnostics()
         self._latencies: deque[int] = deque(maxlen=REMEMBERED)
         self.start(receiver)
 
@@ -153,9 +237,8 @@ class Running:
     def listen(self) -> None:
         """Subscribe to the input topics."""
         source = self.receiver.source
-        kind = message_class(source.type)
         for k, topic in enumerate(source.topics):
-            self._node.inputs.open(kind, topic, partial(self._take, k))
+            self._node.inputs.open(source.type, topic, partial(self._take, k))
 
     def _take(self, inlet: int, data: bytes) -> None:
         """Take in a message, and publish what comes of it and of all samples that it completes."""
@@ -270,7 +353,7 @@ class Running:
 
     def _report(self) -> None:
         """Publish the diagnostics."""
-        now, prefix = self._node.get_clock().now().nanoseconds, prefix_of(self._node)
+        now, prefix = self._node.get_clock().now().nanoseconds, self._node.prefix
         hardware = self.receiver.pipeline.config.hardware_id
         if not self._node.inputs.subscriptions:
             lines = [StatusLine(Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware, ())]

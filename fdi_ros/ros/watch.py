@@ -1,50 +1,239 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Watch a running monitor, fdi watch: drawn in place on a terminal, or line by line."""
+"""Watch a running monitor, fdi watch: a picture of it, made of what it publishes, drawn in place or told line by line.
+
+It may run anywhere, and its topics may be mapped to anything.
+"""
 
 from __future__ import annotations
 
-import importlib.util
+import contextlib
+import math
 import sys
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Imu
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
-from fdi_ros.ros.process import NO_ROS
+from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine, parse_number
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.ros.node import read_diagnostics
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.text import shown
 
-if TYPE_CHECKING:
-    from fdi_ros.ros.watch_node import Picture, Watcher
+try:
+    from rich.bar import Bar
+    from rich.console import Console, Group
+    from rich.live import Live
+    from rich.table import Table
+    from rich.text import Text
+
+    CAN_DRAW = True
+except ImportError:
+    CAN_DRAW = False
 
 PERIOD = 0.1  # how often the view is drawn, s
 REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
+SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there before the node is configured
+SETTLE = 1.0
+"""Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
+STATES = tuple(state.name for state in ChannelState)
+DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+SILENT = {"fused": 1.0, "diagnostics": 3.0}
+"""After so long without a message the last one is no longer shown as the present state, s."""
+REMEMBERED = 50  # changes of state that were not reported yet, or may be drawn
+COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
+GREY = "bright_black"
+SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
+"""What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
+LATEST = 8  # changes of state that are drawn
+WIDE = 90  # columns from which the biases have room
+
+
+class Change(NamedTuple):
+    """Channels that changed state alike; when: s since 1970."""
+
+    at: float
+    level: Level
+    words: str
+
+
+@dataclass
+class Picture:
+    """What a monitor has published so far; the figures are those of the last message of each kind."""
+
+    monitor: str = ""  # full name of the node
+    caption: str = ""  # what else is to be known, above all; empty: nothing
+    waiting: str = "looking for a monitor"  # what is waited for; empty: nothing
+    since: float = field(default_factory=time.monotonic)  # when waiting for it began, s, monotonic clock
+    whole: StatusLine = field(default_factory=lambda: StatusLine(Level.STALE, WHOLE, ""))
+    channels: Mapping[str, StatusLine] = field(default_factory=dict)  # by name
+    inputs: Sequence[StatusLine] = ()
+    rate: tuple[float, float, float] | None = None  # fused rate, rad/s
+    heard: dict[str, float] = field(default_factory=dict)  # when the last message of each kind came, s, monotonic clock
+    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    ignored: int = 0  # messages that no monitor sends: nothing was taken from them
+    ignored_why: str = ""  # why the last of them
+
+    def is_silent(self, kind: str) -> bool:
+        """Whether messages of a kind have stopped, or never came."""
+        return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT[kind]
+
+    @property
+    def evidence(self) -> tuple[float, float] | None:
+        """Statistic and threshold; None: no sample is judged now."""
+        found = self.whole.number("statistic"), self.whole.number("threshold")
+        is_stale = self.whole.level == Level.STALE or self.is_silent("diagnostics")
+        return None if is_stale or not math.isfinite(found[0]) or not found[1] > 0 else found
+
+    def format_ignored(self) -> str:
+        """Say how many messages were ignored and why the last one was; empty: none."""
+        some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} ignored"
+        return shown(f"{some}: {self.ignored_why}", LINE) if self.ignored else ""
+
+    def update_channels(self, channels: Mapping[str, StatusLine]) -> None:
+        """Keep the present channels and remember which changed state."""
+        moves: dict[tuple[Level, str], list[str]] = {}
+        for name, line in channels.items():
+            before, state = self.channels[name].value("state") if name in self.channels else "", line.value("state")
+            if state != before:
+                why = f": {line.message}" if state != "OK" and line.message else ""
+                words = f"{before} -> {state}{why}" if before else f"{state}{why}"
+                moves.setdefault((line.level, words), []).append(name)
+        self.channels = channels
+        for (level, words), names in moves.items():
+            who = "all" if len(names) == len(channels) else ", ".join(names)
+            self.changes.append(Change(time.time(), level, shown(f"{who}  {words}", LINE)))
+
+
+class Watcher(Node):
+    """Finds a monitor and keeps a picture of it; without the full name of a node, of the only one there is."""
+
+    def __init__(self, monitor: str = "", name: str = "fdi_watch") -> None:
+        super().__init__(name, start_parameter_services=False)
+        self.picture = Picture(monitor)
+        self._callbacks = {Imu: self._on_fused, DiagnosticArray: self._on_diagnostics}
+        self._heard_on: dict[type, Subscription[Any]] = {}  # by message type; empty: nothing is listened to yet
+        self._found = math.inf
+
+    def look(self) -> None:
+        """Look for a monitor and listen to it; `FdiError` if there are several and none is named."""
+        picture = self.picture
+        before, picture.monitor = picture.waiting, picture.monitor or self._choose()
+        if picture.monitor:
+            picture.waiting = self._listen(picture.monitor)
+        else:
+            picture.waiting = f"waiting for a monitor (fdi_node) on ROS_DOMAIN_ID {self.context.get_domain_id()}"
+        if picture.waiting != before:
+            picture.since = time.monotonic()
+
+    def _choose(self) -> str:
+        services = self.get_service_names_and_types()
+        there = sorted(name[: -len(SERVICE)] for name, _ in services if name.endswith(SERVICE))
+        now = time.monotonic()
+        self._found = min(self._found, now) if there else math.inf
+        if not there or now - self._found < SETTLE:
+            return ""
+        if len(there) > 1:
+            names = shown(", ".join(there), LINE)
+            raise FdiError(f"{len(there)} monitors are running: choose with --node one of {names}")
+        return there[0]
+
+    def _listen(self, monitor: str) -> str:
+        """Listen to a monitor if it is there; return what is waited for, empty: nothing."""
+        # Anew each time: after a restart it may publish elsewhere. Others publish on the same topics, as on
+        # /diagnostics: that a topic has a publisher proves nothing.
+        namespace, _, name = monitor.rpartition("/")
+        try:
+            published = self.get_publisher_names_and_types_by_node(name, namespace or "/")
+        except NodeNameNonExistentError:
+            # One that comes back has published nothing yet.
+            self.picture.heard.clear()
+            if self._heard_on:
+                return f"{monitor} is gone: waiting for it to come back"
+            return f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
+        topics = {
+            kind: topic
+            for topic, kinds in published
+            for kind in self._callbacks
+            if kinds[0].endswith(f"/{kind.__name__}")
+        }
+        if len(topics) < len(self._callbacks):
+            return f"{monitor} is not configured: waiting for a lifecycle manager to do it"
+        if topics != {kind: one.topic_name for kind, one in self._heard_on.items()}:
+            for one in self._heard_on.values():
+                self.destroy_subscription(one)
+            self._heard_on = {
+                kind: self.create_subscription(kind, topics[kind], callback, DEEP)
+                for kind, callback in self._callbacks.items()
+            }
+        if self.picture.is_silent("diagnostics"):
+            # DDS goes on listing one that was killed for a while.
+            silent = f"{monitor} is silent: it was killed or hangs; " if "diagnostics" in self.picture.heard else ""
+            return f"{silent}waiting for diagnostics of {monitor} on {topics[DiagnosticArray]}"
+        whole = self.picture.whole
+        return f"waiting for the first sample: {whole.message}" if whole.value("samples") == "0" else ""
+
+    def _ignore(self, message: object, why: str) -> None:
+        """Count a message that no monitor sends, and remember why."""
+        self.picture.ignored += 1
+        self.picture.ignored_why = f"{self._heard_on[type(message)].topic_name}: {why}"
+
+    def _on_fused(self, message: Imu) -> None:
+        rate = message.angular_velocity
+        if not all(map(math.isfinite, (rate.x, rate.y, rate.z))):
+            self._ignore(message, "a rate that is not finite")
+            return
+        self.picture.rate = (rate.x, rate.y, rate.z)
+        self.picture.heard["fused"] = time.monotonic()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        try:
+            found = read_diagnostics(message, self.picture.monitor)
+        except ValueError as error:
+            self._ignore(message, str(error))
+            return
+        channels = {line.name: line for line in found if line.value("state")}
+        wrong = next((state for line in channels.values() if (state := line.value("state")) not in STATES), "")
+        if wrong:
+            self._ignore(message, f"state {wrong!r}, expected one of {', '.join(STATES)}")
+        elif found:
+            picture = self.picture
+            picture.whole = next((line for line in found if line.name == WHOLE), picture.whole)
+            picture.inputs = [
+                line._replace(name=line.name.removeprefix(INPUT)) for line in found if line.name.startswith(INPUT)
+            ]
+            picture.update_channels(channels or picture.channels)
+            picture.heard["diagnostics"] = time.monotonic()
 
 
 def watch(node: str = "", plain: bool = False) -> int:
-    """Show a monitor until interrupted, and return the exit code; `FdiError` if there is no ROS 2, or not one monitor.
+    """Show a monitor until interrupted, and return the exit code; `FdiError` if there is not one monitor.
 
     Without the full name of a node it is the only monitor that is running. Plain is line by line also on a terminal.
     """
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise FdiError(f"watch {NO_ROS} ({error})") from error
-    from fdi_ros.ros.watch_node import Watcher
-
     name = f"/{node.removeprefix('/')}" if node else ""
     if name and not is_plain_name(name):
         raise FdiError(f"--node is {node!r}, expected the full name of a node such as /drone/fdi_node")
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        show(Watcher(name), plain)
-    except KeyboardInterrupt:
         # The usual end.
-        return 0
+        with contextlib.suppress(KeyboardInterrupt):
+            show(Watcher(name), plain)
     finally:
         rclpy.try_shutdown()
     return 0
@@ -52,65 +241,46 @@ def watch(node: str = "", plain: bool = False) -> int:
 
 def show(watcher: Watcher, plain: bool = False, over: Callable[[], bool] = lambda: False) -> None:
     """Show a monitor until that is over: drawn in place on a terminal, elsewhere or if plain line by line."""
-    out = sys.stdout
-    is_terminal = out.isatty() and not plain
-    if is_terminal and "utf" in (out.encoding or "").lower() and importlib.util.find_spec("rich") is not None:
-        from rich.console import Console
-        from rich.live import Live
-
-        from fdi_ros.ros.watch_view import draw
-
-        console = Console()
-        try:
-            with Live(console=console, screen=True, auto_refresh=False) as live:
-                _repeat(watcher, lambda: live.update(draw(watcher.picture, console.width), refresh=True), over)
-        finally:
-            # The screen is that of before: what was seen last stays on it.
-            console.print(draw(watcher.picture, console.width))
-        return
-    if is_terminal:
+    is_terminal = sys.stdout.isatty() and not plain
+    showing: AbstractContextManager[Callable[[], None]] = contextlib.nullcontext(LineReport(watcher.picture).print)
+    if is_terminal and CAN_DRAW and "utf" in (sys.stdout.encoding or "").lower():
+        showing = drawing(watcher.picture)
+    elif is_terminal:
         print("line by line: for a view of the whole, pip install rich and use a UTF-8 terminal")
-    report = LineReport()
-
-    def print_lines() -> None:
-        for line in report.lines(watcher.picture):
-            print(line, flush=True)
-
-    _repeat(watcher, print_lines, over)
-
-
-def _repeat(watcher: Watcher, show_once: Callable[[], None], over: Callable[[], bool]) -> None:
-    """Take what arrives and show it, once in a period."""
-    from rclpy.executors import SingleThreadedExecutor
-
     executor = SingleThreadedExecutor()
     executor.add_node(watcher)
     is_over = False
-    while not is_over:
-        watcher.look()
-        end = time.monotonic() + PERIOD
-        while (left := end - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
-        is_over = over()
-        show_once()
+    with showing as show_once:
+        while not is_over:
+            watcher.look()
+            end = time.monotonic() + PERIOD
+            while (left := end - time.monotonic()) > 0:
+                executor.spin_once(timeout_sec=left)
+            is_over = over()
+            show_once()
 
 
 class LineReport:
     """Reports a monitor line by line: each change, each new state of the whole, and a line now and then."""
 
-    def __init__(self) -> None:
-        self._changed = 0  # changes reported
+    def __init__(self, picture: Picture) -> None:
+        self._picture = picture
         self._caption, self._said = "", ("", False)
         self._due = 0.0  # when the state of the whole is reported again, s since 1970
 
-    def lines(self, picture: Picture) -> list[str]:
-        """Return what is new since the last time."""
-        now, caption, before = time.time(), self._caption, self._said
-        new, self._changed = min(picture.changed - self._changed, len(picture.changes)), picture.changed
+    def print(self) -> None:
+        """Print what is new since the last time."""
+        for line in self.lines():
+            print(line, flush=True)
+
+    def lines(self) -> list[str]:
+        """Return what is new since the last time; its changes are taken out of the picture."""
+        picture, now, caption, before = self._picture, time.time(), self._caption, self._said
         whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole.message)
         self._caption, self._said = picture.caption, (whole, picture.ignored > 0)
         lines = [(now, picture.caption)] if picture.caption != caption else []
-        lines += [(change.at, change.words) for change in list(picture.changes)[len(picture.changes) - new :]]
+        lines += [(change.at, change.words) for change in picture.changes]
+        picture.changes.clear()
         if any(self._said) and (self._said != before or now >= self._due):
             self._due = now + REGULAR
             lines.append((now, whole if picture.waiting else f"{whole}{_format_figures(picture)}"))
@@ -129,3 +299,112 @@ def _format_figures(picture: Picture) -> str:
         evidence = "evidence {:.3g} of {:.3g}".format(*picture.evidence)
     hertz, late = (picture.whole.value(key) or "none" for key in ("sample rate (Hz)", "latency p99 (ms)"))
     return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"
+
+
+# Drawn on a terminal ------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def drawing(picture: Picture) -> Iterator[Callable[[], None]]:
+    """Yield what draws a monitor anew, on a screen of its own; what was seen last stays on that of before."""
+    console = Console()
+    try:
+        with Live(console=console, screen=True, auto_refresh=False) as live:
+            yield lambda: live.update(draw(picture, console.width), refresh=True)
+    finally:
+        console.print(draw(picture, console.width))
+
+
+def draw(picture: Picture, width: int) -> Group:
+    """Draw a monitor, no line wider than the terminal."""
+    parts: list[Text | Table] = [Text(shown(picture.caption, LINE), style="bold")] if picture.caption else []
+    parts.append(_head(picture))
+    if picture.waiting:
+        waited = time.monotonic() - picture.since
+        parts.append(Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow"))
+    if picture.ignored:
+        parts.append(Text(picture.format_ignored(), style="yellow"))
+    if not picture.is_silent("diagnostics"):
+        parts.append(Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level]))
+    if not picture.channels:
+        return Group(*parts)
+    parts += [Text(), _figure_table(picture), _channel_table(picture, width >= WIDE), *_input_lines(picture), Text()]
+    for change in list(picture.changes)[: -LATEST - 1 : -1]:
+        at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
+        parts.append(at.append(change.words, style=COLOURS[change.level]))
+    return Group(*parts)
+
+
+def _head(picture: Picture) -> Text:
+    head = Text(f"{shown(picture.monitor) or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
+    if picture.is_silent("diagnostics"):
+        return head.append("says nothing" if picture.heard else "", style="magenta")
+    keys = ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector")
+    hertz, middle, late, detector = (shown(picture.whole.value(key) or "none") for key in keys)
+    return head.append(f"{hertz} Hz  latency {middle} ms (p99 {late})  {detector}", style="not bold")
+
+
+def _grid(widths: Sequence[int | None]) -> Table:
+    """Make a table without lines; None: the column that takes what is left of the terminal."""
+    table = Table.grid(padding=(0, 1), expand=True)
+    for wide in widths:
+        table.add_column(width=wide, ratio=1 if wide is None else None, no_wrap=True, overflow="ellipsis")
+    return table
+
+
+def _figure_table(picture: Picture) -> Table:
+    """Draw the fused rate, and the statistic against its threshold: the evidence of all channels together."""
+    table = _grid((8, None, 14))
+    if picture.rate is None or picture.is_silent("fused"):
+        table.add_row("fused", Text("no rate", style="bold red"))
+    else:
+        rate = "  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True))
+        level = [parse_number(text) for text in picture.whole.value("protection level (rad/s)").split()]
+        known = bool(level) and all(map(math.isfinite, level))
+        table.add_row("fused", f"{rate} rad/s", Text(f"within {max(level):.2g}" if known else "", style=GREY))
+    if picture.evidence is None:
+        table.add_row("evidence", Text("none: no sample is being judged", style=GREY))
+    else:
+        statistic, threshold = picture.evidence
+        bar = Bar(threshold, 0.0, min(statistic, threshold), color="red" if statistic >= threshold else "cyan")
+        table.add_row("evidence", bar, f"{statistic:.3g} of {threshold:.3g}")
+    return table
+
+
+def _channel_table(picture: Picture, is_wide: bool) -> Table:
+    """Draw one row per channel: state, residual, and where there is room the bias."""
+    is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
+    residuals = {name: line.number("residual (rad/s)") for name, line in picture.channels.items()}
+    sizes = {name: abs(value) if math.isfinite(value) else 0.0 for name, value in residuals.items()}
+    scale = next((scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1])
+    table = _grid((max(len(shown(name)) for name in sizes), 9, None, 9, 18)[:columns])
+    heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")
+    table.add_row(*(Text(word, style=GREY) for word in heads[:columns]))
+    for name, line in picture.channels.items():
+        # A string would be taken for markup.
+        cells: list[Text | Bar | str] = [Text(shown(name)), Text("?", style=GREY), Bar(scale, 0.0, 0.0), "none", "none"]
+        if is_fresh:
+            colour, residual = COLOURS[line.level], residuals[name]
+            bar = Bar(scale, 0.0, min(sizes[name], scale), color=colour.removeprefix("bold "))
+            figure = f"{residual:+.4f}" if math.isfinite(residual) else "none"
+            cells[1:] = [Text(line.value("state"), style=colour), bar, figure, _format_bias(line)]
+        table.add_row(*cells[:columns])
+    return table
+
+
+def _format_bias(line: StatusLine) -> str:
+    bias, std = line.number("bias (rad/s)"), line.number("bias known to (rad/s)")
+    if not math.isfinite(bias):
+        return "none"
+    return f"{bias:+.4f}" + (f" +- {std:.4f}" if math.isfinite(std) else "")
+
+
+def _input_lines(picture: Picture) -> list[Text]:
+    """Return the inputs in which something is wrong; if there is none, the rates of all."""
+    if picture.is_silent("diagnostics") or not picture.inputs:
+        return []
+    odd = [line for line in picture.inputs if line.level != Level.OK]
+    if odd:
+        return [Text(shown(f"input {line.name}: {line.message}", LINE), style=COLOURS[line.level]) for line in odd]
+    rates = ", ".join(f"{line.name} {line.value('rate (Hz)')} Hz" for line in picture.inputs)
+    return [Text(shown(f"inputs   {rates}", LINE), no_wrap=True, overflow="ellipsis")]

@@ -88,7 +88,6 @@ def test_names_of_statuses_carry_the_namespace_and_a_dump_loads_back(tmp_path) -
     dump = tmp_path / "dump.yaml"
     code = f"""
 import rclpy, yaml
-from fdi_ros.ros.messages import prefix_of
 from fdi_ros.ros.monitor_node import MonitorNode
 for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
     rclpy.init(args=["--ros-args", "--params-file", file, "-r", "__ns:=/drone"])
@@ -97,7 +96,7 @@ for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
     values = {{name: list(value) if hasattr(value, "tolist") else value for name, value in values.items()}}
     with open({str(dump)!r}, "w") as out:
         yaml.safe_dump({{"/drone/fdi_node": {{"ros__parameters": values}}}}, out)
-    print(prefix_of(node), sorted(values.items()))
+    print(node.prefix, sorted(values.items()))
     node.destroy_node()
     rclpy.shutdown()
 """

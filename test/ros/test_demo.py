@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("quiet_domain")
 
 
 def demo(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "fdi_ros.ros.demo", *words]
+    command = [sys.executable, "examples/demo.py", *words]
     return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=240, check=False)
 
 
@@ -36,7 +36,7 @@ def test_the_fault_is_found_shown_and_summed_up(root: Path) -> None:
 
 
 def test_a_wrong_fault_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from fdi_ros.ros import demo
+    from examples import demo
 
     # It keeps itself out of other programs' way; that is for the process that it is.
     monkeypatch.setattr(os, "environ", dict(os.environ))

@@ -14,14 +14,12 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from rclpy.executors import SingleThreadedExecutor
 from ros.harness import TWO_IMUS, Process, healthy, listening, parameter_file, wait
-from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.core.states import ChannelState
-from fdi_ros.ros import inputs
-from fdi_ros.ros.inputs import DEPTH, FLOOD, LONGEST
-from fdi_ros.ros.node import CheckedNode
+from fdi_ros.ros import node as node_module
+from fdi_ros.ros.node import DEPTH, FLOOD, LONGEST, CheckedNode
 from fdi_ros.ros.process import replace_executor
 
 
@@ -31,14 +29,14 @@ def flooded():
     with listening(("flooded",)) as listener:
         node = CheckedNode("taker", {}, subscribes=False)
         node.got = []
-        node.inputs.open(Imu, "flooded", node.got.append)
+        node.inputs.open("sensor_msgs/msg/Imu", "flooded", node.got.append)
         assert wait(listener.outputs[0].get_subscription_count)
         yield listener, node
         node.destroy_node()
 
 
 def test_a_flood_is_polled_and_then_taken_by_events_again(flooded, monkeypatch) -> None:
-    monkeypatch.setattr(inputs, "FLOOD_TIME", 1.0)
+    monkeypatch.setattr(node_module, "FLOOD_TIME", 1.0)
     experimental = pytest.importorskip("rclpy.experimental", reason="no EventsExecutor here")
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     listener, node = flooded

@@ -17,8 +17,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from ros.harness import TWO_IMUS, monitoring, wait
 from ros.storm import KINDS, vehicle, weather
 
-from fdi_ros.ros import messages as log
-from fdi_ros.ros.node import MOST_PARAMETERS
+from fdi_ros.ros.node import LOG_PERIOD, MOST_LINES, MOST_PARAMETERS, BoundedLog
 
 SECONDS = 0.7
 THROTTLED = 10
@@ -33,7 +32,7 @@ def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(t
             assert told["answered"] == told["sent"], kind
             for name, process in (("monitor", over.monitor), ("link", over.link)):
                 assert process.popen.poll() is None
-                assert told[f"{name}: lines of the log a second"] < 3 * log.MOST + THROTTLED, process.said()
+                assert told[f"{name}: lines of the log a second"] < 3 * MOST_LINES + THROTTLED, process.said()
                 assert told[f"{name}: memory, MB"] < 400
         assert over.listener.trigger("reset").success
         assert over.listener.says("monitor", "of 9 channels healthy")
@@ -71,14 +70,14 @@ def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(tmp_path, compil
 def test_a_log_is_bounded_and_says_how_much_was_left_out() -> None:
     now, lines = time.monotonic(), []
     logger = SimpleNamespace(info=lines.append, warning=lines.append, error=lines.append)
-    bounded = log.BoundedLog(logger, lambda: now)
+    bounded = BoundedLog(logger, lambda: now)
     for k in range(1000):
         (bounded.info, bounded.warning, bounded.error)[k % 3](f"line {k}\n" + "x" * 10**5)
     # Each severity has its own room: requests without end hide no declaration.
-    assert len(lines) == 3 * log.MOST
+    assert len(lines) == 3 * MOST_LINES
     assert all(len(line) <= 5000 and "\n" not in line for line in lines)
-    now += log.PERIOD
+    now += LOG_PERIOD
     bounded.begin_period()
-    assert lines[3 * log.MOST :] == [f"and {1000 - 3 * log.MOST} more lines, left out"]
+    assert lines[3 * MOST_LINES :] == [f"and {1000 - 3 * MOST_LINES} more lines, left out"]
     bounded.info("again")
     assert lines[-1] == "again"

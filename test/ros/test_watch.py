@@ -29,8 +29,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.ros.watch import LineReport
-from fdi_ros.ros.watch_node import REMEMBERED, Picture, Watcher
+from fdi_ros.ros.watch import REMEMBERED, LineReport, Picture, Watcher
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
@@ -65,7 +64,7 @@ def picture() -> Picture:
 def drawn(picture: Picture, width: int) -> list[str]:
     """Lines that are shown in a terminal."""
     console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
-    from fdi_ros.ros.watch_view import draw
+    from fdi_ros.ros.watch import draw
 
     out = io.StringIO()
     console.Console(file=out, width=width).print(draw(picture, width))
@@ -101,16 +100,16 @@ def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> Non
 
 
 def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Picture) -> None:
-    report = LineReport()
-    said = [line.split("  ", 1)[1] for line in report.lines(picture)]
+    report = LineReport(picture)
+    said = [line.split("  ", 1)[1] for line in report.lines()]
     assert said[:2] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
     assert picture.whole.message in said[2]
-    assert report.lines(picture) == []
+    assert report.lines() == []
     # Alike with the same words: in one line.
     doubtful = channel("imu_1.x", "SUSPECT", Level.WARN, "disagrees", residual=0.1)
     picture.update_channels({**picture.channels, "imu_1.x": doubtful, "imu_1.y": doubtful})
     picture.whole = whole("9 of 12")
-    said = [line.split("  ", 1)[1] for line in report.lines(picture)]
+    said = [line.split("  ", 1)[1] for line in report.lines()]
     assert said[0] == "imu_1.x, imu_1.y  OK -> SUSPECT: disagrees"
     assert said[1].startswith("9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7")
     # More than is remembered: those that are.
@@ -118,7 +117,7 @@ def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Pict
         before = {**picture.channels}
         picture.update_channels(before | {"imu_1.x": channel("imu_1.x", "OK")})
         picture.update_channels(before)
-    assert len(report.lines(picture)) == REMEMBERED
+    assert len(report.lines()) == REMEMBERED
 
 
 EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
@@ -130,10 +129,10 @@ def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
     keys = ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector", "protection level (rad/s)")
     picture.whole = whole(EVIL, **dict.fromkeys(keys, EVIL))
     picture.waiting = picture.monitor = picture.caption = EVIL
-    report = LineReport()
-    said = report.lines(picture)
+    report = LineReport(picture)
+    said = report.lines()
     picture.waiting, picture.ignored, picture.ignored_why = "", 2, EVIL
-    said += report.lines(picture)
+    said += report.lines()
     for level in (Level.OK, Level.WARN):
         picture.inputs = [StatusLine(level, EVIL, EVIL, values=(("rate (Hz)", EVIL),))]
         said += drawn(picture, 500)

@@ -27,10 +27,9 @@ from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, parse_fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.receiver import warm_path
-from fdi_ros.ros.watch import show
-from fdi_ros.ros.watch_node import DEEP, Watcher
+from fdi_ros.ros.watch import DEEP, Watcher, show
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=18"
 SUFFIX = "_faulty"
