@@ -21,8 +21,7 @@ DURATION, SAMPLE_RATE = 60.0, 100.0
 # The lower triad of the cone is left-handed; an Imu is not. Its x axis is turned round to make one of it, which
 # changes the sign of that channel and nothing else: neither what is redundant nor what can be told apart.
 UNIT_SIGNS = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
-TRANSPORT = 200_000
-"""Each Imu arrives this many ns after the one before, the first after its own stamp."""
+TRANSPORT = 200_000  # each Imu arrives this many ns after the one before, the first after its own stamp
 
 
 def mounts() -> NDArray[np.float64]:

@@ -32,8 +32,7 @@ FOUR = {
 }
 FORGIVING = {"decision.latch": False, "decision.clean_time": 0.5}
 SITUATIONS = ("calm", "faults", "noise")
-WARM, MEASURED, REPEATS = 3000, 3000, 5
-"""Samples one by one, and runs offline."""
+WARM, MEASURED, REPEATS = 3000, 3000, 5  # samples one by one, and runs offline
 
 
 def stream(pipeline: Pipeline, asked: Asked, count: int, situation: str) -> Block:

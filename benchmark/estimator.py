@@ -41,10 +41,10 @@ PARTS = {
     "flights": ("flights", "measure", "FIGURES"),
     "cost": ("cost", "measure", "FIGURES"),
     "vibration": ("vibration", "measure", "FIGURES"),
+    "calibration": ("calibration", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""
-WIDTH = 58
-"""Of labels."""
+WIDTH = 58  # of labels
 
 
 def arguments_of() -> argparse.Namespace:

@@ -3,10 +3,9 @@
 
 """From the fault of one gyro to its declaration: slow drifts, steps, and the step after another fault.
 
-drift: drifts in motion, and healthy gyros that warm up or whose biases walk. 0.6 rad/s about each axis, gyros of small
-MEMS units; the drift begins after a minute and is watched for 30. declared, named: s since it began, where it was
-(median of those); off: largest error of the fused rate, averaged over a second, over its published standard deviation,
-while no channel is other than OK: median and largest of the flights. Healthy twins fly for ten minutes.
+drift: 0.6 rad/s about each axis, gyros of small MEMS units; it begins after a minute and is watched for 30 (healthy
+ones that warm up are in `conditions`). declared, named: s since it began, median; off: largest error of the fused rate,
+averaged over a second, over its published standard deviation while all channels are OK: median and largest.
 
 delay: samples from a bias of 0.5 to 8 sigma to its declaration, beside the information bound. It comes after a calm
 minute, and is watched for another. It shifts the normalised residual of the channel by sqrt(S_ii) times as much: S_ii
@@ -26,7 +25,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from healthy import walking, warming
 from trials import (
     FOUND,
     IDEAL,
@@ -42,7 +40,6 @@ from trials import (
     faulty,
     found,
     fresh,
-    in_set,
     labelled,
     summary,
 )
@@ -59,15 +56,8 @@ DRIFT_FIGURES = {
     "flights_declared": "d",
     "flights": "d",
 }
-DRIFTS = (0.003, 0.005, 0.01, 0.02, 0.05)
-"""deg/s^2."""
-ONSET, FLOWN, TWIN = 60.0, 1800.0, 600.0
-"""s."""
-TWINS = {
-    "walk 2e-5": walking(2e-5),
-    "walk 5e-5": walking(5e-5),
-    "warming 0.02 rad/s in 20 min": warming(0.02),
-}
+DRIFTS = (0.003, 0.005, 0.01, 0.02, 0.05)  # deg/s^2
+ONSET, FLOWN = 60.0, 1800.0  # s
 
 
 def off(output: Output, truth: Array) -> float:
@@ -94,17 +84,6 @@ def measure_drifts(asked: Asked) -> Iterator[Row]:
             outcomes.append(found(output, channel, round(ONSET * RATE)))
             errors.append(off(output, flight.truth))
         yield f"{label} deg/s^2", {**_times(outcomes), "off": float(np.median(errors)), "most_off": max(errors)}
-    for label, pipeline, twin in labelled(asked, None, TWINS):
-        declared, errors = 0, []
-        for k in range(trials):
-            rng = asked.rng("twin", label, k)
-            flight = Flight.of(pipeline, rng, TWIN, Sines.drawn(0.6, rng), GyroErrors())
-            added = rng.standard_normal(flight.shape) + TWINS[twin](rng, flight.seconds, flight.shape[1]) / NOISE
-            output = fresh(pipeline, flight.block(added))
-            declared += bool((faulty(output) | in_set(output)).any())
-            errors.append(off(output, flight.truth))
-        figures = {"flights_declared": declared, "flights": trials}
-        yield f"{label}, healthy", {**figures, "off": float(np.median(errors)), "most_off": max(errors)}
 
 
 def _times(outcomes: Any) -> dict[str, Any]:
@@ -126,20 +105,16 @@ def _times(outcomes: Any) -> dict[str, Any]:
 DELAY_FIGURES = {"bound": ".1f", "times_bound": ".2f", **FOUND}
 NEXT_FIGURES = {"times_excluded": ".2f", **FOUND}
 SIZES = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
-RUN_LENGTH = 3.6e8
-"""Samples to a false alarm."""
-CALM = WATCHED = 60.0
-"""s."""
+RUN_LENGTH = 3.6e8  # samples to a false alarm
+CALM = WATCHED = 60.0  # s
 MOTIONS = {
     "at rest": (0.0, NO_ERRORS, IDEAL),
     "gentle motion": (0.05, NO_ERRORS, IDEAL),
     "motion 0.5 rad/s, scale errors": (0.5, GyroErrors(scale_std=0.002, misalignment_std=0.002, delay_std=0.0003), {}),
 }
 """Amplitude, rad/s, errors of the gyros and settings: axes and clocks are known, or off by what is configured."""
-FIRST = 20.0
-"""Size of the fault before, sigma."""
-GAPS = (0.5, 2.0, 5.0, 15.0)
-"""s from its declaration."""
+FIRST = 20.0  # size of the fault before, sigma
+GAPS = (0.5, 2.0, 5.0, 15.0)  # s from its declaration
 
 
 def measure_delays(asked: Asked) -> Iterator[Row]:

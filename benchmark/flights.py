@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
-from trials import CONFIGS, Array, Asked, Mask, Row, faulty, in_set, seconds_of
+from trials import CONFIGS, Array, Asked, Mask, Row, faulty, is_state, seconds_of
 
 from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
@@ -37,10 +37,8 @@ from fdi_ros.replay.run import Request, Sink, replay
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.starting_config import starting_config_of
 
-WITHIN = (1.0, 4.0, 10.0)
-"""Times to the name, s; the last is how long a fault is watched."""
-MATTERS = 4.0
-"""What a set, or a miss, is judged by, s."""
+WITHIN = (1.0, 4.0, 10.0)  # times to the name, s; the last is how long a fault is watched
+MATTERS = 4.0  # what a set, or a miss, is judged by, s
 OTHERS = ("in a set", "missed", "false set", "wrong", "before")
 FIGURES = {
     **dict.fromkeys(("faulty", "in_sets", "trials"), "d"),
@@ -55,19 +53,15 @@ GROUPS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "mimu, shaken": (("mimu_exp1", 180.0, 210.0),),
 }
 """Recordings, or parts of one from and to s, under the folder of the data."""
-NO_FAULTS = ("mimu, shaken",)
-"""Until the gyros saturate."""
-EXCEPTED = {"solo": "imu_1.x"}
-"""Channels that are not known to be healthy."""
+NO_FAULTS = ("mimu, shaken",)  # until the gyros saturate
+EXCEPTED = {"solo": "imu_1.x"}  # channels that are not known to be healthy
 BASE: dict[str, dict[str, Any]] = {
     "phantom4": {"sample_rate": 120.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 5))},
     "solo": {"sample_rate": 50.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 4))},
 }
 """Settings that no calibration finds out; mounts are the identity. mimu: config/three_imus.yaml."""
-BIASES = (0.03, 0.1, 0.3)
-"""rad/s."""
-LAG = 0.08
-"""Largest delay that the cross-correlation looks for, s."""
+BIASES = (0.03, 0.1, 0.3)  # rad/s
+LAG = 0.08  # largest delay that the cross-correlation looks for, s
 
 
 @dataclass(frozen=True)
@@ -117,14 +111,10 @@ class Kept(Sink):
 class Replayed:
     """States of a replay."""
 
-    seconds: Array
-    """(N,) s from the first sample."""
-    alone: Mask
-    """(N, n) channels that stand declared by themselves, or are lost; those that are excepted do not."""
-    named: Mask
-    """(N, n) of them, those that are FAULTY: a hole in the recording loses channels, and names none."""
-    among: Mask
-    """(N, n) channels that stand declared in a set; a set with an excepted channel is none."""
+    seconds: Array  # (N,) s from the first sample
+    alone: Mask  # (N, n) channels that stand declared by themselves, or are lost; those that are excepted do not
+    named: Mask  # (N, n) of them, those that are FAULTY: a hole in the recording loses channels, and names none
+    among: Mask  # (N, n) channels that stand declared in a set; a set with an excepted channel is none
     pipeline: Pipeline
 
 
@@ -135,8 +125,8 @@ def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), e
     assert kept.pipeline is not None
     stamp = np.concatenate([output.stamp for output in kept.outputs])
     alone = np.concatenate([faulty(output) for output in kept.outputs])
-    named = np.concatenate([output.state == ChannelState.FAULTY for output in kept.outputs])
-    among = np.concatenate([in_set(output) for output in kept.outputs])
+    named = np.concatenate([is_state(output, ChannelState.FAULTY) for output in kept.outputs])
+    among = np.concatenate([is_state(output, ChannelState.AMBIGUOUS) for output in kept.outputs])
     excepted = np.array([name == EXCEPTED.get(recorded.vehicle) for name in kept.pipeline.channel_names])
     among[among[:, excepted].any(axis=1)] = False
     return Replayed(seconds_of(stamp), alone & ~excepted, named & ~excepted, among, kept.pipeline)
@@ -222,11 +212,8 @@ def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
     """Shares of the trials."""
     words, delays = [o[0] for o in outcomes], np.array([o[1] for o in outcomes])
     named = {f"in_{limit:g}_s": float((delays <= limit).mean()) for limit in WITHIN}
-    return {
-        "trials": len(words),
-        **named,
-        **{name.replace(" ", "_"): words.count(name) / len(words) for name in OTHERS},
-    }
+    others = {name.replace(" ", "_"): words.count(name) / len(words) for name in OTHERS}
+    return {"trials": len(words), **named, **others}
 
 
 def measure(asked: Asked) -> Iterator[Row]:

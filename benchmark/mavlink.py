@@ -24,7 +24,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,17 +59,18 @@ NOISE, SCALE, MOTION = 0.004, 0.005, 0.6
 # What can be found -------------------------------------------------------------------------------------------------
 
 
-def flight(
-    stack: str, rate: float, seed: int, count: int, fault: tuple[float, float], link: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+Messages = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def flight(stack: str, rate: float, seed: int, count: int, fault: tuple[float, float]) -> Messages:
     """Messages of IMUs in motion: unit, stamp, ns, rates (k, 3); imu_2.y has a bias and a drift from `STRIKES` on.
 
-    With noise of 4 mrad/s, scale factors off by 0.5 %, up to about 0.8 rad/s, sampled as the autopilot does.
-    link: in the steps of SCALED_IMU, cut off towards zero; else exact.
+    With noise of 4 mrad/s, scale factors off by 0.5 %, up to about 0.8 rad/s, sampled as the autopilot does,
+    in the steps of SCALED_IMU, cut off towards zero.
     """
     random = np.random.default_rng(seed)
     phase, factor = random.uniform(0, 2 * np.pi, 6), 1 + SCALE * random.standard_normal((3, 3))
-    slow, fast = (0.25, 0.41, 0.17), (0.83, 0.67, 0.53)
+    slow, fast = (2 * np.pi * np.array(hertz) for hertz in ((0.25, 0.41, 0.17), (0.83, 0.67, 0.53)))
     units, stamps, rates = [], [], []
     for unit in range(count):
         due = np.arange(round(SECONDS * rate)) / rate
@@ -80,17 +80,11 @@ def flight(
         else:
             first = 0.0007 * unit
             at = stamp = np.floor((due + random.uniform(0, 0.006) - first) / 0.005) * 0.005 + first
-        omega = np.column_stack(
-            [
-                np.sin(2 * np.pi * slow[a] * at + phase[a]) + 0.4 * np.sin(2 * np.pi * fast[a] * at + phase[a + 3])
-                for a in range(3)
-            ]
-        )
+        omega = np.sin(np.outer(at, slow) + phase[:3]) + 0.4 * np.sin(np.outer(at, fast) + phase[3:])
         z = MOTION * omega * factor[unit] + NOISE * random.standard_normal(omega.shape)
         if unit == 1:
             z[:, 1] += (fault[0] + fault[1] * (at - STRIKES)) * (at >= STRIKES)
-        if link:
-            z, stamp = np.trunc(z * 1e3) / 1e3, np.floor(stamp * 1e3) / 1e3
+        z, stamp = np.trunc(z * 1e3) / 1e3, np.floor(stamp * 1e3) / 1e3
         units.append(np.full(len(at), unit))
         stamps.append(np.round((stamp + 100.0) * NS).astype(np.int64))
         rates.append(z)
@@ -101,17 +95,13 @@ def flight(
 class Told(NamedTuple):
     """What was declared in one flight."""
 
-    first: float
-    """Time from the fault to the first declaration, s; infinite: there was none."""
-    named: float
-    """To that which names the channel that is struck."""
-    wrong: int
-    """Declarations that name a healthy channel, or a set without that which is struck."""
-    early: int
-    """Declarations before the fault."""
+    first: float  # time from the fault to the first declaration, s; infinite: there was none
+    named: float  # to that which names the channel that is struck
+    wrong: int  # declarations that name a healthy channel, or a set without that which is struck
+    early: int  # declarations before the fault
 
 
-def judged(config: Config, messages: tuple[np.ndarray, np.ndarray, np.ndarray], struck: bool) -> Told:
+def judged(config: Config, messages: Messages, struck: bool) -> Told:
     """Let the monitor judge a flight."""
     from fdi_ros.core.alignment import Alignment
     from fdi_ros.monitor.pipeline import Pipeline
@@ -143,21 +133,16 @@ def found(flights: int) -> None:
             whole = Config.from_file(ROOT / "config" / f"{stack}.yaml")
             given = {"imus.topics": whole.imus.topics[:count], "imus.names": whole.imus.names[:count]}
             given |= {"imus.mounts": whole.imus.mounts[: 9 * count]}
-            for link, rate in product((True, False), RATES):
+            for rate in RATES:
                 config, row, wrong, early = whole.replaced({**given, "sample_rate": rate}), [], 0, 0
                 for name, fault in FAULTS.items():
                     told = [
-                        judged(config, flight(stack, rate, seed, count, fault, link), any(fault))
-                        for seed in range(flights)
+                        judged(config, flight(stack, rate, seed, count, fault), any(fault)) for seed in range(flights)
                     ]
                     wrong, early = wrong + sum(t.wrong for t in told), early + sum(t.early for t in told)
                     if any(fault):
                         row.append(f"{name}: {_share([t.first for t in told])}, {_share([t.named for t in told])}")
-                kind = "1 mrad/s" if link else "exact"
-                print(
-                    f"{count} {stack:10}{kind:9}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}",
-                    flush=True,
-                )
+                print(f"{count} {stack:10}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}", flush=True)
 
 
 def _share(times: list[float]) -> str:
@@ -228,9 +213,6 @@ def cpu(seconds: float) -> None:
             f"{name:24}{100 * used / took:6.1f} % CPU, {1e6 * used / sent:.0f} us a message; "
             f"{sent / took:.0f} messages and {heard / took:.0f} Imu a second"
         )
-
-
-# Storms ------------------------------------------------------------------------------------------------------------
 
 
 # Failover ------------------------------------------------------------------------------------------------------------

@@ -28,8 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw")
 RATES = (1000, 1500, 2000, 3000, 4000, 5000, 6000, 8000, 10000, 12000, 14000, 16000, 20000)
-SUSTAINED = 1e-3
-"""Loss above this share is no sustained rate: the listener itself may be kept waiting for a moment."""
+SUSTAINED = 1e-3  # loss above this share is no sustained rate: the listener itself may be kept waiting for a moment
 CANDIDATES = {
     "fdi_node": [
         *("-m", "fdi_ros.ros.process", "fdi_node", "--ros-args"),

@@ -7,40 +7,30 @@ Flights of 40 s of small MEMS units in white noise; from 10 s on channels are fa
 7 to 28) with random signs. Input: one Imu topic for each unit, or one array of the same channels.
 
 wrong: a healthy channel was FAULTY at any time; held: at the end every guilty channel is FAULTY or in a set, no healthy
-one FAULTY; named: all of them FAULTY; partly: some of them; missed: none; early: something was declared before the
-fault; unjudged: the channels were not checked when it began, which counts as nothing else.
-set size: mean number of channels in the set at the end, where there is one; delay: median to the first declaration, s.
+one FAULTY; named: all of them FAULTY; early: something was declared before the fault; unjudged: the channels were not
+checked when it began, which counts as nothing else. set size: mean of channels in the set at the end, where there is
+one; delay: median to the first declaration, s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trials import STATED, Array, Asked, Flight, Mask, Rng, Row, faulty, first, fresh, in_set, unchecked
+from trials import Array, Asked, Flight, Mask, Rng, Row, faulty, first, fresh, is_state, ways
 
-from fdi_ros import Config, Pipeline
+from fdi_ros import Pipeline
 from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.monitor.output import ChannelState
 
-LENGTH, ONSET = 40.0, 10.0
-"""Of a flight, and when faults begin, s."""
-GROWTH = 5.0
-"""A ramp has its size after so long, s."""
-COUNTED = ("wrong", "held", "named", "partly", "missed", "early", "unjudged")
+LENGTH, ONSET = 40.0, 10.0  # of a flight, and when faults begin, s
+GROWTH = 5.0  # a ramp has its size after so long, s
+COUNTED = ("wrong", "held", "named", "early", "unjudged")
 FIGURES = {"flights": "d", **dict.fromkeys(COUNTED, "d"), "set_size": ".1f", "delay": ".2f"}
 
-Courses = Callable[[Array, Rng, int], Array]
-"""Errors of the guilty channels, (N, k) in sigma, at times (N,) s."""
-
-
-class Faults(NamedTuple):
-    """Which channels are faulty, and how."""
-
-    count: int
-    """Guilty channels; 0: one whole unit."""
-    courses: Courses
+Courses = Callable[[Array, Rng, int], Array]  # errors of the guilty channels, (N, k) in sigma, at times (N,) s
 
 
 def sizes(rng: Rng, count: int, least: float = 8.0, most: float = 50.0) -> Array:
@@ -70,49 +60,39 @@ def intermittent(seconds: Array, rng: Rng, count: int) -> Array:
     return on * sizes(rng, count)
 
 
-KINDS = {
-    "one bias": Faults(1, biases),
-    "two biases": Faults(2, biases),
-    "three biases": Faults(3, biases),
-    "two ramps": Faults(2, ramps),
-    "whole unit": Faults(0, of_a_unit),
-    "sequence of two": Faults(2, sequence),
-    "two intermittent": Faults(2, intermittent),
+KINDS: dict[str, tuple[int, Courses]] = {
+    "one bias": (1, biases),
+    "two biases": (2, biases),
+    "three biases": (3, biases),
+    "two ramps": (2, ramps),
+    "whole unit": (0, of_a_unit),
+    "sequence of two": (2, sequence),
+    "two intermittent": (2, intermittent),
 }
+"""Guilty channels (0: one whole unit), and their errors."""
 
 
-def array_of(config: Config) -> Config:
-    """Return the config of one array of the channels of a config of units."""
-    axes = Pipeline.from_config(config).geometry.axes
-    mounting = {"geometry.preset": "axes", "geometry.axes": tuple(axes.ravel().tolist())}
-    # The cone's own preset knows its triads; its fourth axis is the reverse of the unit's.
-    mounting = mounting if len(axes) > 6 else {"geometry.preset": "two_triad_cone"}
-    same = {name: value for name, value in config.parameters().items() if name.split(".")[0] in ("bias", "detector")}
-    return Config.from_parameters({"input": "channels", **STATED, **mounting, **same})
-
-
-def fly(pipeline: Pipeline, rng: Rng, faults: Faults) -> dict[str, Any]:
+def fly(pipeline: Pipeline, rng: Rng, count: int, courses: Courses) -> dict[str, Any]:
     """Fly once; return what came of it."""
     flight = Flight.of(pipeline, rng, LENGTH, None, GyroErrors())
     seconds, n = flight.seconds, flight.shape[1]
     channels: NDArray[Any] = 3 * rng.integers(n // 3) + np.arange(3)
-    if faults.count:
-        channels = rng.choice(n, faults.count, replace=False)
+    if count:
+        channels = rng.choice(n, count, replace=False)
     guilty: Mask = np.isin(np.arange(n), channels)
     added = rng.standard_normal(flight.shape)
-    added[:, channels] += faults.courses(seconds, rng, len(channels))
+    added[:, channels] += courses(seconds, rng, len(channels))
     output = fresh(pipeline, flight.block(added))
-    alone, among, onset = faulty(output), in_set(output), int(np.searchsorted(seconds, ONSET))
+    alone, among = faulty(output), is_state(output, ChannelState.AMBIGUOUS)
+    onset = int(np.searchsorted(seconds, ONSET))
     declared = alone | among
-    if unchecked(output)[onset - 1].any():
+    if is_state(output, ChannelState.UNCHECKED)[onset - 1].any():
         return {"unjudged": True}
     hit, wrong = declared[-1, guilty], bool(alone[:, ~guilty].any())
     return {
         "wrong": wrong,
         "held": bool(hit.all()) and not wrong,
         "named": bool(alone[-1, guilty].all()) and not wrong,
-        "partly": bool(hit.any() and not hit.all()),
-        "missed": not hit.any(),
         "early": bool(declared[:onset].any()),
         "set_size": int(among[-1].sum()),
         "delay": (first(declared[onset:].any(axis=1)) - 1) / pipeline.config.sample_rate,
@@ -122,14 +102,10 @@ def fly(pipeline: Pipeline, rng: Rng, faults: Faults) -> dict[str, Any]:
 def measure(asked: Asked) -> Iterator[Row]:
     """Every kind, mounting and input."""
     flights = asked.count(20)
-    for mounting, units in asked.configs().items():
-        for way, config in (("Imu topics", units), ("array", array_of(units))):
-            pipeline = Pipeline.from_config(config)
-            for name, faults in KINDS.items():
-                if not asked.wants(label := f"{mounting}, {way}, {name}"):
-                    continue
-                outcomes = [fly(pipeline, asked.rng("several", mounting, name, k), faults) for k in range(flights)]
-                sets = [o["set_size"] for o in outcomes if o.get("set_size")]
-                counts = {word: sum(o.get(word, False) for o in outcomes) for word in COUNTED}
-                size, delays = float(np.mean(sets)) if sets else None, [o.get("delay", np.inf) for o in outcomes]
-                yield label, {"flights": flights, **counts, "set_size": size, "delay": float(np.median(delays))}
+    for label, mounting, config, name in ways(asked, None, KINDS):
+        pipeline = Pipeline.from_config(config)
+        outcomes = [fly(pipeline, asked.rng("several", mounting, name, k), *KINDS[name]) for k in range(flights)]
+        sets = [o["set_size"] for o in outcomes if o.get("set_size")]
+        counts = {word: sum(o.get(word, False) for o in outcomes) for word in COUNTED}
+        size, delays = float(np.mean(sets)) if sets else None, [o.get("delay", np.inf) for o in outcomes]
+        yield label, {"flights": flights, **counts, "set_size": size, "delay": float(np.median(delays))}

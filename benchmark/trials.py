@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -22,21 +22,17 @@ from rosbags.typesys import Stores, get_typestore
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps, vehicle_motion
+from fdi_ros.experiments.simulate import GyroErrors, Gyros, Motion, regular_stamps, vehicle_motion
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.output import ChannelState, Output
 
 Rng = np.random.Generator
-Row = tuple[str, dict[str, Any]]
-"""What was measured, in words, and its figures by name."""
+Row = tuple[str, dict[str, Any]]  # what was measured, in words, and its figures by name
 
 CONFIGS = Path(fdi_ros.__file__).parents[1] / "config"
-START = 10**18
-"""Stamp of the first sample of a simulated flight, ns."""
-RATE = 100.0
-"""Samples a second."""
-NOISE = 0.003
-"""Standard deviation of the white noise of a channel in one sample, rad/s: "sigma" in all tables."""
+START = 10**18  # stamp of the first sample of a simulated flight, ns
+RATE = 100.0  # samples a second
+NOISE = 0.003  # standard deviation of the white noise of a channel in one sample, rad/s: "sigma" in all tables
 STATED: dict[str, Any] = {
     "sample_rate": RATE,
     "noise.noise_std": (NOISE,),
@@ -51,10 +47,8 @@ PARALLEL: dict[str, Any] = {
     "imus.mounts": (),
 }
 """What makes three parallel units of the two of two_imus.yaml."""
-NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)
-"""Only the biases are not as they should be."""
-REST = 6.0
-"""At the start of every flight, s."""
+NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)  # only the biases are not as they should be
+REST = 6.0  # at the start of every flight, s
 
 
 @dataclass(frozen=True)
@@ -99,23 +93,13 @@ def fresh(pipeline: Pipeline, block: Block) -> Output:
     return pipeline.process(block)
 
 
-class Moving(Protocol):
-    """A motion as a function of time."""
-
-    def rate_at(self, t: Array) -> Array:
-        """Body rate (N, 3) rad/s at times t (N,) s."""
-
-
 @dataclass(frozen=True)
 class Sines:
     """Rest, then one sine about each axis."""
 
-    amplitude: float
-    """rad/s; 0: rest for ever."""
-    turn: Array
-    """(3,) rad/s."""
-    phase: Array
-    """(3,)"""
+    amplitude: float  # rad/s; 0: rest for ever
+    turn: Array  # (3,) rad/s
+    phase: Array  # (3,)
 
     @classmethod
     def drawn(cls, amplitude: float, rng: Rng) -> Sines:
@@ -134,14 +118,14 @@ class Flight:
 
     geometry: Geometry
     gyros: Gyros
-    motion: Moving
+    motion: Motion | Sines
     stamp: Int
     late: Array | float = 0.0
     """By how much the stamp of each unit lies after its sampling instant, s: a number, (units,) or (N, units)."""
 
     @classmethod
     def of(
-        cls, pipeline: Pipeline, rng: Rng, seconds: float, motion: Moving | None, errors: GyroErrors = NO_ERRORS
+        cls, pipeline: Pipeline, rng: Rng, seconds: float, motion: Motion | Sines | None, errors: GyroErrors = NO_ERRORS
     ) -> Flight:
         """Make gyros and fly them; None: as a small vehicle flies."""
         gyros = errors.draw(pipeline.geometry, rng)
@@ -188,8 +172,7 @@ def walks(rng: Rng, shape: tuple[int, int], walk: float) -> Array:
     return np.cumsum(walk / NOISE / np.sqrt(RATE) * rng.standard_normal(shape), axis=0)
 
 
-Noise = Callable[[Rng, int, int], Array]
-"""Noise of unit variance, (rows, n)."""
+Noise = Callable[[Rng, int, int], Array]  # noise of unit variance, (rows, n)
 
 
 def white(rng: Rng, rows: int, n: int) -> Array:
@@ -202,19 +185,9 @@ def faulty(output: Output) -> Mask:
     return np.asarray((output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE))
 
 
-def in_set(output: Output) -> Mask:
-    """(N, n) whether a channel is one of a set that holds a faulty one."""
-    return np.asarray(output.state == ChannelState.AMBIGUOUS)
-
-
-def suspect(output: Output) -> Mask:
-    """(N, n) whether a channel is under suspicion."""
-    return np.asarray(output.state == ChannelState.SUSPECT)
-
-
-def unchecked(output: Output) -> Mask:
-    """(N, n) whether a fault of a channel would go unseen."""
-    return np.asarray(output.state == ChannelState.UNCHECKED)
+def is_state(output: Output, state: ChannelState) -> Mask:
+    """(N, n) whether a channel is AMBIGUOUS (in a set that holds a faulty one), SUSPECT, UNCHECKED, as asked for."""
+    return np.asarray(output.state == state)
 
 
 def first(rows: Mask) -> float:
@@ -225,30 +198,25 @@ def first(rows: Mask) -> float:
 class Found(NamedTuple):
     """What came of the fault of one channel."""
 
-    declared: float
-    """Samples to the declaration of the channel, or of a set that holds it; inf: none."""
-    named: float
-    """Until it stands alone."""
-    wrong: bool
-    """A healthy channel was declared by itself."""
-    early: bool
-    """Something stood declared before the fault."""
-    judged: bool
-    """The channels were checked when it began."""
+    declared: float  # samples to the declaration of the channel, or of a set that holds it; inf: none
+    named: float  # until it stands alone
+    wrong: bool  # a healthy channel was declared by itself
+    early: bool  # something stood declared before the fault
+    judged: bool  # the channels were checked when it began
 
 
 def found(output: Output, channel: int, onset: int, guilty: tuple[int, ...] = (), since: int = 0) -> Found:
     """Say what came of a fault of one channel from a sample on; guilty: others that are faulty, all clear since."""
-    alone, among = faulty(output), in_set(output)
+    alone, among = faulty(output), is_state(output, ChannelState.AMBIGUOUS)
     alone[:, list(guilty)] = among[:, list(guilty)] = False
     wrong = np.delete(alone[onset:], channel, axis=1).any()
     early = (alone | among)[since:onset].any()
     own = alone[onset:, channel]
-    judged = not unchecked(output)[onset - 1, channel]
+    judged = not is_state(output, ChannelState.UNCHECKED)[onset - 1, channel]
     return Found(first(own | among[onset:, channel]), first(own), bool(wrong), bool(early), bool(judged))
 
 
-def summary(outcomes: list[Found], most: float, unit: float = 1.0) -> dict[str, Any]:
+def summary(outcomes: list[Found], most: float) -> dict[str, Any]:
     """Figures of faults that were watched for at most so many samples: mean and median (missed ones count as that)."""
     kept = [o for o in outcomes if o.judged and not o.early]
     declared, named = (np.array([o[k] for o in kept]) for k in (0, 1))
@@ -257,11 +225,11 @@ def summary(outcomes: list[Found], most: float, unit: float = 1.0) -> dict[str, 
     if not kept:
         return share
     return {
-        "declared": unit * float(np.minimum(declared, most).mean()),
-        "error": unit * float(np.minimum(declared, most).std() / np.sqrt(len(kept))),
-        "median": unit * float(np.median(declared)),
-        "named": unit * float(np.minimum(named, most).mean()),
-        "named_median": unit * float(np.median(named)),
+        "declared": float(np.minimum(declared, most).mean()),
+        "error": float(np.minimum(declared, most).std() / np.sqrt(len(kept))),
+        "median": float(np.median(declared)),
+        "named": float(np.minimum(named, most).mean()),
+        "named_median": float(np.median(named)),
         "missed": float(np.isinf(declared).mean()),
         "unnamed": float(np.isinf(named).mean()),
         **share,
@@ -281,6 +249,25 @@ def labelled(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Itera
         for kind in kinds:
             if asked.wants(label := f"{mounting} {kind}"):
                 yield label, pipeline, kind
+
+
+def array_of(config: Config) -> Config:
+    """Return the config of one array of the channels of a config of units."""
+    axes = Pipeline.from_config(config).geometry.axes
+    mounting = {"geometry.preset": "axes", "geometry.axes": tuple(axes.ravel().tolist())}
+    # The cone's own preset knows its triads; its fourth axis is the reverse of the unit's.
+    mounting = mounting if len(axes) > 6 else {"geometry.preset": "two_triad_cone"}
+    same = {name: value for name, value in config.parameters().items() if name.split(".")[0] in ("bias", "detector")}
+    return Config.from_parameters({"input": "channels", **STATED, **mounting, **same})
+
+
+def ways(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Iterator[tuple[str, str, Config, Any]]:
+    """Every kind with both mountings and both inputs: its label, the mounting, the config and the kind."""
+    for mounting, units in asked.configs(settings).items():
+        for way, config in (("Imu topics", units), ("array", array_of(units))):
+            for kind in kinds:
+                if asked.wants(label := f"{mounting}, {way}, {kind}"):
+                    yield label, mounting, config, kind
 
 
 def write_bag(block: Block, topics: tuple[str, ...], path: Path, late: Array | float = 0.0) -> None:

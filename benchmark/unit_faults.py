@@ -25,16 +25,14 @@ from typing import Any
 
 import numpy as np
 from flights import Kept
-from several import array_of
-from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked, write_bag
+from trials import START, Array, Asked, Flight, Rng, Row, faulty, is_state, ways, write_bag
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.simulate import GyroErrors
-from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, replay
 
-LENGTH, ONSET = 120.0, 20.0
-"""Of a flight, and when a fault begins that is not there from the start, s."""
+LENGTH, ONSET = 120.0, 20.0  # of a flight, and when a fault begins that is not there from the start, s
 COUNTED = ("other", "single", "unit", "in_sets")
 FIGURES = {
     "flights": "d",
@@ -44,8 +42,7 @@ FIGURES = {
     **dict.fromkeys(("off", "sigmas", "nees"), ".2f"),
 }
 
-Late = Callable[[Array, Rng], Array]
-"""By how much the stamps of the unit are late, (N,) s, at times (N,) s."""
+Late = Callable[[Array, Rng], Array]  # by how much the stamps of the unit are late, (N,) s, at times (N,) s
 Change = Callable[[Array, Array, Array, Rng], Array]
 """What the unit shows instead: of times (N,) s, values (N, 3) rad/s and axes (3, 3)."""
 
@@ -141,13 +138,14 @@ def fly(config: Config, rng: Rng, kind: str) -> dict[str, Any]:
         error = (rate - flight.motion.rate_at(at - shift))[valid]
         nees.append(float(np.einsum("ki,kij,kj->k", error, information, error).mean()) / 3)
     alone = np.concatenate([faulty(o) for o in given]).any(axis=0)
+    unchecked = np.concatenate([is_state(o, ChannelState.UNCHECKED) for o in given])
     other = bool(np.delete(alone, own).any())
     return {
         "other": other,
         "single": bool(alone[own].any() and not alone[own].all()),
         "unit": bool(alone[own].all()) and not other,
-        "in_sets": any(bool(in_set(o).any()) for o in given),
-        "unjudged": float(np.concatenate([unchecked(o) for o in given])[after].any(axis=1).mean()),
+        "in_sets": any(bool(is_state(o, ChannelState.AMBIGUOUS).any()) for o in given),
+        "unjudged": float(unchecked[after].any(axis=1).mean()),
         "off": delay_error(pipeline, late[-1] - flight.gyros.delay[::3]) if "jitter" not in kind else None,
         "nees": min(nees) if valid.any() else None,
     }
@@ -168,23 +166,15 @@ def delay_error(pipeline: Pipeline, late: Array) -> tuple[float, float] | None:
 def measure(asked: Asked) -> Iterator[Row]:
     """Every kind, mounting and input."""
     flights = asked.count(2)
-    for mounting, units in asked.configs({"imus.max_skew": 1e-4}).items():
-        for way, config in (("Imu topics", units), ("array", array_of(units))):
-            for kind in (*LATE, *CHANGES):
-                if not asked.wants(label := f"{mounting}, {way}, {kind}"):
-                    continue
-                outcomes = [fly(config, asked.rng("unit", mounting, kind, k), kind) for k in range(flights)]
-                told = np.array([o["off"] for o in outcomes if o["off"] is not None])
-                nees = [o["nees"] for o in outcomes if o["nees"] is not None]
-                yield (
-                    label,
-                    {
-                        "flights": flights,
-                        **{name: sum(o[name] for o in outcomes) for name in COUNTED},
-                        "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
-                        "told": len(told),
-                        "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
-                        "sigmas": float(told[:, 1].max()) if len(told) else None,
-                        "nees": float(np.mean(nees)) if nees else None,
-                    },
-                )
+    for label, mounting, config, kind in ways(asked, {"imus.max_skew": 1e-4}, (*LATE, *CHANGES)):
+        outcomes = [fly(config, asked.rng("unit", mounting, kind, k), kind) for k in range(flights)]
+        told = np.array([o["off"] for o in outcomes if o["off"] is not None])
+        nees = [o["nees"] for o in outcomes if o["nees"] is not None]
+        figures = {
+            "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
+            "told": len(told),
+            "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
+            "sigmas": float(told[:, 1].max()) if len(told) else None,
+            "nees": float(np.mean(nees)) if nees else None,
+        }
+        yield label, {"flights": flights, **{name: sum(o[name] for o in outcomes) for name in COUNTED}, **figures}

@@ -21,14 +21,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from healthy import autoregressive
 from trials import CONFIGS, NOISE, START, Array, Asked, Rng, Row, fresh
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.simulate import Motion, regular_stamps
 from fdi_ros.monitor.output import ChannelState
 
-LENGTH, MOTORS, COUNTED = 60.0, 10.0, 15.0
-"""s: of a flight, until the motors start, and from where on errors count."""
+LENGTH, MOTORS, COUNTED = 60.0, 10.0, 15.0  # s: of a flight, until the motors start, and from where on errors count
 SCALE, MISALIGNMENT, BIAS = 0.003, float(np.radians(0.2)), 0.01
 SUMS = {
     "nees": (np.mean, ".2f"),
@@ -50,23 +50,16 @@ class Flight:
 
     rng: Rng
     rate: float
-    t: Array
-    """(N,) s."""
-    motion: Callable[[Array], Array]
-    """Body rate (N, 3) at times (N,), rad/s."""
-    axes: Array
-    """True axes (n, 3)."""
-    late: Array
-    """(N, units) s."""
-    noise: Array
-    """(N, n) rad/s."""
-    std: Array
-    """(n,) of the noise, rad/s; NaN: no best error is known."""
+    t: Array  # (N,) s
+    motion: Callable[[Array], Array]  # body rate (N, 3) at times (N,), rad/s
+    axes: Array  # true axes (n, 3)
+    late: Array  # (N, units) s
+    noise: Array  # (N, n) rad/s
+    std: Array  # (n,) of the noise, rad/s; NaN: no best error is known.
     shaken: Callable[[Array], Array] | None = None
     """Rotation of the whole body (N, 3) by vibration at times (N,), rad/s."""
     gain: Array | float = 1.0
-    phase: Array | float = 0.0
-    """Of each channel (n,) in it; phase as a delay, s."""
+    phase: Array | float = 0.0  # of each channel (n,) in it; phase as a delay, s
 
     @property
     def units(self) -> int:
@@ -88,11 +81,6 @@ class Flight:
             if self.shaken is not None:
                 z[:, i] += gain[i] * (self.shaken(at - phase[i]) @ self.axes[i])
         return z + self.noise
-
-    @property
-    def running(self) -> Array:
-        """(N,) how far the motors have started, 0 to 1."""
-        return np.clip((self.t - MOTORS) / 0.5, 0.0, 1.0)
 
 
 def manoeuvres(rng: Rng) -> Callable[[Array], Array]:
@@ -139,7 +127,7 @@ def tones(flight: Flight, size: float, *hertz: float) -> None:
     """Lines of their own phase in each channel, amplitude size, rad/s."""
     for frequency in hertz:
         phase = flight.rng.uniform(0, 2 * np.pi, len(flight.axes))
-        flight.noise += size * flight.running[:, None] * np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
+        flight.noise += size * running_at(flight.t) * np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
     flight.std[:] = np.nan
 
 
@@ -171,19 +159,15 @@ def broad(flight: Flight, size: float) -> None:
     flight.std[:] = np.nan
 
 
-def autoregressive(flight: Flight, memory: float) -> None:
+def coloured(flight: Flight, memory: float) -> None:
     """Noise of the first order with this memory from sample to sample, of the same variance."""
-    drawn = NOISE * flight.rng.standard_normal(flight.noise.shape)
-    coloured = np.empty_like(drawn)
-    coloured[0] = drawn[0]
-    for k in range(1, len(drawn)):
-        coloured[k] = memory * coloured[k - 1] + np.sqrt(1 - memory**2) * drawn[k]
-    flight.noise += coloured - (flight.noise - flight.noise.mean(axis=0))
+    drawn = NOISE * autoregressive(memory)(flight.rng, *flight.noise.shape)
+    flight.noise += drawn - (flight.noise - flight.noise.mean(axis=0))
 
 
 def low_pass(flight: Flight, hertz: float) -> None:
     """White noise through a filter of the first order."""
-    autoregressive(flight, float(np.exp(-2 * np.pi * hertz / flight.rate)))
+    coloured(flight, float(np.exp(-2 * np.pi * hertz / flight.rate)))
 
 
 def clocks(flight: Flight, ppm: float) -> None:
@@ -197,7 +181,7 @@ def louder(flight: Flight, count: int, factor: float) -> None:
     n = len(flight.axes)
     own = [int(flight.rng.integers(n))] if count == 1 else 3 * int(flight.rng.integers(n // 3)) + np.arange(3)
     added = flight.rng.standard_normal((len(flight.t), count))
-    flight.noise[:, own] += np.sqrt(factor**2 - 1) * NOISE * flight.running[:, None] * added
+    flight.noise[:, own] += np.sqrt(factor**2 - 1) * NOISE * running_at(flight.t) * added
     flight.std[own] *= factor
 
 
@@ -217,7 +201,7 @@ def landing(flight: Flight, size: float) -> None:
 
 def rectified(flight: Flight, size: float) -> None:
     """Biases that move as the motors start."""
-    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * flight.running[:, None]
+    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * running_at(flight.t)
     tones(flight, 0.02, 41.0)
 
 
@@ -248,7 +232,7 @@ CONDITIONS: dict[str, tuple[Any, ...]] = {
     "two own tones 0.1": (100.0, tones, 0.1, 31.0, 43.0),
     **{f"body {size} {hertz} Hz at {rate:.0f}": (rate, body, size, hertz) for size, hertz, rate in TONES},
     "body broadband 0.05": (100.0, broad, 0.05),
-    "AR 0.9": (100.0, autoregressive, 0.9),
+    "AR 0.9": (100.0, coloured, 0.9),
     "low pass 30 Hz at 400": (400.0, low_pass, 30.0),
     "clocks 50 ppm": (100.0, clocks, 50.0),
     "misalignment 0.5 deg": (100.0, misaligned),

@@ -125,8 +125,7 @@ MEANING: dict[str, dict[str, str]] = {
 }
 """What the settings of each kind of study mean."""
 
-REPLAY = "replay/summary.py"
-"""Module of which the classes are the result of a replay."""
+REPLAY = "replay/summary.py"  # module of which the classes are the result of a replay
 SWEEP_MODULE = "replay/sweep_report.py"
 SWEEP: dict[str, tuple[str, dict[str, str]]] = {
     "sweep_figures": (
@@ -241,8 +240,7 @@ def results() -> str:
 MARKS = {"parameters": parameters, "node parameters": node_parameters, "studies": studies, "results": results}
 
 
-PAGES = ("parameters.md", "files.md")
-"""That have marks."""
+PAGES = ("parameters.md", "files.md")  # that have marks
 
 
 def filled(text: str) -> str:

@@ -47,7 +47,7 @@ def seconds(block: Block) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_stated_errors_are_the_actual_ones(kind: str) -> None:
-    # Some hundred figures of each; benchmark/setup.py has many vehicles.
+    # Some hundred figures of each; `benchmark/estimator.py calibration` has many vehicles.
     axes, biases, delays = [], [], []
     for seed, units in ((0, 3), (1, 2), (2, 3)):
         one, result = made(seed, kind, units)
