@@ -40,7 +40,7 @@ fi
 export NUMBA_OPT=0 NUMBA_CACHE_DIR=.venv-ubuntu/compiled PYTHONPATH=$PWD
 if [ $# = 0 ]; then
     # A monitor fed with messages, a live node, its files, and what the verbs say.
-    set -- test/test_libraries.py test/test_trusted_file.py test/monitor/test_receiver.py \
+    set -- test/test_libraries.py test/test_files.py test/monitor/test_receiver.py \
         test/test_layers.py::test_a_live_node_imports_nothing_that_is_for_offline_use
 fi
 exec .venv-ubuntu/bin/python -m pytest -p no:cacheprovider "$@"

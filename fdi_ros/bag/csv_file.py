@@ -32,7 +32,7 @@ from fdi_ros.bag.log_parts import ImuSamples, Portion, Source
 from fdi_ros.bag.raw import MOST_SHOWN
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
-from fdi_ros.system.limits import CSV_LINE_BYTES, EARLIEST
+from fdi_ros.system.files import CSV_LINE_BYTES, EARLIEST
 from fdi_ros.system.text import shown
 from fdi_ros.system.yaml_file import read_yaml
 

@@ -28,7 +28,7 @@ from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
+from fdi_ros.system.files import EARLIEST, LATEST, LOG_SPAN
 from fdi_ros.system.text import shown
 
 IMU = "sensor_msgs/msg/Imu"

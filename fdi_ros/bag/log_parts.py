@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.samples import Array, Int
-from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
+from fdi_ros.system.files import EARLIEST, LATEST, LOG_SPAN
 
 FLU = np.array([1.0, -1.0, -1.0])  # from FRD
 FEWEST = 20  # samples by which the rate of a source can be judged

@@ -30,7 +30,7 @@ from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.model.samples import Bytes, Int
-from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS
+from fdi_ros.system.files import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
 _PREFIX = 9  # bytes of a record before its content: opcode, length of the content

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
-from fdi_ros.system.limits import FILES
+from fdi_ros.system.files import FILES, open_regular
 from fdi_ros.system.text import shown
-from fdi_ros.system.trusted_file import open_regular
 from fdi_ros.system.yaml_file import read_yaml
 
 MOST_SHOWN = 400  # characters of what is said of one place

@@ -30,9 +30,8 @@ from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import SOURCES, source_of_type
-from fdi_ros.system.limits import CHANNELS, LATEST, max_unpacked_bytes
+from fdi_ros.system.files import CHANNELS, LATEST, max_unpacked_bytes, open_regular
 from fdi_ros.system.text import shown
-from fdi_ros.system.trusted_file import open_regular
 
 LOGS: dict[str, type[FlightLog]] = {".bin": DataflashLog, ".csv": CsvLog, ".tlog": Tlog, ".ulg": Ulog, ".ulog": Ulog}
 """Formats of flight logs, and tables of text."""

@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros.bag.raw import BagFile, Batch, Damage, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import source_of_type
-from fdi_ros.system.limits import CHUNK_BYTES, PORTION_BYTES, ROS1_INDEX_BYTES
+from fdi_ros.system.files import CHUNK_BYTES, PORTION_BYTES, ROS1_INDEX_BYTES
 
 MAGIC = b"#ROSBAG V2.0\n"
 _TOGETHER = 4096  # messages handed on at once

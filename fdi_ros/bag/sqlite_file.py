@@ -25,7 +25,7 @@ import zstandard
 
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.errors import BagError
-from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE
+from fdi_ros.system.files import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE
 
 _ROWS = 4096  # messages read at once
 _TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next

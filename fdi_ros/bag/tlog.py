@@ -25,7 +25,7 @@ from fdi_ros.bag.log_parts import ImuSamples, Portion, Source, parts, possible_s
 from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Int
-from fdi_ros.system.limits import TLOG_BYTES
+from fdi_ros.system.files import TLOG_BYTES
 
 _HEARTBEAT, _STATUSTEXT = 0, 253
 _AUTOPILOT_COMPONENT = 1

@@ -32,8 +32,7 @@ from fdi_ros.cli.settings import COMPILE, GEOMETRY, SHIPPED, WATCH
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.system.installation import require, resolve
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 VERBS = {
     "setup": SETUP,

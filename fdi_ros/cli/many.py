@@ -20,11 +20,11 @@ def _fleet(arguments: Namespace) -> int:
     """Judge them, write tables and page, print what needs a person."""
     from fdi_ros.cli.ahead import compile_for_workers
     from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_target, config_words, versions
-    from fdi_ros.config.parameter_file import with_parameters
+    from fdi_ros.config.config import with_parameters
     from fdi_ros.fleet.judge import find_recordings, judge_all
     from fdi_ros.fleet.tables import Fleet, Tables
+    from fdi_ros.system.files import write_text
     from fdi_ros.system.jobs import worker_count
-    from fdi_ros.system.result_file import write_text
 
     workers = worker_count(arguments.workers)
     names = ", ".join(shown(file.name) for file in arguments.config)
@@ -91,7 +91,7 @@ def _montecarlo(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress
     from fdi_ros.experiments.montecarlo import load_study, run_study
     from fdi_ros.experiments.report import headline, report
-    from fdi_ros.system.result_file import plain
+    from fdi_ros.system.files import plain
 
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")

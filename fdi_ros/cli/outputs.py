@@ -25,11 +25,9 @@ from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import WORDS, View, clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.verdict import Severity, with_first_line_coloured
+from fdi_ros.system.files import STANDARD_OUTPUT, is_open_already, is_stream, open_regular, real_path, whole, write_json
 from fdi_ros.system.installation import PROGRESS, there
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
-from fdi_ros.system.text import shown, visible
-from fdi_ros.system.trusted_file import open_regular
+from fdi_ros.system.text import LINE, shown, visible
 
 # Progress -------------------------------------------------------------------------------------------------------------
 
@@ -209,7 +207,7 @@ class Outputs:
             # They take their places at the end: where one cannot be written, there is none.
             for name, write in others.items():
                 if name in self._targets:
-                    write(stack.enter_context(whole_file(self._targets[name])))
+                    write(stack.enter_context(whole(self._targets[name])))
             if figures is not None:
                 write_json(self._targets.get("json"), figures)
         self.say(text, severity)

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 from fdi_ros.cli.arguments import FILE, PART, RESULTS, Options, Verb, config_files, shared
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.installation import BAGS, POOL, PROGRESS, resolve
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 if TYPE_CHECKING:
     from fdi_ros.cli.outputs import Outputs
@@ -47,7 +46,7 @@ def _inspect(arguments: Namespace) -> int:
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.findings import findings_figures, recording_findings, verdict_of
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
-    from fdi_ros.system.result_file import write_json, write_text
+    from fdi_ros.system.files import write_json, write_text
 
     outputs, unit = Outputs(arguments, ("json", "output"), [arguments.bag]), unit_of(arguments.degrees)
     reports, damage = inspect(arguments.bag)
@@ -156,8 +155,7 @@ SETUP = Verb(
 def _calibrate(arguments: Namespace) -> int:
     """Calibrate, say what was found, write the files."""
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
-    from fdi_ros.config.config import Config
-    from fdi_ros.config.parameter_file import with_parameters
+    from fdi_ros.config.config import Config, with_parameters
     from fdi_ros.setup.calibrate import REPLACED
     from fdi_ros.setup.run import recalibrate
 
@@ -206,12 +204,12 @@ def _convert(arguments: Namespace) -> int:
     """Convert to an MCAP bag of the gyro topics, and say how much was written."""
     from fdi_ros.bag.reader import Recording, convert
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
-    from fdi_ros.system.result_file import whole_folder
+    from fdi_ros.system.files import whole
 
     target = arguments.output
     outputs = Outputs(arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER)
     with Recording(arguments.bag) as recording:
-        with Progress(sys.stderr, arguments.quiet) as progress, whole_folder(target) as path:
+        with Progress(sys.stderr, arguments.quiet) as progress, whole(target) as path:
             counts = convert(recording, path, progress.show)
         damage = recording.damage.report()
     lines = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]

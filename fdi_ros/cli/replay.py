@@ -41,7 +41,7 @@ def _replay(arguments: Namespace) -> int:
     from fdi_ros.replay.words import summary_text, verdict
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.findings import refuse_degrees
-    from fdi_ros.system.result_file import whole_file, write_json
+    from fdi_ros.system.files import whole, write_json
 
     request, assumed = _request(arguments)
     geometry = build_geometry(request.config)
@@ -61,7 +61,7 @@ def _replay(arguments: Namespace) -> int:
             figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
         if report:
             page = report.html(summary, _about_replay(arguments, request, assumed))
-            stack.enter_context(whole_file(arguments.report)).write_text(page, encoding="utf-8")
+            stack.enter_context(whole(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
@@ -116,14 +116,14 @@ def _request(arguments: Namespace) -> tuple[Request, str]:
 def _sinks(arguments: Namespace, request: Request, geometry: Geometry, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
     from fdi_ros.replay.outputs import CsvFile, OutputBag
-    from fdi_ros.system.result_file import whole_file, whole_folder
+    from fdi_ros.system.files import whole
 
     sinks: list[Sink] = []
     if arguments.csv is not None:
-        path = stack.enter_context(whole_file(arguments.csv))
+        path = stack.enter_context(whole(arguments.csv))
         sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
     if arguments.output is not None:
-        path = stack.enter_context(whole_folder(arguments.output))
+        path = stack.enter_context(whole(arguments.output))
         sinks.append(stack.enter_context(OutputBag(path, request.config, geometry.n)))
     return sinks
 

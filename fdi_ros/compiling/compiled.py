@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compiling with Numba: the one module that calls the compiler, and where its results are kept.
+"""Compiling with Numba: records, functions over them, and where compiled code is kept; no other module calls Numba.
 
 Numba alone optimises each function by itself, and once more within every function that calls it: at five levels of
 calls five times. Here only what Python calls is optimised, and made machine code; what compiled code calls is a `Part`:
@@ -14,7 +14,7 @@ meets the results of another one. The folder lies in the package's own ``__pycac
 written in the user's cache folder, or else in a temporary one that no other user can write. A package folder that is
 read-only but was filled beforehand (``fdi compile``) serves as it is.
 
-What is found is run: so folders and files must belong to this user or root, closed to all others (`trusted_file`).
+What is found is run: so folders and files must belong to this user or root, closed to all others (`system.files`).
 
 With ``NUMBA_DISABLE_JIT=1`` everything runs as plain Python: slow, with the same results.
 """
@@ -33,10 +33,11 @@ import stat
 import sys
 import tempfile
 import time
+import typing
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import numba
 import numpy as np
@@ -49,7 +50,82 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from fdi_ros.system import trusted_file
+from fdi_ros.system.files import OTHERS, DistrustError, check_ancestor, check_trusted, close_to_others, lock, replacing
+
+F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
+
+INTERPRETED = bool(numba.config.DISABLE_JIT)
+"""Whether everything runs as plain Python."""
+LOG = logging.getLogger("fdi_ros")
+# A function over a record takes records that begin with the same fields, too; Numba warns that this is new to it.
+warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+
+# Records --------------------------------------------------------------------------------------------------------------
+# Classes whose annotated fields are a NumPy structured type of fixed size. A field is declared as one line,
+# ``name: Real  # unit, meaning``. A type checker sees plain numbers, arrays and other records; `record` makes the dtype
+# of the same layout. Records nest, and lists of records are arrays of them.
+
+MAX_CHANNELS = 12
+MAX_UNITS = 4
+
+Real = Annotated[float, "f8"]
+Whole = Annotated[int, "i8"]
+Mask = Annotated[int, "i8"]
+"""A set of channels, one bit each."""
+Small = Annotated[int, "u1"]
+Flag = Annotated[bool, "u1"]
+Vector = Annotated[NDArray[np.float64], "f8", (3,)]
+Channels = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS,)]
+Axes = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, 3)]
+Square = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
+Symmetric = Annotated[NDArray[np.float64], "f8", (6,)]
+"""Upper triangle of a symmetric (3, 3) matrix: xx, xy, xz, yy, yz, zz."""
+Units = Annotated[NDArray[np.float64], "f8", (MAX_UNITS,)]
+Stamps = Annotated[NDArray[np.int64], "i8", (MAX_CHANNELS,)]
+Counts = Annotated[NDArray[np.int64], "i8", (MAX_CHANNELS,)]
+Flags = Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS,)]
+
+
+def record(kind: type[T]) -> type[T]:
+    """Give a class of annotated fields the attribute `dtype`, the NumPy type of the same fields."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    taken = hints.keys() & set(dir(np.record))
+    if taken:
+        # In plain Python a record is an np.record: a field may not hide behind an attribute of it.
+        raise TypeError(f"{kind.__name__} has fields named like attributes of np.record: {', '.join(sorted(taken))}")
+    layout = [_field(name, hint) for name, hint in hints.items()]
+    kind.dtype = np.dtype(layout, align=True)  # type: ignore[attr-defined]
+    return kind
+
+
+def _field(name: str, hint: Any) -> tuple[Any, ...]:
+    if isinstance(getattr(hint, "dtype", None), np.dtype):
+        # Another record.
+        return (name, hint.dtype)
+    about = hint.__metadata__
+    if isinstance(about[0], str):
+        return (name, *about)
+    # A list of records of a fixed length.
+    (element,) = typing.get_args(hint.__origin__)
+    return (name, element.dtype, about)
+
+
+def allocate(kind: type, count: int = 1) -> NDArray[Any]:
+    """Return records of a class, all zero, (count,)."""
+    rows = np.zeros(count, dtype=kind.dtype)  # type: ignore[attr-defined]
+    return rows.view(np.recarray) if INTERPRETED else rows
+
+
+# Compiling ------------------------------------------------------------------------------------------------------------
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[\w.]*))", re.MULTILINE)
+_NAME = "fdi_ros"
+_dispatchers: list[Any] = []
+_callbacks: list[Callback] = []
+_parts: set[Path] = set()
+"""Marks of parts whose callers have not been kept yet."""
 
 
 class Part(CompilerBase):  # type: ignore[misc,unused-ignore]
@@ -84,23 +160,6 @@ class _Library(JITCodeLibrary):  # type: ignore[misc,unused-ignore]
         """Pass it over."""
 
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-INTERPRETED = bool(numba.config.DISABLE_JIT)
-"""Whether everything runs as plain Python."""
-LOG = logging.getLogger("fdi_ros")
-# A function over a record takes records that begin with the same fields, too; Numba warns that this is new to it.
-warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
-
-_PACKAGE = Path(__file__).resolve().parents[1]
-_IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[\w.]*))", re.MULTILINE)
-_NAME = "fdi_ros"
-_dispatchers: list[Any] = []
-_callbacks: list[Callback] = []
-_parts: set[Path] = set()
-"""Marks of parts whose callers have not been kept yet."""
-
-
 def compiled(function: F) -> F:
     """Compile a function when it is first called; the compiled result is kept on disk.
 
@@ -110,7 +169,7 @@ def compiled(function: F) -> F:
         return _quiet(function)
     with _kept(function):
         dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
-    _one_at_a_time(dispatcher)
+    dispatcher._cache._cache_file.__class__ = _Kept
     _call_as_part(dispatcher)
     _dispatchers.append(dispatcher)
     return cast(F, dispatcher)
@@ -138,7 +197,7 @@ class Callback:
 
     def __init__(self, function: Callable[..., None], records: tuple[type, ...]) -> None:
         self.function, self.records = function, records
-        self._compiled: Any = None
+        self.compiled: Any = None  # once the address was asked for
         _callbacks.append(self)
 
     def __call__(self, *arguments: Any) -> None:
@@ -150,21 +209,16 @@ class Callback:
         """What `call` takes; compiles the function if that was not done before."""
         if INTERPRETED:
             return _callbacks.index(self)
-        if self._compiled is None:
+        if self.compiled is None:
             types = tuple(numba.from_dtype(kind.dtype) for kind in self.records)  # type: ignore[attr-defined]
             # As `numba.cfunc` does, which would load what is kept before it is known whose it is.
             with _kept(self.function):
-                compiled = CFunc(self.function, (types, numba.types.void), {}, {"error_model": "numpy"})
+                compiled: Any = CFunc(self.function, (types, numba.types.void), {}, {"error_model": "numpy"})
                 compiled.enable_caching()
-                _one_at_a_time(compiled)
+                compiled._cache._cache_file.__class__ = _Kept
                 compiled.compile()
-            self._compiled = compiled
-        return int(self._compiled.address)
-
-    @property
-    def was_compiled(self) -> bool:
-        """Whether the address needed a compilation in this process, not only a load."""
-        return self._compiled is not None and self._compiled.cache_hits == 0
+            self.compiled = compiled
+        return int(self.compiled.address)
 
 
 def callback(*records: type) -> Callable[[Callable[..., None]], Callback]:
@@ -174,12 +228,6 @@ def callback(*records: type) -> Callable[[Callable[..., None]], Callback]:
         return Callback(_quiet(function) if INTERPRETED else function, records)
 
     return decorate
-
-
-def allocate(kind: type, count: int = 1) -> NDArray[Any]:
-    """Return records of a class, all zero, (count,)."""
-    rows = np.zeros(count, dtype=kind.dtype)  # type: ignore[attr-defined]
-    return rows.view(np.recarray) if INTERPRETED else rows
 
 
 def as_input(values: Any, kind: Any) -> NDArray[Any]:
@@ -207,7 +255,7 @@ def reported(what: str) -> Iterator[None]:
 def compilations() -> int:
     """Return how many compilations this process has made so far; what was only loaded does not count."""
     misses = sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers)
-    return misses + sum(one.was_compiled for one in _callbacks)
+    return misses + sum(one.compiled is not None and one.compiled.cache_hits == 0 for one in _callbacks)
 
 
 def missing() -> int:
@@ -235,8 +283,7 @@ if INTERPRETED:
         address: int, constants: int, row: int, size: int, state: int, state_size: int, sample: Any, verdict: Any
     ) -> None:
         """Call a `Callback`; see the compiled form."""
-        first, second = _by_address[constants], _by_address[state]
-        _callbacks[address](first[row], second[row], sample, verdict)
+        _callbacks[address](_by_address[constants][row], _by_address[state][row], sample, verdict)
 
 else:
 
@@ -304,7 +351,7 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
     def save(self, key: Any, data: Any) -> None:
         try:
             self._close()
-            with trusted_file.lock(f"{self._index_path}.lock"):
+            with lock(f"{self._index_path}.lock"):
                 super().save(key, data)
                 while _parts:
                     _parts.pop().touch(0o644)
@@ -337,13 +384,13 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
         """Check that nobody else can write the folder of the function, nor any between it and that of all results."""
         inside, top = Path(self._cache_path), folder()
         for one in (inside, *(parent for parent in inside.parents if parent.is_relative_to(top))):
-            trusted_file.close_to_others(one)
+            close_to_others(one)
 
     def _is_ours(self, path: str) -> bool:
         try:
             self._close()
-            trusted_file.check(path)
-        except trusted_file.DistrustError as error:
+            check_trusted(path)
+        except DistrustError as error:
             LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
             return False
         except OSError:
@@ -353,15 +400,10 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
     @contextlib.contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
         with super()._open_for_write(filepath) as file:
-            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~trusted_file.OTHERS)
+            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS)
             yield file
             file.flush()
             os.fsync(file.fileno())
-
-
-def _one_at_a_time(function: Any) -> None:
-    """Have a compiled function keep its results as `_Kept` does."""
-    function._cache._cache_file.__class__ = _Kept
 
 
 @functools.cache
@@ -389,7 +431,7 @@ def _temporary() -> Path:
     shared = Path(tempfile.gettempdir()) / f"{_NAME}-{os.getuid()}"
     with contextlib.suppress(OSError):
         shared.mkdir(mode=0o700, exist_ok=True)
-        trusted_file.check(shared)
+        check_trusted(shared)
         if shared.lstat().st_uid == os.getuid():
             return shared
     own = Path(tempfile.mkdtemp(prefix=f"{_NAME}-"))
@@ -403,12 +445,12 @@ def _usable(root: Path, version: str) -> bool:
     try:
         for folder in (root, path):
             folder.mkdir(parents=True, exist_ok=True)
-            trusted_file.close_to_others(folder)
+            close_to_others(folder)
         for above in root.resolve().parents:
-            trusted_file.check_ancestor(above)
+            check_ancestor(above)
         with tempfile.TemporaryFile(dir=path):
             return True
-    except trusted_file.DistrustError as error:
+    except DistrustError as error:
         LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
     except OSError:
         pass
@@ -417,7 +459,7 @@ def _usable(root: Path, version: str) -> bool:
 
 def _take_over(prepared: Path, target: Path) -> None:
     """Copy what was compiled beforehand into a package that cannot be written now."""
-    if prepared == target or not prepared.is_dir():
+    if prepared == target:
         return
     for source in prepared.rglob("*.nb?"):
         inside = source.relative_to(prepared)
@@ -425,10 +467,10 @@ def _take_over(prepared: Path, target: Path) -> None:
         if not copy.exists():
             with contextlib.suppress(OSError):
                 for one in (prepared.parent, prepared, *(prepared / folder for folder in inside.parents), source):
-                    trusted_file.check(one)
+                    check_trusted(one)
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                trusted_file.close_to_others(copy.parent)
-                with trusted_file.replacing(copy) as file:
+                close_to_others(copy.parent)
+                with replacing(copy) as file:
                     file.write(source.read_bytes())
 
 

@@ -46,8 +46,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate, compiled
-from fdi_ros.compiling.record import MAX_UNITS, Units
+from fdi_ros.compiling.compiled import MAX_UNITS, Units, allocate, compiled
 from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Counters, DelayBuffer, Sample, Unit
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int

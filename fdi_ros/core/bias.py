@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Portion, Sensors, ValueGroup
 from fdi_ros.model.samples import MAX_RATE, Array

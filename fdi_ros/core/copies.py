@@ -15,8 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.compiling.compiled import allocate, compiled
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate, compiled
 from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSettings
 from fdi_ros.core.subsets import LARGEST_RATE
 from fdi_ros.model.samples import Array

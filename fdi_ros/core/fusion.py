@@ -22,8 +22,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import Symmetric, Vector
+from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.health import is_at_rest
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_weights, covariance_of, eliminate_rate
 from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Parity, PathSettings, Subset

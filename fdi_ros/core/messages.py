@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
 from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
 from fdi_ros.model.samples import Array, Bytes, Int

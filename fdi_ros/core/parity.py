@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import Symmetric, Vector
+from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.record import (
+from fdi_ros.compiling.compiled import (
     MAX_CHANNELS,
     MAX_UNITS,
     Axes,

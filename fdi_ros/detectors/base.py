@@ -20,8 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
-from fdi_ros.compiling.record import Whole, record
+from fdi_ros.compiling.compiled import Callback, Whole, address_of, allocate, as_input, compiled, record
 from fdi_ros.core.records import Bank, Circumstances, SampleVerdict
 from fdi_ros.core.subsets import REFUSED, UNPREPARED, describe_sensors, flags_of, judge_sample, present_in, whole_set
 from fdi_ros.errors import DetectorError, FdiError

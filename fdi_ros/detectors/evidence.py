@@ -14,8 +14,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Whole, record
+from fdi_ros.compiling.compiled import MAX_CHANNELS, Channels, Real, Whole, compiled, record
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import FAR, LONG
 

@@ -29,8 +29,19 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Channels, Flag, Mask, Real, Square, Vector, Whole, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    MAX_UNITS,
+    Channels,
+    Flag,
+    Mask,
+    Real,
+    Square,
+    Vector,
+    Whole,
+    compiled,
+    record,
+)
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import Matrix, Parity
 from fdi_ros.model.geometry import ROUNDING

@@ -20,8 +20,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
+from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, Square, Whole, compiled, record
 from fdi_ros.model.samples import Array
 
 ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)

@@ -18,8 +18,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import (
+from fdi_ros.compiling.compiled import (
     MAX_CHANNELS,
     MAX_UNITS,
     Channels,
@@ -31,6 +30,7 @@ from fdi_ros.compiling.record import (
     Units,
     Vector,
     Whole,
+    compiled,
     record,
 )
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_joint_weights, compute_weights, eliminate_rate

@@ -18,8 +18,19 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Small, Square, Vector, Whole, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    Channels,
+    Flag,
+    Mask,
+    Real,
+    Small,
+    Square,
+    Vector,
+    Whole,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 

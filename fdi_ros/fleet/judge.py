@@ -23,8 +23,7 @@ from fdi_ros.bag.raw import LFS, LOG_SUFFIXES, SUFFIXES, Damage, files_of_bag, f
 from fdi_ros.bag.reader import LOGS
 from fdi_ros.bag.ros1_file import MAGIC
 from fdi_ros.bag.samples import read_block
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter_file import parameter_file, parameters_of
+from fdi_ros.config.config import Config, parameter_file, parameters_of
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
 from fdi_ros.model.samples import Block
@@ -38,9 +37,9 @@ from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
+from fdi_ros.system.files import open_regular
 from fdi_ros.system.jobs import run_jobs
 from fdi_ros.system.text import date_of, shown, storable
-from fdi_ros.system.trusted_file import open_regular
 
 
 def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:

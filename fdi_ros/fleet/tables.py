@@ -27,9 +27,8 @@ from fdi_ros import __version__
 from fdi_ros.errors import BagError
 from fdi_ros.report.layout import Column, Section, figures_of, html_table, number, page, told
 from fdi_ros.report.verdict import Severity, Verdict
-from fdi_ros.system.result_file import plain, whole_file, write_text
+from fdi_ros.system.files import open_regular, plain, whole, write_text
 from fdi_ros.system.text import shown, storable
-from fdi_ros.system.trusted_file import open_regular
 
 Row = Mapping[str, Any]  # values of a row by the names of the columns; None where nothing can be said.
 VERSION = 3  # of the columns: raised when one changes its name, type or meaning
@@ -176,7 +175,7 @@ class Tables:
             [arrow.field(one.name, kind, metadata=dict(one.metadata)) for one, kind in kinds],
             metadata={"fdi_ros": __version__, "columns": str(VERSION), "settings": self._settings},
         )
-        with whole_file(self._folder / f"{name}.parquet") as scratch, scratch.open("wb") as file:
+        with whole(self._folder / f"{name}.parquet") as scratch, scratch.open("wb") as file:
             parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), file)
 
 

@@ -24,7 +24,7 @@ from fdi_ros.mavlink.imu import ARDUPILOT
 from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
-from fdi_ros.system import trusted_file
+from fdi_ros.system.files import read_trusted, replacing
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
@@ -200,7 +200,7 @@ class Failover:
 
     def _restore(self) -> tuple[int, frozenset[int]]:
         try:
-            saved = json.loads(trusted_file.read(self._path, LARGEST))
+            saved = json.loads(read_trusted(self._path, LARGEST))
             units = frozenset(int(unit) - 1 for unit in saved["out_of_use"])
             if not units <= set(range(len(self._values))):
                 raise ValueError
@@ -215,7 +215,7 @@ class Failover:
     def _save(self) -> None:
         out = {"system_id": self._system, "out_of_use": [unit + 1 for unit in sorted(self._state.orders)]}
         try:
-            with trusted_file.replacing(self._path) as file:
+            with replacing(self._path) as file:
                 file.write(json.dumps(out).encode())
         except OSError as error:
             raise ConfigError(f"failover_file {self._path} cannot be written: {error.strerror}") from error

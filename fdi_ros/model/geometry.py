@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
 from fdi_ros.system.text import html_table

@@ -28,7 +28,7 @@ from fdi_ros.estimator.blocks import LONGEST_DELAY
 from fdi_ros.estimator.error_states import predict
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.system import trusted_file
+from fdi_ros.system.files import DistrustError, open_regular, read_trusted, replacing
 
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
@@ -240,12 +240,12 @@ class StateFile:
         self._check_ours(self._old)
         self.is_rejected = True
         try:
-            self._restore_from(json.loads(trusted_file.read(self.path, MAX_BYTES).decode()), pipeline)
+            self._restore_from(json.loads(read_trusted(self.path, MAX_BYTES).decode()), pipeline)
         except FileNotFoundError:
             self.is_rejected = False
             self.words = f"no state taken from {self.path}: there is none yet"
             return False
-        except trusted_file.DistrustError as error:
+        except DistrustError as error:
             refusal = str(error.strerror)
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
@@ -269,7 +269,7 @@ class StateFile:
             kind = path.lstat().st_mode
             if not stat.S_ISREG(kind) and not stat.S_ISLNK(kind):
                 raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
-            with trusted_file.open_regular(path, links=False) as file:
+            with open_regular(path, links=False) as file:
                 begin = file.read(64)
             if begin and not BEGIN.match(begin):
                 raise ConfigError(
@@ -287,7 +287,7 @@ class StateFile:
             return False
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
         try:
-            with trusted_file.replacing(self.path) as file:
+            with replacing(self.path) as file:
                 file.write(json.dumps({**about, **vars(state)}, indent=1, default=Errors.as_json).encode())
                 if self.is_rejected:
                     with contextlib.suppress(FileNotFoundError):

@@ -27,7 +27,7 @@ from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.sources import source_of
-from fdi_ros.system.limits import LATEST
+from fdi_ros.system.files import LATEST
 
 _STATES = np.array([state.name for state in ChannelState])
 

@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.model.samples import Array
 from fdi_ros.report.verdict import Severity
-from fdi_ros.system.limits import LINE, WORD
-from fdi_ros.system.text import date_of, shown, visible
+from fdi_ros.system.text import LINE, WORD, date_of, shown, visible
 
 
 class Unit(NamedTuple):

@@ -34,8 +34,7 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine
 from fdi_ros.ros.process import Stop, spin
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 DEPTH = 256
 """Messages that a topic keeps, in and out, for a node that is busy for a moment: a quarter of a second at 1 kHz."""

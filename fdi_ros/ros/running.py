@@ -27,8 +27,7 @@ from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.node import REPORT_PERIOD, BoundedLog, CheckedNode
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood

@@ -32,8 +32,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine, parse_number
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.node import read_diagnostics
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 try:
     from rich.bar import Bar

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS
 from fdi_ros.config.config import Config, is_plain_name
 from fdi_ros.errors import BagError
 from fdi_ros.estimator.estimator import REST_BLOCKS
@@ -32,8 +32,7 @@ from fdi_ros.setup.agreement import LEAST_ROTATION
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
 from fdi_ros.sources import SOURCES
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 
 class Role(str, Enum):

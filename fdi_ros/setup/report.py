@@ -35,8 +35,7 @@ from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.result import Calibration, calibration_figures, calibration_findings, channel_columns
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, times_words
 from fdi_ros.sources import source_of
-from fdi_ros.system.limits import LINE
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import LINE, shown
 
 LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
 MOST_POINTS = 2000  # of a curve on the page

@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter_file import parameter_file
+from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry

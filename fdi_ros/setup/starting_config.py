@@ -16,8 +16,7 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config
-from fdi_ros.config.parameter_file import parameter_file
+from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config, parameter_file
 from fdi_ros.errors import BagError
 from fdi_ros.setup.agreement import LEAST_WINDOWS, SQUARE, angle_of, find_turn
 from fdi_ros.setup.blocks import WINDOW

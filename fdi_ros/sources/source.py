@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import GOOD, Decoded, MessageError, as_batch, byte_order, explain, read_only
 from fdi_ros.errors import ConfigError

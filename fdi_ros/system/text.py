@@ -10,7 +10,9 @@ import math
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 
-from fdi_ros.system.limits import EARLIEST, LATEST, LINE, WORD
+from fdi_ros.system.files import EARLIEST, LATEST
+
+WORD, LINE = 120, 4000  # characters of a text from a file, and of a whole line with such texts, that are shown
 
 
 def shown(text: object, most: int = WORD) -> str:

@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 import yaml
 
 from fdi_ros.errors import FdiError
-from fdi_ros.system.limits import YAML_BYTES, YAML_DEPTH, YAML_DIGITS, YAML_NODES
-from fdi_ros.system.trusted_file import open_regular
+from fdi_ros.system.files import YAML_BYTES, YAML_DEPTH, YAML_DIGITS, YAML_NODES, open_regular
 
 try:
     from yaml import CSafeLoader as _SafeLoader

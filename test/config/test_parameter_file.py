@@ -12,8 +12,15 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.config.config import PARAMETERS, Config, read_parameter_file
-from fdi_ros.config.parameter_file import WIDTH, parameter_file, parameters_of, with_parameters
+from fdi_ros.config.config import (
+    PARAMETERS,
+    WIDTH,
+    Config,
+    parameter_file,
+    parameters_of,
+    read_parameter_file,
+    with_parameters,
+)
 from fdi_ros.errors import ConfigError
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.compiling.compiled import _Kept
-from fdi_ros.compiling.record import Real, record
+from fdi_ros.compiling.compiled import Real, _Kept, record
 
 SCRIPT = """
 import logging, sys

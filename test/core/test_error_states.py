@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fdi_ros.compiling.compiled import allocate
-from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate
 from fdi_ros.core.alignment import restamp
 from fdi_ros.core.parity import compute_joint_weights, eliminate_rate
 from fdi_ros.core.records import DelayBuffer, Parity

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from fdi_ros import Geometry
-from fdi_ros.compiling.compiled import allocate
-from fdi_ros.compiling.record import MAX_UNITS
+from fdi_ros.compiling.compiled import MAX_UNITS, allocate
 from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (

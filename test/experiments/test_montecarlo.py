@@ -29,7 +29,7 @@ from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.outcomes import added, quantiles, share
 from fdi_ros.system import jobs
-from fdi_ros.system.result_file import MADE_BY, plain, write_json
+from fdi_ros.system.files import MADE_BY, plain, write_json
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))

@@ -270,7 +270,7 @@ def test_what_is_there_is_not_judged_again(fleet, tmp_path, monkeypatch):
 def test_a_run_that_is_killed_anywhere_goes_on(fleet, judged, tmp_path, name):
     """Before a table is written the second time."""
     words = (fleet / "heron", fleet / "kite", "--config", fleet / "config.yaml", "--quiet")
-    times, real = [], tables.whole_file
+    times, real = [], tables.whole
 
     def stop(path):
         times.append(path.name)
@@ -281,7 +281,7 @@ def test_a_run_that_is_killed_anywhere_goes_on(fleet, judged, tmp_path, name):
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(tables, "WRITE_AFTER", 0.0)
         monkeypatch.setattr(tables, "WRITE_SHARE", 1e9)
-        monkeypatch.setattr(tables, "whole_file", stop)
+        monkeypatch.setattr(tables, "whole", stop)
         with pytest.raises(Stopped):
             run(tmp_path / "o", *words)
     assert len(rows(tmp_path / "o")) == 1

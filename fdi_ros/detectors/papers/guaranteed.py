@@ -22,8 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate, callback, compiled
-from fdi_ros.compiling.record import Channels, Real, Whole, record
+from fdi_ros.compiling.compiled import Channels, Real, Whole, allocate, callback, compiled, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError, DetectorError

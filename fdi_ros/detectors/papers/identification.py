@@ -17,8 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import callback, compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, Flag, Whole, record
+from fdi_ros.compiling.compiled import MAX_CHANNELS, Flag, Whole, callback, compiled, record
 from fdi_ros.core.records import SampleInput, SampleVerdict
 from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (

@@ -26,8 +26,18 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import callback, compiled
-from fdi_ros.compiling.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
+from fdi_ros.compiling.compiled import (
+    Channels,
+    Flag,
+    Real,
+    Square,
+    Symmetric,
+    Vector,
+    Whole,
+    callback,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector

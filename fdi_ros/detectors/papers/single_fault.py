@@ -17,8 +17,18 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import callback, compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    Channels,
+    Flag,
+    Flags,
+    Real,
+    Square,
+    Whole,
+    callback,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector, NoState

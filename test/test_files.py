@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.system import trusted_file
+from fdi_ros.system import files
 
 STRANGER = 54321
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
@@ -22,12 +22,12 @@ def test_what_others_can_write_is_refused_and_nothing_else(tmp_path_factory, mod
     path.mkdir() if folder else path.write_text("x")
     path.chmod(mode)
     if mode & 0o022:
-        with pytest.raises(trusted_file.DistrustError, match="others can write it"):
-            trusted_file.check(path)
+        with pytest.raises(files.DistrustError, match="others can write it"):
+            files.check_trusted(path)
     else:
-        trusted_file.check(path)
+        files.check_trusted(path)
     if folder:
-        trusted_file.close_to_others(path)
+        files.close_to_others(path)
         assert stat.S_IMODE(path.stat().st_mode) == mode & ~0o022
 
 
@@ -35,11 +35,11 @@ def test_what_others_can_write_is_refused_and_nothing_else(tmp_path_factory, mod
 def test_what_belongs_to_another_user_is_refused(tmp_path):
     path = tmp_path / "one"
     path.write_text("x")
-    trusted_file.check(path)
-    assert trusted_file.read(path, 10) == b"x"
+    files.check_trusted(path)
+    assert files.read_trusted(path, 10) == b"x"
     os.chown(path, STRANGER, 0)
-    for refuse in (trusted_file.check, trusted_file.close_to_others, lambda path: trusted_file.read(path, 10)):
-        with pytest.raises(trusted_file.DistrustError, match=f"another user .{STRANGER}"):
+    for refuse in (files.check_trusted, files.close_to_others, lambda path: files.read_trusted(path, 10)):
+        with pytest.raises(files.DistrustError, match=f"another user .{STRANGER}"):
             refuse(path)
 
 
@@ -48,15 +48,15 @@ def test_links_and_pipes_are_neither_followed_nor_waited_for(tmp_path):
     target.write_text("x")
     link.symlink_to(target)
     os.mkfifo(pipe)
-    for refuse in (trusted_file.check, trusted_file.close_to_others, lambda path: trusted_file.read(path, 10)):
-        with pytest.raises(trusted_file.DistrustError, match="it is a link"):
+    for refuse in (files.check_trusted, files.close_to_others, lambda path: files.read_trusted(path, 10)):
+        with pytest.raises(files.DistrustError, match="it is a link"):
             refuse(link)
-    with trusted_file.open_regular(link) as file:
+    with files.open_regular(link) as file:
         assert file.read() == b"x"
     for links in (True, False):
-        with pytest.raises(trusted_file.DistrustError, match="no regular file"):
-            trusted_file.open_regular(pipe, links)
-    with trusted_file.replacing(link) as file:
+        with pytest.raises(files.DistrustError, match="no regular file"):
+            files.open_regular(pipe, links)
+    with files.replacing(link) as file:
         file.write(b"new")
     assert (target.read_text(), link.read_text(), link.is_symlink()) == ("x", "new", False)
 
@@ -65,21 +65,21 @@ def test_links_and_pipes_are_neither_followed_nor_waited_for(tmp_path):
 def test_what_is_written_is_closed_to_others_whatever_the_umask_and_gone_if_it_fails(tmp_path, mask):
     path, before = tmp_path / "one", os.umask(mask)
     try:
-        with trusted_file.replacing(path) as file:
+        with files.replacing(path) as file:
             file.write(b"first")
-        with pytest.raises(TypeError), trusted_file.replacing(path) as file:
+        with pytest.raises(TypeError), files.replacing(path) as file:
             file.write("no bytes")
     finally:
         os.umask(before)
-    trusted_file.check(path)
+    files.check_trusted(path)
     assert path.read_bytes() == b"first"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_in_which_everybody_can_swap_ours_is_refused(tmp_path):
-    trusted_file.check_ancestor(tmp_path)
+    files.check_ancestor(tmp_path)
     tmp_path.chmod(0o1777)
-    trusted_file.check_ancestor(tmp_path)
+    files.check_ancestor(tmp_path)
     tmp_path.chmod(0o777)
-    with pytest.raises(trusted_file.DistrustError, match="everybody can write it"):
-        trusted_file.check_ancestor(tmp_path)
+    with pytest.raises(files.DistrustError, match="everybody can write it"):
+        files.check_ancestor(tmp_path)
