@@ -133,8 +133,7 @@ def integrity_table() -> list[str]:
     for name, geometry in named.items():
         for prior, risk in ((1e-3, 1e-3), (1e-3, 1e-5), (1e-4, 1e-7)):
             rate = {"integrity.fault_rate": -math.log1p(-prior), "integrity.exposure": 1.0, "integrity.risk": risk}
-            alarms = {"detector.false_alarms_per_hour": 0.0, "detector.false_alarm_probability": 1e-6}
-            known = Integrity(Config.from_parameters(rate | alarms), geometry, NoiseModel(1.0))
+            known = Integrity(Config.from_parameters(rate).integrity, 1e-6, geometry, NoiseModel(1.0))
             subsets, whole = prepare_subsets(geometry, NoiseModel(1.0)), mask_of(range(geometry.n))
             worst = known.after_loss(subsets, whole)
             shown = [" ".join(f"{x:.2f}" for x in level) for level in (subsets["level"][whole], worst)]

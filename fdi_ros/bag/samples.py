@@ -19,7 +19,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.sources import source_of
 
 _TOGETHER = 16384

@@ -5,8 +5,8 @@
 
 A record is 8 bytes of time (us since 1970, the first byte first) and a message of MAVLink 1 or 2. A record counts only
 where another one begins behind it, and one that is used only if pymavlink accepts it, by its checksum. What the
-messages of IMUs say is told by the same description as live (`fdi_ros.mavlink.imu`), of one autopilot: the first with a
-HEARTBEAT.
+messages of IMUs say is told by the same description as live (`fdi_ros.mavlink.protocol`), of one autopilot: the first
+with a HEARTBEAT.
 
 Stamps are the autopilot's own; UTC is that of the message that came with the least delay.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.log_parts import ImuSamples, Portion, Source, parts, possible_start
-from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
+from fdi_ros.mavlink.protocol import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, understood
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Int
 from fdi_ros.system.files import TLOG_BYTES
@@ -103,7 +103,7 @@ class Tlog(FlightLog):
             row = (time, min(came, _LATEST), end, *reading.rate, *reading.acceleration)
             series.setdefault(Source(kind, reading.unit), array("d")).extend(row)
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
-        if raw in series and scaled not in series and stands_in(RAW, beat.autopilot):
+        if raw in series and scaled not in series:
             series[scaled] = series.pop(raw)
         return series
 

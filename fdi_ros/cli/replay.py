@@ -33,7 +33,7 @@ def _replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
     from fdi_ros.mavlink.failover import failover_text
-    from fdi_ros.monitor.build import build_geometry
+    from fdi_ros.monitor.pipeline import build_geometry
     from fdi_ros.replay.check import failures, parse_check
     from fdi_ros.replay.page import Report
     from fdi_ros.replay.run import replay
@@ -241,7 +241,7 @@ def _plan(arguments: Namespace) -> Plan:
 def _configs(arguments: Namespace) -> dict[str, Config]:
     """Return the configs to be tried by name: the one given, and those to compare it with."""
     from fdi_ros.config.config import Config
-    from fdi_ros.monitor.build import build_geometry
+    from fdi_ros.monitor.pipeline import build_geometry
 
     config = Config.from_file(arguments.config)
     config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config

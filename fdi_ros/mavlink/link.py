@@ -24,7 +24,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from fdi_ros.errors import FdiError
-from fdi_ros.mavlink.clock import NS
+from fdi_ros.mavlink.protocol import NS
 from fdi_ros.system.files import open_regular
 from fdi_ros.system.installation import require
 

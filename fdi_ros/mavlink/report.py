@@ -13,11 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fdi_ros.mavlink.clock import MS, NS
-from fdi_ros.mavlink.imu import MESSAGES, RESOLUTION, numbers
 from fdi_ros.mavlink.link import Link
-from fdi_ros.mavlink.streams import ENOUGH
-from fdi_ros.mavlink.vehicle import UnitTrack, Vehicle
+from fdi_ros.mavlink.protocol import ENOUGH, MESSAGES, MS, NS, RESOLUTION, numbers
+from fdi_ros.mavlink.vehicle import LOST, UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 LOSSY = 0.05  # share of messages lost on the link that is worth a warning
@@ -56,7 +54,7 @@ class Reporter:
         if not vehicle.in_reach:
             return Level.STALE, f"nothing of {who} for {(now - vehicle.heard) / NS:.0f} s"
         words = []
-        if others := vehicle.others_of_late(now):
+        if others := sorted(system for system, at in vehicle.others.items() if now - at < 10 * LOST):
             words.append(f"other autopilots on the link, left aside: {', '.join(map(str, others))}")
         if not vehicle.sync.synchronised:
             words.append("no answer to TIMESYNC: stamps are late by the unknown latency of the link")
@@ -89,8 +87,7 @@ class Reporter:
 
     def _message(self, unit: int) -> int | None:
         """Return the id of the message that brings a unit; None: not known."""
-        ids = numbers(self._vehicle.kind) if self._vehicle.kind else ()
-        return next((number for number in ids if MESSAGES[number].unit in (unit, -1)), None)
+        return next((number for number in numbers(self._vehicle.kind) if MESSAGES[number].unit in (unit, -1)), None)
 
     def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle

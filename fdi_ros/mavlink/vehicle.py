@@ -18,22 +18,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from fdi_ros.mavlink.clock import MS, NS, BootClock, TimeSync
-from fdi_ros.mavlink.imu import (
-    IMU_MESSAGES,
+from fdi_ros.mavlink.link import Verifier, now_in_steps
+from fdi_ros.mavlink.protocol import (
+    ARDUPILOT,
+    DEFAULT_INTERVAL,
     MESSAGES,
     MOST_UNITS,
+    MS,
     NO_AUTOPILOT,
+    NS,
+    PX4,
     RAW,
+    RESOLUTION,
     SCALED,
+    SET_MESSAGE_INTERVAL,
+    BootClock,
     ImuSample,
+    Streams,
+    TimeSync,
     numbers,
     read,
-    stands_in,
     understood,
 )
-from fdi_ros.mavlink.link import Verifier, now_in_steps
-from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
 from fdi_ros.system.installation import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
@@ -108,20 +114,12 @@ class Vehicle:
         self.settings = settings
         self.system = settings.system or None  # system id in use; None: no autopilot was heard yet.
         self.autopilot = NO_AUTOPILOT  # MAV_AUTOPILOT
-        self.kind = settings.kind  # kind of messages in use; empty: not chosen yet
-        self.sync, self.clock, self.streams = TimeSync(), BootClock(), Streams()
-        self.units: dict[int, UnitTrack] = {}
-        self.magnetometers: set[int] = set()  # units of which only a magnetometer came
         self.others: dict[int, int] = {}  # other autopilots on the link: when each was last heard, ns, by system id
         self.counts: Counter[str] = Counter()
         self.events: deque[str] = deque(maxlen=32)  # what has happened, in words, for the log
-        self.heard = 0  # when it was last heard, ns; 0: never
-        self.armed = self.gives_gyros = False
-        """Whether its last heartbeat says that it is armed; whether it has sent any gyros."""
+        self.armed = False  # whether its last heartbeat says so
         self.disarmed = 0  # for how long all its heartbeats have said that it is not armed, ns
         self.begun = 0  # how often a conversation with it began: what it said of parameters before may no longer be so
-        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
-        """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
         self.peer: Any = None
         self.behind = 0.0  # s by which the last signature that was too old was so
         self._behind_from: Any = None
@@ -134,15 +132,28 @@ class Vehicle:
         if settings.key:
             self._out.signing.secret_key, self._out.signing.sign_outgoing = settings.key, True
             self._out.signing.timestamp = now_in_steps(seconds())
-        self._seen: set[tuple[str, int]] = set()
-        """Kinds of messages and units of which samples came, until a kind is chosen."""
-        self._first_imu = self._found = self._beat = self._checked = 0
+        self._beat = self._checked = 0
         self._scaled_at = 0  # when SCALED_IMU of IMU 1 came last, or was asked for, ns
         self._sequence: int | None = None
         self._late = 0  # late messages in a row
-        self._lost = self._chosen = False
+        self._lost = False
         self._disarmed_at: int | None = None
         self._interval = round(1e6 / settings.rate)
+        self._know_nothing()
+
+    def _know_nothing(self) -> None:
+        """Begin with an autopilot of which nothing is known: the first, or another one."""
+        self.kind = self.settings.kind  # kind of messages in use; empty: not chosen yet
+        self.sync, self.clock, self.streams = TimeSync(), BootClock(), Streams()
+        self.units: dict[int, UnitTrack] = {}
+        self.magnetometers: set[int] = set()  # units of which only a magnetometer came
+        self.heard = 0  # when it was last heard, ns; 0: never
+        self.gives_gyros = False  # whether it has sent any
+        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
+        """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
+        self._found = self._first_imu = 0
+        self._seen: set[tuple[str, int]] = set()
+        """Kinds of messages and units of which samples came, until a kind is chosen."""
 
     # What comes in ------------------------------------------------------------------------------------------------
 
@@ -217,7 +228,9 @@ class Vehicle:
         beats = is_autopilot and number == HEARTBEAT
         beats = beats and message.autopilot != NO_AUTOPILOT and message.type != GROUND_STATION
         if is_autopilot and system != self.system and self._may_change_to(system, beats, number, now):
-            self._change_to(system)
+            # It is taken into use with its next heartbeat.
+            self.system, self.begun = system, self.begun + 1
+            self._know_nothing()
         if system != self.system or not is_autopilot:
             self.counts["of others"] += 1
             if beats:
@@ -253,18 +266,6 @@ class Vehicle:
             return now - self.others.get(system, -LOST) < LOST
         return beats and (is_gone or now - self._found > LOST)
 
-    def _change_to(self, system: int) -> None:
-        """Begin anew with another system; it is taken into use with its next heartbeat."""
-        self.system, self.heard, self.gives_gyros, self._found = system, 0, False, 0
-        # What the former one has said of its parameters is nothing about this one.
-        self.begun += 1
-        self.parameters.clear()
-        self.kind, self._chosen, self.streams = self.settings.kind, False, Streams()
-        self.units.clear()
-        self.magnetometers.clear()
-        self.sync.reset()
-        self.clock.reset()
-
     def _begin_with(self, message: Any, peer: Any, now: int) -> None:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
@@ -277,7 +278,7 @@ class Vehicle:
         if again:
             self.streams.ask_again()
         else:
-            kinds = (self.kind,) if self.kind else IMU_MESSAGES
+            kinds = [self.kind] if self.kind else list(RESOLUTION)
             wanted = [number for kind in kinds if understood(kind, self.autopilot) for number in numbers(kind)]
             self.streams.want(wanted, self._interval)
 
@@ -304,10 +305,10 @@ class Vehicle:
         kind, self.gives_gyros = message.kind, True
         if number == SCALED:
             self._scaled_at = now
-        elif stands_in(number, self.autopilot) and sample.unit == 0 and now - self._scaled_at > STAND_IN:
+        elif number == RAW and sample.unit == 0 and now - self._scaled_at > STAND_IN:
             # Unless it is in use itself.
             kind = kind if self.kind == kind else MESSAGES[SCALED].kind
-        if not self._chosen and not self._choose(kind, sample.unit, now):
+        if not self.kind and not self._choose(kind, sample.unit, now):
             return None
         return self._timed(sample, message.microseconds > 1, now) if kind == self.kind else None
 
@@ -340,22 +341,19 @@ class Vehicle:
 
     def _choose(self, kind: str, unit: int, now: int) -> bool:
         """Choose the kind of messages with the most units, the finest of several; return whether that is done."""
-        if not self.kind:
-            self._first_imu = self._first_imu or now
-            self._seen.add((kind, unit))
-            if now - self._first_imu < CHOICE:
-                return False
-            self.kind = max(IMU_MESSAGES, key=lambda kind: sum(seen == kind for seen, _ in self._seen))
-            self._seen.clear()
-            for other in IMU_MESSAGES:
-                if other != self.kind and understood(other, self.autopilot):
-                    self.streams.want(numbers(other), DEFAULT_INTERVAL)
-        self._chosen = True
+        self._first_imu = self._first_imu or now
+        self._seen.add((kind, unit))
+        if now - self._first_imu < CHOICE:
+            return False
+        self.kind = max(RESOLUTION, key=lambda kind: sum(seen == kind for seen, _ in self._seen))
+        for other in RESOLUTION:
+            if other != self.kind and understood(other, self.autopilot):
+                self.streams.want(numbers(other), DEFAULT_INTERVAL)
         self.events.append(f"{self.kind} is in use")
         return True
 
     def _restarted(self, now: int) -> None:
-        self.sync.reset()
+        self.sync = TimeSync()
         self._found, self.begun = now, self.begun + 1
         for track in self.units.values():
             track.time = -1
@@ -381,19 +379,17 @@ class Vehicle:
             self._say("command_long", self.system, AUTOPILOT_COMPONENT, *fields)
         if now - self._checked >= NS:
             self._checked = now
-            self.streams.check(self.rates(now), now)
-            if self.streams.refused(SCALED) and stands_in(RAW, self.autopilot):
+            self._check_rates(now)
+            if self.streams.refused(SCALED) and understood("RAW_IMU", self.autopilot):
                 self.streams.want((RAW,), self._interval)
 
-    def rates(self, now: int) -> list[tuple[int, float]]:
-        """Messages in use, by id, with the samples a second of each unit that they bring; the slowest counts."""
-        found = []
-        for number in numbers(self.kind) if self.kind else ():
+    def _check_rates(self, now: int) -> None:
+        """Ask again for messages that come too slowly; of those with several units the slowest counts."""
+        for number in numbers(self.kind):
             unit = MESSAGES[number].unit
             if unit not in self.magnetometers:
                 brought = [unit] if unit >= 0 else list(self.units) or [0]
-                found.append((number, min(self.units.get(k, UnitTrack()).rate(now) for k in brought)))
-        return found
+                self.streams.check(number, min(self.units.get(k, UnitTrack()).rate(now) for k in brought), now)
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
@@ -429,8 +425,4 @@ class Vehicle:
     @property
     def name(self) -> str:
         """Name of the flight stack."""
-        return {3: "ArduPilot", 12: "PX4"}.get(self.autopilot, f"autopilot {self.autopilot}")
-
-    def others_of_late(self, now: int) -> list[int]:
-        """Return the system ids of other autopilots that were heard of late."""
-        return sorted(system for system, at in self.others.items() if now - at < 10 * LOST)
+        return {ARDUPILOT: "ArduPilot", PX4: "PX4"}.get(self.autopilot, f"autopilot {self.autopilot}")

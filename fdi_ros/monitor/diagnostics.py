@@ -139,22 +139,18 @@ def describe(
     """
     worse = _find_worse(status)
     level, message = _whole_message(status, worse)
-    rows = [(WHOLE, max(level, Level.WARN) if warning else level, f"{message}; {warning}" if warning else message)]
-    rows += [(channel.name, *_channel_message(channel, status, worse)) for channel in status.channels]
+    if warning:
+        level, message = max(level, Level.WARN), f"{message}; {warning}"
+    rows = [(WHOLE, level, message, (*_whole_values(status), *figures))]
+    for k, channel in enumerate(status.channels):
+        values = _channel_values(channel, status, k, since[k] if since else channel.since)
+        rows.append((channel.name, *_channel_message(channel, status, worse), values))
     if silent is not None:
         words = f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
-        rows = [(name, Level.STALE, words) for name, *_ in rows]
-    began = since or [channel.since for channel in status.channels]
-    values = [
-        (*_whole_values(status), *figures),
-        *(_channel_values(channel, status, k, began[k]) for k, channel in enumerate(status.channels)),
-    ]
-    rows += [(f"{INPUT}{line.name}", *_input_message(line)) for line in inputs]
-    values += [_input_values(line) for line in inputs]
-    return [
-        StatusLine(level, prefix + name, message, status.config.hardware_id, pairs)
-        for (name, level, message), pairs in zip(rows, values, strict=True)
-    ]
+        rows = [(name, Level.STALE, words, values) for name, _, _, values in rows]
+    rows += [(f"{INPUT}{line.name}", *_input_message(line), _input_values(line)) for line in inputs]
+    hardware = status.config.hardware_id
+    return [StatusLine(level, prefix + name, message, hardware, values) for name, level, message, values in rows]
 
 
 def degraded(status: Status) -> dict[str, str]:

@@ -31,13 +31,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.config import Config
+from fdi_ros.config.settings import IntegrityConfig
 from fdi_ros.core.subsets import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import normal_isf
-from fdi_ros.monitor.build import alarm_probability
 
 Axes = tuple[float, float, float]
 NO_LEVEL: Axes = (math.inf,) * 3
@@ -78,9 +77,11 @@ class Integrity:
     the fused rate are 1 / noise_std^2; biases left, bias_std, count as if they hung together as is worst for each axis.
     """
 
-    def __init__(self, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
-        settings, noise = config.integrity, noise.for_channels(geometry.n)
-        self.risk, self.alarm_probability = settings.risk, alarm_probability(config)
+    def __init__(
+        self, settings: IntegrityConfig, alarm_probability: float, geometry: Geometry, noise: NoiseModel
+    ) -> None:
+        noise = noise.for_channels(geometry.n)
+        self.risk, self.alarm_probability = settings.risk, alarm_probability
         unnoticed = [-math.expm1(-rate * settings.exposure) for rate in settings.fault_rate]
         self.prior: Array = np.broadcast_to(np.array(unnoticed), geometry.n)
         """(n,) probability that a channel is faulty unnoticed."""

@@ -32,8 +32,6 @@ CERTAIN = 4.0
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 UNUSUAL = 3.0
 """An error beyond so many standard deviations expected of it is not what was expected."""
-
-
 MAX_START_BIAS = 4.0
 """A bias learned at the start that is off by more ``bias.turn_on_std`` is reported: one healthy start in 16 000."""
 
@@ -45,30 +43,19 @@ class ChannelStatus:
     name: str
     state: ChannelState
     reason: Reason
-    since: int
-    """Stamp of the sample that brought the state, ns; 0 before the first sample."""
-    group: tuple[str, ...]
-    """AMBIGUOUS: names of the set one of which is faulty."""
-    error: float
-    """Estimated error when declared or suspected, rad/s."""
-    residual: float
-    """Of the last sample, rad/s; NaN where missing."""
-    last_received: int
-    """Stamp of the last sample it delivered, ns; 0 if none."""
-    counts: Mapping[str, int]
-    """``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``."""
-    delivers: float = 1.0
-    """Share of the samples that it has lately given a finite number for."""
-    drift: float = 0.0
-    """How far its bias has been followed in flight from that at the start, rad/s."""
-    start_bias: float = 0.0
-    """What was learned of its bias at the start, beyond ``bias.fixed``, rad/s."""
+    since: int  #: Stamp of the sample that brought the state, ns; 0 before the first sample.
+    group: tuple[str, ...]  #: AMBIGUOUS: names of the set one of which is faulty.
+    error: float  #: Estimated error when declared or suspected, rad/s.
+    residual: float  #: Of the last sample, rad/s; NaN where missing.
+    last_received: int  #: Stamp of the last sample it delivered, ns; 0 if none.
+    counts: Mapping[str, int]  #: ``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``.
+    delivers: float = 1.0  #: Share of the samples that it has lately given a finite number for.
+    drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
+    start_bias: float = 0.0  #: What was learned of its bias at the start, beyond ``bias.fixed``, rad/s.
     bias_std: float = math.nan
     """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
-    noise: float = 0.0
-    """Lately, in noise_std; 0: not measured."""
-    noisy: bool = False
-    """Whether that is much, and more than the others show."""
+    noise: float = 0.0  #: Lately, in noise_std; 0: not measured.
+    noisy: bool = False  #: Whether that is much, and more than the others show.
 
     @property
     def is_left_out(self) -> bool:
@@ -82,14 +69,10 @@ class UnitStatus:
 
     name: str
     channels: tuple[str, ...]
-    delay: float
-    """By how much its stamps are late against those of another unit, s; negative: early; NaN: not measured."""
-    delay_std: float
-    """Standard deviation of that, s."""
-    against: str
-    """The other unit: of two units the first, of more the one in the middle; itself for that one."""
-    taken_off: bool = False
-    """Whether that is taken off the stamps, but for what is not sure."""
+    delay: float  # by how much its stamps are late against those of another unit, s; negative: early; NaN: not measured
+    delay_std: float  # standard deviation of that, s
+    against: str  # the other unit: of two units the first, of more the one in the middle; itself for that one
+    taken_off: bool = False  # whether that is taken off the stamps, but for what is not sure
     frozen: float = 0.0
     """For how long all its values have repeated while the others measure motion, s; 0: shorter than
     ``health.stuck_time``."""
@@ -100,12 +83,9 @@ class ApartStatus:
     """Two channels that alone measure one axis and surely differ: one of them is faulty, and nothing tells which."""
 
     channels: tuple[str, str]
-    who: str
-    """The two in words."""
-    size: float
-    """By how much they differ, rad/s."""
-    std: float
-    """Standard deviation of that, rad/s; NaN: not known."""
+    who: str  # the two in words
+    size: float  # by how much they differ, rad/s
+    std: float  # standard deviation of that, rad/s; NaN: not known
 
     def __str__(self) -> str:
         return f"{self.who.removesuffix(',')}, {plus_minus(self.size, self.std)} rad/s apart"
@@ -115,10 +95,8 @@ class ApartStatus:
 class ErrorStatus:
     """What is known of one error of a channel or a unit."""
 
-    owner: str
-    """Name of the channel, or of the unit."""
-    kind: str
-    """Name in `fdi_ros.estimator.error_states.ERROR_KINDS`; of three components with x, y or z."""
+    owner: str  # name of the channel, or of the unit
+    kind: str  # name in `fdi_ros.estimator.error_states.ERROR_KINDS`; of three components with x, y or z
     unit: str
     value: float
     std: float
@@ -142,47 +120,37 @@ class Status:
     """The whole monitor as it stands after the last sample."""
 
     config: Config = field(repr=False)
-    stamp: int
-    """Of the last sample, ns; 0 before the first."""
+    stamp: int  #: Of the last sample, ns; 0 before the first.
     samples: int
     detector: str
     channels: tuple[ChannelStatus, ...]
     statistic: float
     threshold: float
-    has_rate: bool
-    """Whether the last sample gave a fused rate."""
+    has_rate: bool  #: Whether the last sample gave a fused rate.
     withheld: bool
     """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false), or of old values."""
-    all_repeat: bool
-    """Whether all channels repeat their values."""
-    can_detect: tuple[str, ...]
-    """Channels whose fault would be seen."""
-    can_isolate: tuple[str, ...]
-    """Channels whose fault would be seen and named."""
+    all_repeat: bool  #: Whether all channels repeat their values.
+    can_detect: tuple[str, ...]  #: Channels whose fault would be seen.
+    can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
     bias: tuple[float, ...]
     """Subtracted from each channel, rad/s: as given or learned at the start, and what was followed in flight."""
-    bias_state: str
-    """Words: fixed, learned, learning, refused and why, followed from a start in motion."""
-    note: str
-    """Why checking is limited, in words; empty if it is not."""
+    bias_state: str  #: Words: fixed, learned, learning, refused and why, followed from a start in motion.
+    note: str  #: Why checking is limited, in words; empty if it is not.
     protection_level: tuple[float, float, float] = (math.inf,) * 3
     """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
     protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
     """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
-    units: tuple[UnitStatus, ...] = ()
-    """Units of several channels, in their order."""
+    units: tuple[UnitStatus, ...] = ()  #: Units of several channels, in their order.
     delays: tuple[float, ...] = ()
     """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
-    delay_std: tuple[float, ...] = ()
-    """Standard deviation of each, s."""
+    delay_std: tuple[float, ...] = ()  #: Standard deviation of each, s.
     errors: tuple[ErrorStatus, ...] = ()
     """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
     names_rest_on: str = ""
     """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
     copies: tuple[tuple[str, str], ...] = ()
     """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
-    apart: ApartStatus | None = None
-    """Where a set is declared: the pair in it that surely differs."""
+    apart: ApartStatus | None = None  #: Where a set is declared: the pair in it that surely differs.
 
     def is_far(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""

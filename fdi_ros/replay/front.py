@@ -16,7 +16,7 @@ from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, fault_from, parse_fault
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.replay.summary import Summary

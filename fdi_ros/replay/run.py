@@ -27,10 +27,9 @@ from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.episodes import Stretches
 from fdi_ros.replay.evaluate import Evaluation
 from fdi_ros.replay.outcomes import finite

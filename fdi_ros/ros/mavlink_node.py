@@ -27,11 +27,10 @@ from fdi_ros.config.config import is_plain_name
 from fdi_ros.config.settings import MAVLINK
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
-from fdi_ros.mavlink.imu import ImuSample
 from fdi_ros.mavlink.link import open_link, read_key
+from fdi_ros.mavlink.protocol import ImuSample, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
@@ -73,7 +72,7 @@ class AutopilotNode(CheckedNode):
         self._diagnostics = self.create_diagnostics()
         self._opened = self._valued = self._due = 0
         self._trouble = self._link.trouble
-        self._time = SystemTime()
+        self._ahead = system_ahead()
         self._called = False  # whether the executor has found something to do
         channels = config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
         self._announcer = Announcer(channels) if params["statustext"] else None
@@ -194,7 +193,7 @@ class AutopilotNode(CheckedNode):
             now = time.monotonic_ns()
             for sample in self._vehicle.feed(peer, data, now):
                 # By the time of the system.
-                stamp = sample.stamp + self._time.ahead(now)
+                stamp = sample.stamp + self._ahead
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:
                     output, message = self._units[sample.unit]
                     output.publish(message.fill(stamp, sample))
@@ -249,6 +248,7 @@ class AutopilotNode(CheckedNode):
         self._called = True
         self.log.begin_period()
         now, hardware = time.monotonic_ns(), self.config.hardware_id
+        self._ahead = system_ahead()
         lines = self._reporter.lines(self.prefix, hardware, now)
         if self._failover is not None:
             lines.append(StatusLine(*self._failover.status(f"{self.prefix}failover", now), hardware, ()))

@@ -21,9 +21,8 @@ from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import CHANNEL_DELAY, UNIT_DELAY, Pipeline, build_geometry, build_noise
 from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement

@@ -23,8 +23,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of

@@ -13,7 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.imu import ImuSample
+from fdi_ros.mavlink.protocol import ImuSample
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from mavlink.autopilots import NS, PARAMETERS, Autopilot
 

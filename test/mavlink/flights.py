@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdi_ros.mavlink.failover_policy import GROUNDED, FailoverState, FailoverUnit, Known, decide
+from fdi_ros.mavlink.failover import GROUNDED, FailoverState, FailoverUnit, Known, decide
 
 MS = 1_000_000
 NS = 1000 * MS

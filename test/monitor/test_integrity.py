@@ -28,8 +28,7 @@ ALL = np.ones(6, dtype=bool)
 
 def integrity(geometry=None, noise=1.0, *, prior=1e-3, risk=1e-5):
     settings = {"integrity.risk": risk, "integrity.fault_rate": -math.log1p(-prior), "integrity.exposure": 1.0}
-    settings |= {"detector.false_alarms_per_hour": 0.0, "detector.false_alarm_probability": ALARM}
-    return Integrity(config(**settings), geometry or Geometry.two_triad_cone(), NoiseModel(noise))
+    return Integrity(config(**settings).integrity, ALARM, geometry or Geometry.two_triad_cone(), NoiseModel(noise))
 
 
 def block(z, first=0):

@@ -197,17 +197,6 @@ def test_a_reset_clears_what_is_over_and_what_lasts_is_declared_again(lasts):
     assert lasts or [(e.channel, e.after.name) for e in output.events] == [(3, "UNCHECKED"), (3, "OK")]
 
 
-def test_another_detector_at_run_time_keeps_bias_and_declarations():
-    pipeline = Pipeline(config(bias__fixed=[0.01] * 6))
-    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
-    pipeline.process(Block(block.stamp, block.z + 0.01))
-    pipeline.reconfigure(pipeline.config.replaced({"detector.name": "max_residual"}))
-    status = pipeline.status()
-    assert status.detector == "max_residual"
-    assert status.channels[3].state == ChannelState.FAULTY
-    assert status.bias == (0.01,) * 6
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -322,14 +311,6 @@ def test_any_memory_layout_gives_the_same():
     usual = Pipeline(config()).process(block)
     for z in (np.asfortranarray(block.z), np.repeat(block.z, 2, axis=0)[::2]):
         same(Pipeline(config()).process(Block(block.stamp.astype(np.uint64), z)), usual)
-
-
-@pytest.mark.parametrize("begin", [-(10**15), 0, START])
-def test_a_dead_channel_is_declared_whatever_the_stamps(begin):
-    pipeline = Pipeline(config())
-    block = struck(stream(pipeline.geometry, 300), ["channel=g3 kind=dropout start=1"], pipeline.channel_names)
-    output = pipeline.process(Block(block.stamp - START + begin, block.z))
-    assert output.state[-1, 2] == ChannelState.FAULTY
 
 
 def test_more_events_than_are_written_down_at_once():

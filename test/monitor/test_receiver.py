@@ -4,16 +4,14 @@
 """Bytes of messages in, bytes out: what the live node does with each message, without a node."""
 
 import gc
-import tracemalloc
 
 import numpy as np
 import pytest
-from monitor.streams import SIGMA, START, config, parallel, stream, struck
+from monitor.streams import START, config, parallel, stream, struck
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.model.samples import Block
 from fdi_ros.monitor import output
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState, Encoder, SampleOutput, Topic
 from fdi_ros.monitor.pipeline import Pipeline
@@ -172,32 +170,6 @@ def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     assert len(ear.integrity) >= 99
     assert len(set(thresholds[1:])) == len(names)
     assert pipeline.status().detector in names
-
-
-@pytest.mark.parametrize("inlet", [-2, 2, 4, 1000])
-def test_a_topic_that_is_none_is_left_alone(inlet):
-    ear = Ear(Pipeline(parallel(2)))
-    before = ear.receiver.live.tobytes()
-    ear.take(inlet, ImuTemplate("imu").fill(START, (0.0,) * 3, (0.0,) * 9))
-    assert ear.receiver.live.tobytes() == before
-
-
-def test_nothing_grows_while_messages_come():
-    """Records are of fixed size: 20 000 messages leave the memory of Python as it was."""
-    pipeline = Pipeline(parallel(2))
-    ear = Ear(pipeline)
-    block = Block(START + STEP * np.arange(10_000), np.random.default_rng(0).normal(0, SIGMA, (10_000, 6)))
-    sent = list(messages(block, 2))
-    take = ear.receiver.receive
-    for unit, data in sent[:2000]:
-        take(unit, data)
-    tracemalloc.start()
-    before = tracemalloc.get_traced_memory()[0]
-    for unit, data in sent[2000:]:
-        take(unit, data)
-    grown = tracemalloc.get_traced_memory()[0] - before
-    tracemalloc.stop()
-    assert grown < 10_000
 
 
 def test_live_stamps_ahead_of_the_clock_are_refused_and_said():

@@ -20,7 +20,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.evaluate import GRACE
 from fdi_ros.replay.run import Request, Sink, replay

@@ -32,8 +32,7 @@ from vehicles import Vehicle, vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import Data, prepare
 from fdi_ros.setup.run import Proof, Tried
