@@ -8,7 +8,7 @@ import pytest
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.core.states import ChannelState
+from fdi_ros.core.decision import ChannelState
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.monitor.pipeline import Pipeline
 

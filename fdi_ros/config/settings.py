@@ -124,10 +124,10 @@ class Input(NamedTuple):
 
     section: str
     """Of its settings: ``channels`` for messages of all channels, ``imus`` for messages of three-axis units."""
-    source: str  # module in `fdi_ros.sources`, and class there, that reads it
+    source: str  # class in `fdi_ros.sources` that reads it
 
 
-INPUTS = {"channels": Input("channels", "channels:ChannelsSource"), "imus": Input("imus", "imus:ImuSource")}
+INPUTS = {"channels": Input("channels", "ChannelsSource"), "imus": Input("imus", "ImuSource")}
 """Kinds of input by the value of the parameter ``input``."""
 
 

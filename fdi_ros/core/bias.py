@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
-from fdi_ros.core.parity import invert
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Portion, Sensors, ValueGroup
+from fdi_ros.core.subsets import invert
 from fdi_ros.model.samples import MAX_RATE, Array
 
 DEFAULT_DURATION = 2_000_000_000  # of the average of the bias where the settings give none, ns

@@ -5,7 +5,7 @@
 
 Where a name, or a set, may be wrong, other channels may be faulty in place of those left out. D are channels that are
 left out as faulty, W those fused and D together, all of which give a value. A rival h says that D is healthy and that
-one or two others, R, are faulty. With u = A z and gain G of W (`fdi_ros.core.parity`), its error and rate are those of
+one or two others, R, are faulty. With u = A z and gain G of W (`fdi_ros.core.subsets`), its error and rate are those of
 solution separation (`fdi_ros.monitor.integrity`):
 
     f_h = A_RR^-1 u_R,    x_h = G z - G_R f_h,    P_h = P_W + G_R A_RR^-1 G_R',    chi_h = z' A z - u_R' f_h.
@@ -24,9 +24,19 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.health import is_at_rest
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_weights, covariance_of, eliminate_rate
 from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Parity, PathSettings, Subset
-from fdi_ros.core.subsets import fill_growth, fill_level, fill_rate, passes_test, variance_of
+from fdi_ros.core.subsets import (
+    UNKNOWN_RATE,
+    apply_gain,
+    compute_weights,
+    covariance_of,
+    eliminate_rate,
+    fill_growth,
+    fill_level,
+    fill_rate,
+    passes_test,
+    variance_of,
+)
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 from fdi_ros.model.samples import Array
 

@@ -24,13 +24,23 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.alignment import enter, next_sample, restamp
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, update_bias
-from fdi_ros.core.copies import update_copies
-from fdi_ros.core.decision import CHECKED, at_least, decide, fill_suspects, forget_kind, gather_evidence
+from fdi_ros.core.decision import (
+    CHECKED,
+    alive,
+    at_least,
+    decide,
+    fill_suspects,
+    forget_kind,
+    gather_evidence,
+    left_out,
+    out_of_use,
+    update_states,
+    write_events,
+)
 from fdi_ros.core.fusion import fuse, update_level
-from fdi_ros.core.health import all_repeat, check, leave_flickering, update_repeated
+from fdi_ros.core.health import FINE, OUT_OF_RANGE, all_repeat, check, leave_flickering, update_copies, update_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, PathSettings, Sample
-from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, left_out, out_of_use, update_states, write_events
 from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
 from fdi_ros.model.samples import Array, Bytes
 

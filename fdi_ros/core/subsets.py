@@ -4,7 +4,7 @@
 """What depends on which channels are there: least squares over a set, its protection level, the detector's constants.
 
 A set has one bit for each channel, from the first up; its number is its place in tables of all sets. How the rate of a
-set changes stands here, too.
+set changes stands here, too, and what a sample says of the errors of its channels once the body rate is eliminated.
 """
 
 from __future__ import annotations
@@ -16,8 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate, call, compiled
-from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration, Bank, Circumstances, SampleVerdict, Sensors, Subset
+from fdi_ros.compiling.compiled import Symmetric, Vector, allocate, call, compiled
+from fdi_ros.core.records import (
+    ACCELERATION_SAMPLES,
+    Acceleration,
+    Bank,
+    Circumstances,
+    Parity,
+    SampleVerdict,
+    Sensors,
+    Subset,
+)
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
@@ -301,3 +310,166 @@ def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> Non
         sensors[name][:n] = getattr(noise, name)
     sensors["share"][:n], sensors["detectable"][:n] = np.diag(geometry.S), geometry.detectable
     sensors["alike"][:n, :n] = geometry.group_matrix
+
+
+# Parity ---------------------------------------------------------------------------------------------------------------
+#
+# With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but its prior N(0, K^-1),
+# K = k I:
+#
+#     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
+#
+# A is the information about d that the redundancy holds (a projector where M = I and k = 0), G the weighted least
+# squares. No basis of the null space is needed, and a channel that is absent is a row left out: rows and columns of the
+# channels that are not in a set are zero.
+
+
+UNKNOWN_RATE = 1e-6
+"""k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no
+division by zero."""
+TINY = 1e-300
+
+
+@compiled
+def factorise(a: Array, size: int, factor: Array) -> float:
+    """Cholesky factor of a symmetric positive definite matrix; return the log of its determinant."""
+    log = 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                factor[i, i] = math.sqrt(max(total, TINY))
+                log += 2.0 * math.log(factor[i, i])
+            else:
+                factor[i, j] = total / factor[j, j]
+    return log
+
+
+@compiled
+def invert(a: Array, size: int, out: Array) -> float:
+    """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
+
+    The lower triangle of a is read. ``out`` takes both triangles; on the way the factor, then its inverse.
+    """
+    log = factorise(a, size, out)
+    for i in range(size):
+        for j in range(i):
+            total = 0.0
+            for k in range(j, i):
+                total -= out[i, k] * out[k, j]
+            out[i, j] = total / out[i, i]
+        out[i, i] = 1.0 / out[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += out[k, i] * out[k, j]
+            out[i, j] = out[j, i] = total
+    return log
+
+
+@compiled
+def list_channels(parity: Parity, n: int, mask: int) -> int:
+    """List the channels of a set in ``parity.place``; return how many."""
+    count = 0
+    for i in range(n):
+        if mask >> i & 1:
+            parity.place[count] = i
+            count += 1
+    return count
+
+
+@compiled
+def compute_weights(parity: Parity, n: int, mask: int, variance: Array) -> None:
+    """W of independent errors of the given variances (n,), (rad/s)^2."""
+    for i in range(n):
+        for j in range(n):
+            parity.weight[i, j] = 0.0
+        if mask >> i & 1:
+            parity.weight[i, i] = 1.0 / variance[i]
+
+
+@compiled
+def compute_joint_weights(parity: Parity, n: int, mask: int, covariance: Array) -> None:
+    """W of errors of the given covariance (n, n), (rad/s)^2."""
+    count = list_channels(parity, n, mask)
+    for p in range(count):
+        for q in range(p + 1):
+            parity.information[p, q] = covariance[parity.place[p], parity.place[q]]
+    invert(parity.information, count, parity.weight)
+    for p in range(count):
+        for q in range(count):
+            parity.information[p, q] = parity.weight[p, q]
+    for i in range(n):
+        for j in range(n):
+            parity.weight[i, j] = 0.0
+    for p in range(count):
+        for q in range(count):
+            parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
+
+
+@compiled
+def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
+    """Work out W H, and of ``H' W H + K`` the lower triangle."""
+    for i in range(n):
+        for a in range(3):
+            total = 0.0
+            for j in range(n):
+                total += parity.weight[i, j] * axes[j, a]
+            parity.weighted[i, a] = total
+    for a in range(3):
+        for b in range(a + 1):
+            total = known if a == b else 0.0
+            for i in range(n):
+                total += axes[i, a] * parity.weighted[i, b]
+            parity.normal[a, b] = total
+
+
+@compiled
+def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
+    """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
+    update_normal(parity, n, axes, known)
+    invert(parity.normal, 3, parity.inverse)
+    for a in range(3):
+        for i in range(n):
+            total = 0.0
+            for b in range(3):
+                total += parity.inverse[a, b] * parity.weighted[i, b]
+            parity.gain[a, i] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = parity.weight[i, j]
+            for a in range(3):
+                total -= parity.weighted[i, a] * parity.gain[a, j]
+            parity.information[i, j] = parity.information[j, i] = total
+
+
+@compiled
+def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
+    """Rate (3,) of values (n,), rad/s: those of channels left out are not read."""
+    for a in range(3):
+        total = 0.0
+        for i in range(n):
+            if gain[a, i] != 0.0:
+                total += gain[a, i] * values[i]
+        rate[a] = total
+
+
+@compiled
+def covariance_of(gain: Array, n: int, variance: Array, together: Array, out: Symmetric) -> None:
+    """Covariance G (diag(variance) + together) G' (6,) of a rate, upper triangle, (rad/s)^2."""
+    k = 0
+    for a in range(3):
+        for b in range(a, 3):
+            total = 0.0
+            for i in range(n):
+                if gain[a, i] != 0.0 or gain[b, i] != 0.0:
+                    total += gain[a, i] * gain[b, i] * variance[i]
+                    part = 0.0
+                    for j in range(n):
+                        part += gain[b, j] * together[i, j]
+                    total += gain[a, i] * part
+            out[k] = total
+            k += 1

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Channels, Flag, Mask, Real, Whole, compiled, record
-from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
+from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.detectors.evidence import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from

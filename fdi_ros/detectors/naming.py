@@ -11,7 +11,7 @@ covariance M, and D (n, k) the directions of the hypothesis:
 - a unit as a whole measures too much or too little: ``h_i w`` on its channels;
 - a unit as a whole is late or early: ``h_i`` times the angular acceleration on its channels.
 
-The rate w is unknown altogether, and drops out (`fdi_ros.core.parity`): with ``u = A y``, an amplitude f ~ N(0, t I)
+The rate w is unknown altogether, and drops out (`fdi_ros.core.subsets`): with ``u = A y``, an amplitude f ~ N(0, t I)
 makes the data more likely than no fault by
 
     log L = u_D' (A_DD + I / t)^-1 u_D / 2 - log det(I + t A_DD) / 2,     u_D = D' u,  A_DD = D' A D.
@@ -42,8 +42,8 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.parity import invert
 from fdi_ros.core.records import Matrix, Parity
+from fdi_ros.core.subsets import invert
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 

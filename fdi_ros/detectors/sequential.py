@@ -79,9 +79,8 @@ from fdi_ros.estimator.noise import (
 )
 from fdi_ros.estimator.shared_noise import begin_shared, update_line, update_shape, update_shared_level
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
-from fdi_ros.model.thresholds import FalseAlarmRate
 
 LEAST_TIME = 0.02  # s; that a fault lasts before it is declared
 OUTLIER, ALIKE = 5.5, 0.95

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
+from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,

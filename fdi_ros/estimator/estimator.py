@@ -33,8 +33,8 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_joint_weights, compute_weights, eliminate_rate
 from fdi_ros.core.records import Parity, Sensors
+from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, compute_joint_weights, compute_weights, eliminate_rate
 from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, fill_signals, subtract_errors
 from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, compute_weights, eliminate_rate, invert
+from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, compute_weights, eliminate_rate, invert
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array

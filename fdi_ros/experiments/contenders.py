@@ -19,9 +19,8 @@ from fdi_ros.detectors.base import Detector, Verdict, accepted_options
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, solve_log
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, solve_log
 
 
 class ChiSquare:

@@ -1,17 +1,24 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The errors of a healthy channel: additive noise, scale factor, sampling instant, and their guaranteed bound."""
+"""The errors of a healthy channel; from a false-alarm rate to a threshold, and to the faults that show at one.
+
+NumPy and the standard library only: chi-square tails of whole degrees of freedom are finite sums.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.samples import Array
 
 
@@ -150,3 +157,286 @@ def noisier_words(
     who = ", ".join(f"{names[i]} ({noise[i] * factor:.2g} {unit})" for i, _ in found)
     verb = "is" if len(found) == 1 else "are"
     return f"{who} {verb} much noisier than the other units ({max(beside for _, beside in found) * factor:.2g} at most)"
+
+
+# False-alarm rates ----------------------------------------------------------------------------------------------------
+
+
+DEFAULT_PROBABILITY = 1e-6  # per sample
+DEFAULT_RUN_LENGTH, MIN_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 2.0, 1e15
+"""Samples; the default is one false alarm in 1000 hours at 100 Hz."""
+OPTIONS = ("run_length", "false_alarm_probability", "false_alarms_per_hour", "sample_rate")
+"""Names of its fields among the options of a detector."""
+
+
+@dataclass(frozen=True)
+class FalseAlarmRate:
+    """A false-alarm rate as it is asked for; stated in no way, each reading has its default.
+
+    Parameters
+    ----------
+    probability
+        Per sample, 0 to 1, both excluded.
+    per_hour
+        Expected false alarms per hour, > 0; needs the sample rate.
+    run_length
+        Mean samples to a false alarm.
+    sample_rate
+        Hz, > 0.
+
+    Raises
+    ------
+    ConfigError
+        If it is stated in two ways, or a value is out of its range.
+    """
+
+    probability: float | None = None
+    per_hour: float | None = None
+    run_length: float | None = None
+    sample_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        given = [name for name, value in self._named().items() if value is not None and name != "sample_rate"]
+        if len(given) > 1:
+            raise ConfigError(f"give {' or '.join(given)}, not both")
+        if self.per_hour is not None:
+            if not self.per_hour > 0 or not math.isfinite(self.per_hour):
+                raise ConfigError(f"false_alarms_per_hour is {self.per_hour:g}, expected > 0")
+            if self.sample_rate is None or not self.sample_rate > 0 or not math.isfinite(self.sample_rate):
+                raise ConfigError(f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {self.sample_rate}")
+
+    def per_sample(self) -> float:
+        """Probability of a false alarm in one sample; `DEFAULT_PROBABILITY` if nothing is stated.
+
+        `ConfigError` if it is not between 0 and 1.
+        """
+        probability = DEFAULT_PROBABILITY if self.probability is None else self.probability
+        if self.per_hour is not None and self.sample_rate is not None:
+            probability = self.per_hour / (3600.0 * self.sample_rate)
+        elif self.run_length is not None:
+            probability = 1 / self.mean_run_length()
+        if not 0 < probability < 1:
+            raise ConfigError(f"false-alarm probability per sample is {probability:g}, expected between 0 and 1")
+        return probability
+
+    def mean_run_length(self) -> float:
+        """Mean samples to a false alarm; `DEFAULT_RUN_LENGTH` if nothing is stated.
+
+        `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`.
+        """
+        samples = DEFAULT_RUN_LENGTH if self.run_length is None else self.run_length
+        if self.per_hour is not None or self.probability is not None:
+            samples = 1 / self.per_sample()
+        if not MIN_RUN_LENGTH <= samples <= MAX_RUN_LENGTH:
+            raise ConfigError(f"run_length is {samples:g} samples, expected {MIN_RUN_LENGTH:g} to {MAX_RUN_LENGTH:g}")
+        return samples
+
+    def as_options(self, accepted: Collection[str] = OPTIONS) -> dict[str, float]:
+        """Return the options of a detector that state the same.
+
+        One that takes a run length and no probability, of the options accepted, gets the run length.
+        """
+        options = self._named()
+        if self.probability is not None and "run_length" in accepted and "false_alarm_probability" not in accepted:
+            options["run_length"] = max(1 / self.probability, MIN_RUN_LENGTH)
+        return {name: value for name, value in options.items() if value is not None and name in accepted}
+
+    def _named(self) -> dict[str, float | None]:
+        return dict(zip(OPTIONS, (self.run_length, self.probability, self.per_hour, self.sample_rate), strict=True))
+
+
+def erfc(x: Array) -> Array:
+    """Complementary error function, elementwise."""
+    return np.asarray(np.frompyfunc(math.erfc, 1, 1)(x), dtype=np.float64)
+
+
+# Thresholds ----------------------------------------------------------------------------------------------------------
+
+
+def normal_isf(probability: float) -> float:
+    """Upper quantile of the standard normal."""
+    return -NormalDist().inv_cdf(probability)
+
+
+def chi2_sf(x: Array | float, dof: int) -> Array:
+    """P(chi-square with whole dof > x), elementwise; the closed sums of Abramowitz and Stegun 26.4.4-5."""
+    half = np.asarray(x, dtype=np.float64) / 2
+    if dof % 2 == 0:
+        terms = [half**k / math.factorial(k) for k in range(dof // 2)]
+        return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
+    terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
+    return np.asarray(erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
+
+
+def chi2_isf(probability: float, dof: int) -> float:
+    """Threshold that a chi-square with whole dof exceeds with the given probability."""
+    start = max(normal_isf(probability), 0.0) ** 2 + dof
+    return solve_log(lambda x: float(chi2_sf(x, dof)), probability, start)
+
+
+def max_normal_threshold(directions: Array, probability: float) -> float:
+    """Exact threshold of ``max_i |w_i|`` for standard normal w_i = directions_i . p, p white in m dimensions.
+
+    The threshold is exceeded with a probability, 0 to 1; directions (n, m) are unit vectors. Up to m = 3 the chi-square
+    tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged over the unit sphere by quadrature.
+    Above, over samples drawn beyond the threshold along each direction in turn (Naiman and Priebe 2001), which keeps
+    its relative accuracy far into the tail.
+    """
+    unique = _distinct(directions)
+    m = unique.shape[1]
+    tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
+    bonferroni = normal_isf(probability / (2 * len(unique)))
+    return solve_log(tail, probability, bonferroni)
+
+
+def _distinct(directions: Array) -> Array:
+    kept: list[int] = []
+    for i, direction in enumerate(directions):
+        if all(abs(direction @ directions[j]) < 1 - 1e-9 for j in kept):
+            kept.append(i)
+    return directions[kept]
+
+
+def _sphere_tail(directions: Array) -> Callable[[float], float]:
+    points, weights = half_sphere(directions.shape[1])
+    largest = np.abs(points @ directions.T).max(axis=1)
+    inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
+    return lambda t: float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
+
+
+def half_sphere(m: int, circle: int = 360, around: int = 128, heights: int = 48) -> tuple[Array, Array]:
+    """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
+
+    In a plane there are `circle` of them; in space `around` at each of the heights, which are those of Gauss and
+    Legendre.
+    """
+    if m == 1:
+        return np.ones((1, 1)), np.ones(1)
+    if m == 2:
+        angle = np.pi * (np.arange(circle) + 0.5) / circle
+        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(circle, 1 / circle)
+    nodes, weights = np.polynomial.legendre.leggauss(heights)
+    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(around) + 0.5) / around
+    radius, level = np.sqrt(1 - height**2), np.ones(around)
+    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, level)]
+    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / around, around)
+
+
+def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], float]:
+    # Seeded once: the threshold is a function of the geometry, the same in every run.
+    rng = np.random.default_rng(20190101)
+    n, m = directions.shape
+    # The more directions share in the estimate, the fewer draws each needs: the cost grows with n squared, not cubed.
+    draws = min(most_draws, 16 * most_draws // n)
+    white = rng.standard_normal((draws, m)) @ directions.T
+    log_levels = np.log((rng.permutation(draws) + 0.5) / draws)
+    nodes = np.linspace(log_levels.min(), 0.0, 257)
+    correlation = directions @ directions.T
+
+    def tail(t: float) -> float:
+        single = math.erfc(t / math.sqrt(2))
+        # 257 quantiles and straight lines between them: within 1e-5, and all draws at once.
+        along = np.interp(log_levels, nodes, [normal_isf(math.exp(node) * single / 2) for node in nodes])
+        total = 0.0
+        for i in range(n):
+            w = (along - white[:, i])[:, None] * correlation[i]
+            w += white
+            # Comparing i's own value, rounded, with t would lose the one exceedance that is certain.
+            w[:, i] = 0.0
+            others = (np.abs(w, out=w) > t).sum(axis=1)
+            total += single * float(np.mean(1 / (1 + others)))
+        return total
+
+    return tail
+
+
+def solve_log(tail: Callable[[float], float], level: float, start: float) -> float:
+    """Root of log tail(t) = log level, t > 0, by secant: tails and run lengths are nearly exponential in t."""
+    target = math.log(level)
+    older, newer = start, start + 0.05
+    f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
+    for _ in range(60):
+        if abs(newer - older) < 1e-9 * newer or f_newer == f_older:
+            break
+        step = f_newer * (newer - older) / (f_newer - f_older)
+        older, f_older = newer, f_newer
+        newer = max(newer - step, 0.2 * newer)
+        f_newer = math.log(tail(newer)) - target
+    return newer
+
+
+DETECTION = 0.99  # probability with which the smallest detectable error is seen in one sample
+IN_PLANE = 0.1
+"""Directions in parity space whose third singular value is below are in one plane: mounts are known no better."""
+MOST_SETS = 4  # sets of channels that are listed
+
+
+def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
+    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
+
+    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
+    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
+    """
+    V = geometry.parity
+    inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
+    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
+    root = np.linalg.cholesky(inverse)
+    directions = (root.T @ V).T[geometry.detectable]
+    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
+    with np.errstate(divide="ignore"):
+        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
+
+
+def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
+    """Channels of which two that fail in step look like a fault of a third, set by set.
+
+    Their directions in parity space lie in a plane: three parallel gyros, for one, which have two differences.
+    """
+    directions = geometry.parity / np.maximum(np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY)
+    sets: list[set[int]] = []
+    triples = np.array(list(combinations(np.flatnonzero(geometry.isolable), 3)), dtype=np.int64).reshape(-1, 3)
+    third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
+    for triple in triples[third < IN_PLANE].tolist():
+        # Two directions make a plane.
+        known = next((found for found in sets if len(found & set(triple)) == 2), None)
+        if known is None:
+            sets.append(set(triple))
+        else:
+            known |= set(triple)
+    return tuple(tuple(sorted(found)) for found in sets)
+
+
+def assumption_words(geometry: Geometry) -> str:
+    """Say what no data can tell and every name rests on (docs/integrity.md); empty: nothing of this kind."""
+    names = geometry.channel_names
+    sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
+    shown = ", ".join(sets[:MOST_SETS]) + (f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else "")
+    return f"no two failing alike of {shown}: they would look like a fault of the third" if sets else ""
+
+
+def summary_line(
+    geometry: Geometry,
+    noise: NoiseModel,
+    probability: float,
+    unit: str = "rad/s",
+    factor: float = 1.0,
+    agree: bool = True,
+) -> str:
+    """Return what a mounting can do, in one line: for the log of a node.
+
+    ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the errors, and how much of it is 1
+    rad/s. ``agree``: the channels are not known to contradict each other; else nothing is said of what can be named.
+    """
+    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
+    seen = smallest[np.isfinite(smallest)]
+    ends = dict.fromkeys(f"{value * factor:.3g}" for value in (seen.min(), seen.max())) if len(seen) else {}
+    span = f"{' to '.join(ends)} {unit}" if ends else "none"
+    isolable, n = int(geometry.isolable.sum()), geometry.n
+    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    if not agree:
+        return f"{words}; which faults can be isolated is not known: channels contradict each other"
+    groups = [group for group in geometry.groups if len(group) > 1]
+    if isolable == n:
+        return f"{words}; any single fault can be isolated"
+    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
+    return f"{words}; {isolable} of {n} single faults can be isolated, not told apart: {alike or 'faults never seen'}"

@@ -34,9 +34,8 @@ from numpy.typing import NDArray
 from fdi_ros.config.settings import IntegrityConfig
 from fdi_ros.core.subsets import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import NoiseModel, normal_isf
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.model.thresholds import normal_isf
 
 Axes = tuple[float, float, float]
 NO_LEVEL: Axes = (math.inf,) * 3

@@ -17,11 +17,10 @@ from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.config.config import PARAMETERS, Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits, restart_bias
-from fdi_ros.core.decision import RETURN_MEAN, clear_declarations
+from fdi_ros.core.decision import REASONS, RETURN_MEAN, ChannelState, Reason, clear_declarations
 from fdi_ros.core.fusion import update_level
 from fdi_ros.core.path import begin_bias, run
 from fdi_ros.core.records import Core, EventRow, OutputRow, Sample
-from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import (
     describe_sensors,
     mask_of,
@@ -34,9 +33,8 @@ from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, normal_isf
 from fdi_ros.model.samples import Block
-from fdi_ros.model.thresholds import FalseAlarmRate, normal_isf
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Event, Output, events_of
 from fdi_ros.monitor.status import Status, status_of

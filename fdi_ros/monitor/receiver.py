@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import Callback, allocate, reported
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, are_parted, is_live, new_aligner
-from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.health import copies_among
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import MORE, NEVER, process
 from fdi_ros.core.records import EventRow, Live

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
+from fdi_ros.core.decision import REASONS, ChannelState, Reason
 from fdi_ros.core.records import Condition
-from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import flags_of, is_in, mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_words
+from fdi_ros.model.noise import assumption_words
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.model.thresholds import assumption_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import plus_minus
 

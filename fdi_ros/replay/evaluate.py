@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.states import ChannelState
+from fdi_ros.core.decision import ChannelState
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block

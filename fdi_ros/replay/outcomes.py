@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.core.states import ChannelState
+from fdi_ros.core.decision import ChannelState
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.output import Output
 

@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.states import ChannelState
+from fdi_ros.core.decision import ChannelState
 from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array

@@ -37,7 +37,7 @@ from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, Status
 from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros.node import REPORT_PERIOD, CheckedNode, message_class, read_diagnostics
 from fdi_ros.ros.process import Stop, guarded, make_executor
-from fdi_ros.sources.channels import ChannelsSource
+from fdi_ros.sources import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
 NAMES = ("imu_1", "imu_2", "imu_3")  # of units where the settings name none, each on the topic ``NAME/data_raw``

@@ -23,7 +23,7 @@ from fdi_ros.compiling.notice import announced, refused
 from fdi_ros.config.config import is_ros_parameter
 from fdi_ros.config.settings import MONITOR
 from fdi_ros.errors import FdiError
-from fdi_ros.model.thresholds import summary_line
+from fdi_ros.model.noise import summary_line
 from fdi_ros.monitor.output import OUTPUTS, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline, alarm_probability
 from fdi_ros.monitor.receiver import Receiver, warm_detector

@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.core.copies import copies_among
+from fdi_ros.core.health import copies_among
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats

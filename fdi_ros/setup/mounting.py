@@ -16,9 +16,8 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import DETECTION, NoiseModel, assumption_words, smallest_detectable, summary_line
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import DETECTION, assumption_words, smallest_detectable, summary_line
 from fdi_ros.monitor.pipeline import alarm_probability, build_geometry, build_noise
 from fdi_ros.report.layout import (
     PALETTE,

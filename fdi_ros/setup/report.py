@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from fdi_ros.model.noise import summary_line
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import summary_line
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
     RADIANS,

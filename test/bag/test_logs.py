@@ -23,7 +23,7 @@ from fdi_ros.bag import dataflash, flight_log, ulog
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FdiError
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {

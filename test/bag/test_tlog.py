@@ -15,7 +15,7 @@ from pymavlink import mavutil
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.errors import BagError
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 UTC = 1_790_000_000_000_000
 """Of the start of a log, us."""

@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate
 from fdi_ros.core.alignment import restamp
-from fdi_ros.core.parity import compute_joint_weights, eliminate_rate
 from fdi_ros.core.records import DelayBuffer, Parity
+from fdi_ros.core.subsets import compute_joint_weights, eliminate_rate
 from fdi_ros.estimator.error_states import (
     MAX_STATES,
     ErrorStates,

@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import Geometry, NoiseModel, create_detector
-from fdi_ros.model.thresholds import chi2_isf
+from fdi_ros.model.noise import chi2_isf
 
 UNIT = NoiseModel(1.0)
 MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)

@@ -13,8 +13,7 @@ from scipy.stats import multivariate_normal
 
 from fdi_ros import Geometry
 from fdi_ros.compiling.compiled import MAX_UNITS, allocate
-from fdi_ros.core.parity import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
-from fdi_ros.core.subsets import mask_of
+from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate, mask_of
 from fdi_ros.detectors.naming import (
     COINCIDENCE,
     DELAY_STD,

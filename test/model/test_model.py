@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fdi_ros import FdiError, Geometry, NoiseModel
-from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, chi2_sf, max_normal_threshold, normal_isf
+from fdi_ros.model.noise import FalseAlarmRate, chi2_isf, chi2_sf, max_normal_threshold, normal_isf
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(4, 12))

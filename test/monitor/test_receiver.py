@@ -16,8 +16,7 @@ from fdi_ros.monitor import output
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState, Encoder, SampleOutput, Topic
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ChannelsSource, ImuSource
 
 STEP = 10_000_000
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import output_of
 
-from fdi_ros.core.states import ChannelState, Reason
+from fdi_ros.core.decision import ChannelState, Reason
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block

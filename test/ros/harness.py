@@ -37,8 +37,7 @@ from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ChannelsSource, ImuSource
 
 ROOT = Path(__file__).parents[2]
 RATE = 250.0

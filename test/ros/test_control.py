@@ -36,7 +36,7 @@ from ros.harness import (
 )
 from rosgraph_msgs.msg import Clock
 
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:

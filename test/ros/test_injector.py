@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.samples import Block
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 
 @pytest.fixture(scope="module")

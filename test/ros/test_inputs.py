@@ -16,8 +16,8 @@ from rclpy.executors import SingleThreadedExecutor
 from ros.harness import TWO_IMUS, Process, healthy, listening, parameter_file, wait
 from std_srvs.srv import Trigger
 
+from fdi_ros.core.decision import ChannelState
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.core.states import ChannelState
 from fdi_ros.ros import node as node_module
 from fdi_ros.ros.node import DEPTH, FLOOD, LONGEST, CheckedNode
 from fdi_ros.ros.process import replace_executor

@@ -20,7 +20,7 @@ from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
 

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 FAULTY = int(ChannelState.FAULTY)
 DECLARED = (FAULTY, int(ChannelState.AMBIGUOUS))

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.model.samples import Block
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 
 def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(tmp_path) -> None:

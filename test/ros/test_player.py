@@ -27,7 +27,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros import player_node
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ImuSource
 
 FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)

@@ -16,8 +16,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import assumption_words, coincidences, smallest_detectable, summary_line
+from fdi_ros.model.noise import NoiseModel, assumption_words, coincidences, smallest_detectable, summary_line
 from fdi_ros.setup.mounting import VIBRATION, WAITS, assess, loss, mounting_text, pair_lines, smallest_shift
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -22,8 +22,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.compiling.compiled import INTERPRETED
 from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
+from fdi_ros.sources import ChannelsSource, ImuSource
 
 finite = st.floats(allow_nan=False)
 vectors = st.tuples(finite, finite, finite)

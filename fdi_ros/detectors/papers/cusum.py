@@ -28,9 +28,8 @@ from fdi_ros.detectors.papers.likelihood_ratio import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, erfc
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import FalseAlarmRate, erfc
 
 
 @lru_cache(maxsize=16)

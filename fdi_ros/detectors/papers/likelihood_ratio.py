@@ -43,9 +43,8 @@ from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, max_normal_threshold
 from fdi_ros.model.samples import Array
-from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, max_normal_threshold
 
 MAX_RATIO = 1e6
 """Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,

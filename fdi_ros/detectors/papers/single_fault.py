@@ -34,9 +34,8 @@ from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector, NoState
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
-from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, max_normal_threshold
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.model.thresholds import FalseAlarmRate, max_normal_threshold
 
 
 def prediction_errors(axes: Array) -> Array:

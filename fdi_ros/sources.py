@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The interface of an input kind, and the two arrangements of topics that there are.
+"""What arrives: the kinds of input, each named in a row of `fdi_ros.config.settings.INPUTS`.
 
 A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and three compiled functions, which
-are listed in `Source`. They are functions of the kind's own module, and not arguments of a common one: so Numba
-compiles each once and keeps the result, and no call is added to the way of a sample.
+are listed in `Source`. They are functions of the kind's own, and not arguments of a common one: so Numba compiles each
+once and keeps the result, and no call is added to the way of a sample.
 """
 
 from __future__ import annotations
@@ -19,9 +19,29 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS
+from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, compiled
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import GOOD, Decoded, MessageError, as_batch, byte_order, explain, read_only
+from fdi_ros.config.settings import INPUTS
+from fdi_ros.core.messages import (
+    ENCAPSULATION,
+    FIRST_OWN,
+    GOOD,
+    IMU_BEFORE_RATE,
+    IMU_DOUBLES,
+    NO_CDR,
+    Decoded,
+    MessageError,
+    as_batch,
+    byte_order,
+    explain,
+    is_cdr,
+    place_after_header,
+    read_bits,
+    read_doubles,
+    read_only,
+    read_rate,
+)
+from fdi_ros.core.path import receive_arrived, receive_stamped
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
@@ -180,3 +200,157 @@ class ArraySource(Source):
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.names, self.timeout = config.topics, config.health.stale_timeout
+
+
+# sensor_msgs/Imu ------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _imu_place(data: Bytes, offset: int, length: int, count: int) -> int:
+    return place_after_header(data, offset, length, IMU_BEFORE_RATE, IMU_DOUBLES)
+
+
+@compiled
+def _imu_decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+    for k in range(len(offset)):
+        measured = read_rate(data, offset[k], length[k], IMU_BEFORE_RATE, IMU_DOUBLES, values[k])
+        if measured < 0:
+            code[k] = -measured
+        else:
+            stamp[k] = measured
+
+
+@compiled
+def _imu_receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    if not 0 <= inlet < aligner[0].n:
+        return 0
+    measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
+    return receive_stamped(live[0], aligner[0], inlet, measured, stamp)
+
+
+class ImuSource(UnitSource):
+    """The angular velocity of sensor_msgs/Imu messages, one topic per unit."""
+
+    type = "sensor_msgs/msg/Imu"
+    called = "an Imu"
+    place = staticmethod(_imu_place)
+    decode_into = staticmethod(_imu_decode_into)
+    receive = staticmethod(_imu_receive)
+
+
+# std_msgs/Float64MultiArray -------------------------------------------------------------------------------------------
+
+
+MAX_DIMENSIONS = 16  # an array whose layout has more dimensions is no message of ours
+_DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES = range(FIRST_OWN, FIRST_OWN + 4)
+
+
+@compiled
+def _count_at(data: Bytes, offset: int, length: int) -> int:
+    """Return where the number of values of an array stands; what is wrong, negative, if that cannot be known."""
+    if not is_cdr(data, offset, length):
+        return -NO_CDR
+    little = data[offset + 1] == 1
+    at = ENCAPSULATION + 4
+    if at > length:
+        return -_CUT_ARRAY
+    dimensions = read_bits(data, offset + ENCAPSULATION, 4, little)
+    if dimensions > MAX_DIMENSIONS:
+        return -_DIMENSIONS
+    for _ in range(dimensions):
+        if at + 4 > length:
+            return -_CUT_ARRAY
+        # Label, aligned to 4, then size and stride.
+        at += 4 + (read_bits(data, offset + at, 4, little) + 3) // 4 * 4 + 8
+    # The offset of the data, then the number of values.
+    at += 4
+    return offset + at if at + 4 <= length else -_CUT_ARRAY
+
+
+@compiled
+def _array_place(data: Bytes, offset: int, length: int, count: int) -> int:
+    at = _count_at(data, offset, length)
+    if at < 0:
+        return at
+    if read_bits(data, at, 4, data[offset + 1] == 1) != count:
+        return -_WRONG_COUNT
+    # The first byte of the values is aligned even where there is none.
+    start = ENCAPSULATION + (at + 4 - offset - ENCAPSULATION + 7) // 8 * 8
+    return offset + start if start + 8 * count <= length else -_CUT_VALUES
+
+
+@compiled
+def _array_read(data: Bytes, offset: int, length: int, count: int, values: Array) -> int:
+    at = _array_place(data, offset, length, count)
+    if at < 0:
+        return -at
+    read_doubles(data, at, count, data[offset + 1] == 1, values)
+    return GOOD
+
+
+@compiled
+def _array_decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+    for k in range(len(offset)):
+        code[k] = _array_read(data, offset[k], length[k], values.shape[1], values[k])
+
+
+@compiled
+def _array_receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    monitor = live[0]
+    if not 0 <= inlet < aligner[0].n:
+        return 0
+    return receive_arrived(monitor, _array_read(data, 0, len(data), monitor.channels, monitor.sample.z), stamp)
+
+
+class ChannelsSource(ArraySource):
+    """The values of std_msgs/Float64MultiArray messages, whatever their layout says."""
+
+    type = "std_msgs/msg/Float64MultiArray"
+    called = "an array"
+    place = staticmethod(_array_place)
+    decode_into = staticmethod(_array_decode_into)
+    receive = staticmethod(_array_receive)
+
+    @classmethod
+    def explain(cls, code: int, data: bytes, count: int) -> str:
+        """Explain in one line what is wrong with a message in which count values were expected."""
+        size, order = len(data), byte_order(data)
+        if code < FIRST_OWN:
+            return super().explain(code, data, count)
+        if code == _DIMENSIONS:
+            (dimensions,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION)
+            return f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"
+        if code == _CUT_ARRAY:
+            return f"{size} bytes are too few for the array they announce"
+        if code == _WRONG_COUNT:
+            return f"array has {cls.announced(*as_batch(data))} values, expected {count}"
+        return f"{size} bytes are too few for {count} values ({'little' if order == '<' else 'big'} endian)"
+
+    @classmethod
+    def announced(cls, buffer: Bytes, offset: Int, length: Int) -> int:
+        """Return how many values the first readable one of k messages says that it has; 0: none is readable."""
+        data = read_only(buffer)
+        for start, size in zip(offset.tolist(), length.tolist(), strict=True):
+            at = _count_at(data, start, size)
+            if at >= 0:
+                return int.from_bytes(data[at : at + 4].tobytes(), "little" if data[start + 1] else "big")
+        return 0
+
+
+SOURCES: dict[str, type[Source]] = {name: globals()[row.source] for name, row in INPUTS.items()}
+"""By the value of the parameter ``input``."""
+
+
+def source_of(config: Config) -> Source:
+    """Return the source of a configuration."""
+    return SOURCES[config.input](config)
+
+
+def input_of(kind: type[Source]) -> str:
+    """Return the value of the parameter ``input`` for a kind."""
+    return next(name for name, one in SOURCES.items() if one is kind)
+
+
+def source_of_type(message_type: str) -> type[Source] | None:
+    """Return the kind of input of a message type, ``sensor_msgs/msg/Imu``; None: no gyros are read from it."""
+    return next((kind for kind in SOURCES.values() if kind.type == message_type), None)
