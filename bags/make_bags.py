@@ -13,7 +13,7 @@ from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Geometry
-from fdi_ros.experiments.simulate import GyroErrors, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import GyroErrors, regular_stamps, vehicle_motion
 
 SEED = 7
 START = 1_750_000_000 * 10**9

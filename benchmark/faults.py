@@ -46,7 +46,7 @@ from trials import (
 
 from fdi_ros import Pipeline
 from fdi_ros.experiments.contenders import moustakides_delay
-from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState, Output
 
 DRIFT_FIGURES = {

@@ -40,7 +40,7 @@ from trials import (
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState
 
 FALSE_FIGURES = {"events": "d", "hours": ".2f", "an_hour": ".2f", "over_asked": ".3f", "error": ".3f"}

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from trials import Array, Asked, Flight, Mask, Rng, Row, faulty, first, fresh, is_state, ways
 
 from fdi_ros import Pipeline
-from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState
 
 LENGTH, ONSET = 40.0, 10.0  # of a flight, and when faults begin, s

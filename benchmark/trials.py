@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.experiments.simulate import GyroErrors, Gyros, Motion, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import GyroErrors, Gyros, Motion, regular_stamps, vehicle_motion
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.output import ChannelState, Output
 

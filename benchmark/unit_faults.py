@@ -28,7 +28,7 @@ from flights import Kept
 from trials import START, Array, Asked, Flight, Rng, Row, faulty, is_state, ways, write_bag
 
 from fdi_ros import Block, Config, Pipeline
-from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, replay
 

@@ -25,7 +25,7 @@ from healthy import autoregressive
 from trials import CONFIGS, NOISE, START, Array, Asked, Rng, Row, fresh
 
 from fdi_ros import Block, Config, Pipeline
-from fdi_ros.experiments.simulate import Motion, regular_stamps
+from fdi_ros.experiments.flight import Motion, regular_stamps
 from fdi_ros.monitor.output import ChannelState
 
 LENGTH, MOTORS, COUNTED = 60.0, 10.0, 15.0  # s: of a flight, until the motors start, and from where on errors count

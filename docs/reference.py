@@ -19,7 +19,8 @@ from typing import Any
 
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.config.settings import NODES, REQUIRED, Field
-from fdi_ros.experiments.montecarlo import SCHEMAS
+from fdi_ros.experiments import PROTOCOLS
+from fdi_ros.experiments.montecarlo import protocol_class
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 WHEN = {
@@ -211,8 +212,9 @@ def node_parameters() -> str:
 def studies() -> str:
     """Sections of a study file with their settings."""
     parts = []
-    _same("MEANING", MEANING, SCHEMAS)
-    for kind, schema in SCHEMAS.items():
+    _same("MEANING", MEANING, PROTOCOLS)
+    for kind in PROTOCOLS:
+        schema = protocol_class(kind).schema
         meaning = {**{name: _COMMON[name] for name in schema if name in _COMMON}, **MEANING[kind]}
         _same(f"MEANING of {kind}", meaning, schema)
         rows = [

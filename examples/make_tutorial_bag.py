@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Geometry
-from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import GyroErrors, Motion, regular_stamps, vehicle_motion
 
 SEED = 42
 START = 1_760_000_000 * 10**9

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.config.config import Config
-from fdi_ros.experiments.simulate import Motion
+from fdi_ros.experiments.flight import Motion
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
+from fdi_ros.experiments.montecarlo import (
+    Counts,
+    Field,
+    Preparation,
+    Refusals,
+    Schema,
+    TrialProtocol,
+    geometry_of,
+)
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, solve_log
 from fdi_ros.model.samples import Array, Mask
@@ -116,14 +124,6 @@ class Contenders(NamedTuple):
     running: dict[str, Contender]
     refused: dict[str, str]
 
-    def for_single_samples(self) -> Contenders:
-        """Return the same without the methods that need a stream."""
-        streaming = {name for name, contender in self.running.items() if contender.has_memory}
-        return Contenders(
-            {name: contender for name, contender in self.running.items() if name not in streaming},
-            {**self.refused, **{n: "judges a stream, not one sample" for n in self.running if n in streaming}},
-        )
-
 
 def build_contenders(
     names: Sequence[str],
@@ -131,23 +131,31 @@ def build_contenders(
     noise: NoiseModel,
     alarm_probability: float,
     own: Mapping[str, Mapping[str, Any]],
-    factors: Mapping[str, float] | None = None,
+    streams: bool = False,
 ) -> Contenders:
     """Build methods of `METHODS` for channels, with loose thresholds of a probability of alarm per sample.
 
-    ``own``: options of a method by name; they win. ``factors``: multiple of the loose threshold that each method is to
-    have, where its verdict depends on its threshold.
+    ``own``: options of a method by name; they win. ``streams``: also the methods that need a stream.
     """
-    running, refused = {}, {}
+    running, refused, streaming = {}, {}, {}
     for name in names:
         options = loose_options(name, geometry.n, alarm_probability) | dict(own.get(name, {}))
-        if factors and name in factors and "threshold" in options:
-            options["threshold"] *= factors[name]
         try:
-            running[name] = Contender(_create(name, geometry, noise, options))
+            chi_square = name == ChiSquare.name
+            method = (
+                ChiSquare(geometry, noise, **options)
+                if chi_square
+                else create_detector(name, geometry, noise, **options)
+            )
         except FdiError as error:
             refused[name] = str(error)
-    return Contenders(running, refused)
+            continue
+        contender = Contender(method)
+        if contender.has_memory and not streams:
+            streaming[name] = "judges a stream, not one sample"
+        else:
+            running[name] = contender
+    return Contenders(running, refused | streaming)
 
 
 def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
@@ -159,12 +167,6 @@ def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]
     return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
 
 
-def _create(name: str, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Method:
-    if name == ChiSquare.name:
-        return ChiSquare(geometry, noise, **options)
-    return create_detector(name, geometry, noise, **options)
-
-
 def _largest(size: Array) -> NDArray[np.intp]:
     """Column of the largest of each row (N,); parallel channels are equal but for rounding, which must not decide."""
     size = np.nan_to_num(size, nan=-1.0)
@@ -172,18 +174,83 @@ def _largest(size: Array) -> NDArray[np.intp]:
     return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
 
 
-def white_noise(noise_std: float) -> NoiseModel:
-    """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
-    return NoiseModel(noise_std, bound=BOUND * noise_std)
-
-
 # One false-alarm rate for all -----------------------------------------------------------------------------------------
 
 
-def largest_ratios(running: Mapping[str, Contender], z: Array, false_alarms: Sequence[float]) -> dict[str, list[float]]:
-    """Keep by method the ratios of samples z (N, n) that can decide a threshold: twice the share of alarms and more."""
-    kept = int(2 * max(false_alarms) * len(z)) + 50
-    return {name: np.sort(one.ratios(z))[::-1][:kept].tolist() for name, one in running.items()}
+class Cell(NamedTuple):
+    """Trials on one geometry, with faults of one size or one selection of trials; neither: healthy channels."""
+
+    geometry: int
+    size: float = 0.0
+    selection: str = ""
+
+    @property
+    def healthy(self) -> bool:
+        """Whether no channel is off."""
+        return not (self.size or self.selection)
+
+
+class CommonRate(TrialProtocol[Cell]):
+    """A protocol that has all methods at one false-alarm rate: that of their loose thresholds, times what it finds.
+
+    The first stage is the same for all: on healthy channels it finds the threshold at which each method gives the rates
+    asked for.
+    """
+
+    schema: ClassVar[Schema] = {
+        "geometries": Field("geometries", ["two_triad_cone"]),
+        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
+        "options": Field("mapping", {}),
+    }
+
+    @property
+    def specs(self) -> list[Any]:
+        """Geometries as the study gives them."""
+        found: list[Any] = self.settings["geometries"]
+        return found
+
+    @cached_property
+    def geometries(self) -> list[Geometry]:
+        """As set."""
+        return [geometry_of(spec) for spec in self.specs]
+
+    @cached_property
+    def contenders(self) -> list[Contenders]:
+        """Methods at their loose thresholds for each geometry."""
+        return [self.build(g, self.settings["detectors"], self.settings["options"]) for g in range(len(self.specs))]
+
+    def preparation_cells(self) -> list[Cell]:
+        """List the geometries, with healthy channels."""
+        return [Cell(g) for g in range(len(self.specs))]
+
+    def trials(self, cell: Cell) -> tuple[int, int]:
+        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
+        return self.settings["sound_trials" if cell.healthy else "trials"], self.settings["block"]
+
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
+        """Find by method the ratios of healthy samples that can decide a threshold."""
+        z, alarms = self.draw(cell, count, rng)[0], self.settings["false_alarms"]
+        # Twice the share of alarms, and more.
+        kept = int(2 * max(alarms) * len(z)) + 50
+        running = self.contenders[cell.geometry].running
+        largest = {name: np.sort(one.ratios(z))[::-1][:kept].tolist() for name, one in running.items()}
+        return {"trials": count, "largest": largest}
+
+    def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
+        """Find the multiples of the loose thresholds by geometry, method and false-alarm rate."""
+        return {"factors": [factors_of(blocks, self.settings["false_alarms"]) for blocks in found]}
+
+    def refusals(self) -> Refusals:
+        """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
+        return {str(spec): one.refused for spec, one in zip(self.specs, self.contenders, strict=True)}
+
+    @abstractmethod
+    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Any]:
+        """Draw values of trials, rad/s, and which channels are off."""
+
+    @abstractmethod
+    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
+        """Build methods at their loose thresholds for a geometry, by its number; ``own``: options by method."""
 
 
 def factors_of(blocks: Sequence[Counts], false_alarms: Sequence[float]) -> dict[str, list[float]]:
@@ -205,45 +272,6 @@ def threshold_factor(largest: Sequence[float], alarm_probability: float, trials:
     return max(float(ordered[rank - 1]), 1.0)
 
 
-class Cell(NamedTuple):
-    """Trials on one geometry with faults of one size; 0: none."""
-
-    geometry: int
-    size: float
-
-
-class OnGeometries(TrialProtocol[Cell]):
-    """A protocol whose cells are each on one of the ``geometries`` of its settings."""
-
-    schema: ClassVar[Schema] = {
-        "geometries": Field("geometries", ["two_triad_cone"]),
-        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
-        "options": Field("mapping", {}),
-    }
-
-    @cached_property
-    def geometries(self) -> list[Geometry]:
-        """As set."""
-        return [geometry_of(spec) for spec in self.settings["geometries"]]
-
-    @cached_property
-    def contenders(self) -> list[Contenders]:
-        """Methods at their loose thresholds for each geometry."""
-        return [self.build(g, self.settings["detectors"]) for g in range(len(self.geometries))]
-
-    def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
-        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
-
-    @abstractmethod
-    def build(self, g: int, names: Sequence[str]) -> Contenders:
-        """Build methods at their loose thresholds for a geometry, by its number."""
-
-    def refusals(self) -> Refusals:
-        """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
-        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self.contenders, strict=True)}
-
-
 # The least delay ----------------------------------------------------------------------------------------------------
 
 
@@ -262,8 +290,12 @@ def cusum_run_length(limit: float, reference: float, mean: float) -> float:
 
     From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature; all in standard deviations of x.
     """
+
+    def above(x: float) -> float:
+        return 0.5 * math.erfc(x / math.sqrt(2))
+
     if limit <= 0:
-        return 1 / _above(reference - mean)
+        return 1 / above(reference - mean)
     # The kernel is one standard deviation wide: a few nodes in each.
     nodes = 60 + math.ceil(2 * limit)
     node, weight = np.polynomial.legendre.leggauss(nodes)
@@ -272,9 +304,5 @@ def cusum_run_length(limit: float, reference: float, mean: float) -> float:
     step = at - start[:, None] + reference - mean
     matrix = np.zeros((nodes + 1, nodes + 1))
     matrix[:, 1:] = np.exp(-0.5 * step**2) * weight / math.sqrt(2 * math.pi)
-    matrix[:, 0] = [1 - _above(reference - mean - s) for s in start]
+    matrix[:, 0] = [1 - above(reference - mean - s) for s in start]
     return float(np.linalg.solve(np.eye(nodes + 1) - matrix, np.ones(nodes + 1))[0])
-
-
-def _above(x: float) -> float:
-    return 0.5 * math.erfc(x / math.sqrt(2))

@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any, NamedTuple
 
-from fdi_ros.experiments.montecarlo import StudyResult
-from fdi_ros.experiments.study import Figures, geometry_words
+from fdi_ros.experiments.montecarlo import Figures, StudyResult
 from fdi_ros.replay.outcomes import Estimate
-from fdi_ros.report.layout import PALETTE, Rows, Section, number, page, table
+from fdi_ros.report.layout import PALETTE, Section, number, page, table
 
 LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
@@ -44,9 +44,10 @@ def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:
     """Parts of all sections in their order, as their protocols show them."""
     parts = []
     for section in result.sections:
-        for spec, cells in groupby(section.cells, lambda cell: cell.get("geometry")):
+        for spec, cells in groupby(section.cells, lambda cell: cell.get("geometry", "")):
             if section.kind in how:
-                parts += how[section.kind](Group(geometry_words(spec or ""), list(cells), section.settings))
+                mounting = spec if isinstance(spec, str) else f"{len(spec)} given axes"
+                parts += how[section.kind](Group(mounting, list(cells), section.settings))
     return parts
 
 
@@ -59,14 +60,9 @@ def headline(result: StudyResult) -> str:
     """Tables as text."""
     lines = [f"{result.title or result.study}, seed {result.seed}"]
     for one in tables(result):
-        lines += ["", one.title, one.hint, *table(*rows_of(one))]
+        assert isinstance(one.content, tuple)
+        lines += ["", one.title, one.hint, *table(*one.content)]
     return "\n".join(lines)
-
-
-def rows_of(one: Section) -> Rows:
-    """Head and rows of a table of a result."""
-    assert isinstance(one.content, tuple)
-    return one.content
 
 
 def report(result: StudyResult) -> str:
@@ -96,21 +92,21 @@ def _alike_together(title: str, hint: str, head: Sequence[str], rows: Sequence[S
     return Section(title, hint, (head, [(", ".join(names), *words) for words, names in alike.items()]))
 
 
-def _percent(figure: Estimate | float | None) -> str:
-    """Share in percent; a dash where there is none."""
-    value = figure.value if isinstance(figure, Estimate) else figure
-    if value is None or value != value:
-        return "-"
-    return f"{100 * value:.1f}" if value >= 0.01 or value == 0 else f"{100 * value:.2g}"
-
-
 def _of(name: str) -> Say:
-    """Words of one share."""
-    return lambda at: "-" if at is None else _percent(at.get(name))
+    """Words of one share, in percent; a dash where there is none."""
+
+    def say(at: Figures | None) -> str:
+        figure = None if at is None else at.get(name)
+        if figure is None or math.isnan(figure.value):
+            return "-"
+        percent = 100 * figure.value
+        return f"{percent:.1f}" if figure.value >= 0.01 or not percent else f"{percent:.2g}"
+
+    return say
 
 
 def _both(at: Figures) -> str:
-    return f"{_percent(at['right'])} ({_percent(at['declared'])})"
+    return f"{_of('right')(at)} ({_of('declared')(at)})"
 
 
 def _firsts(cell: Figures) -> dict[str, Figures]:

@@ -23,8 +23,8 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
 from fdi_ros.experiments.contenders import cusum_run_length, moustakides_delay
+from fdi_ros.experiments.flight import Flight
 from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.outcomes import added, quantiles, share

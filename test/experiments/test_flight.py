@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.model.geometry import Geometry
 
 ERRORS = ("noise_std", "bias_std", "bias_walk", "scale_std", "misalignment_std", "delay_std", "resolution")

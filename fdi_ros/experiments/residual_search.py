@@ -13,38 +13,31 @@ out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
-from fdi_ros.experiments.contenders import (
-    BOUND,
-    Contenders,
-    build_contenders,
-    factors_of,
-    largest_ratios,
-)
-from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.experiments.contenders import BOUND, Cell, CommonRate, Contenders, build_contenders
+from fdi_ros.experiments.montecarlo import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.outcomes import share
 
 Index = NDArray[np.intp]
 
-HEALTHY, STANDS_OUT, PRINTED, ALL = "sound", "stands_out", "printed", "all"
+STANDS_OUT, PRINTED, ALL = "stands_out", "printed", "all"
 CLIP = 3.0
 LOOSE_FALSE_ALARM = 0.98
 """False-alarm probability of the loose thresholds: every method names a channel nearly always, as the protocol counts
 names within the tolerance too."""
 
 
-class ResidualSearch(TrialProtocol[str]):
+class ResidualSearch(CommonRate):
     """Outcomes of the protocol: right or wrong channel, declared or within the tolerance; and false alarms.
 
     The four searches with the paper's tolerance; then all methods at common false-alarm rates of healthy channels. A
@@ -67,32 +60,25 @@ class ResidualSearch(TrialProtocol[str]):
         "block": Field("int", 10_000, 1, 1e6),
     }
 
-    def preparation_cells(self) -> list[str]:
-        """List the healthy channels."""
-        return [HEALTHY]
+    @property
+    def specs(self) -> list[Any]:
+        """The one geometry."""
+        return [self.settings["geometry"]]
 
-    def trial_cells(self) -> list[str]:
+    def trial_cells(self) -> list[Cell]:
         """List the healthy channels, and each selection of trials."""
-        return [HEALTHY, *self.settings["selections"]]
-
-    def trials(self, cell: str) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set, before the selection."""
-        return self.settings["sound_trials" if cell == HEALTHY else "trials"], self.settings["block"]
-
-    def prepare(self, cell: str, count: int, rng: np.random.Generator) -> Counts:
-        """Find the largest ratios of healthy samples."""
-        z = self._draw(rng, count, cell)[0]
-        return {"trials": count, "largest": largest_ratios(self._contenders.running, z, self.settings["false_alarms"])}
+        return [Cell(0), *(Cell(0, selection=selection) for selection in self.settings["selections"])]
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by method and false-alarm rate."""
-        return {"factors": factors_of(found[0], self.settings["false_alarms"])}
+        (factors,) = super().conclude(found)["factors"]
+        return {"factors": factors}
 
-    def run(self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw trials of the protocol and evaluate every method on them."""
-        z, failed = self._draw(rng, count, cell)
+        z, failed = self.draw(cell, count, rng)
         methods, paper = {}, {}
-        for name, contender in self._contenders.running.items():
+        for name, contender in self.contenders[0].running.items():
             evaluation = contender.evaluate(z)
             factors = preparation["factors"][name]
             methods[name] = [_counted(evaluation.ratio >= one, evaluation.named, failed) for one in factors]
@@ -101,7 +87,7 @@ class ResidualSearch(TrialProtocol[str]):
                 paper[name] = _counted(declared, evaluation.named, failed)
         return {"drawn": count, "kept": len(z), "methods": methods, "paper": paper}
 
-    def summary(self, cell: str, counts: Counts, preparation: Preparation) -> Figures:
+    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of the trials that the selection keeps by outcome."""
         alarms, kept = self.settings["false_alarms"], counts["kept"]
 
@@ -109,7 +95,7 @@ class ResidualSearch(TrialProtocol[str]):
             return {name: share(count, kept) for name, count in outcomes.items()}
 
         return {
-            "selection": cell,
+            "selection": cell.selection or "sound",
             "drawn": counts["drawn"],
             "trials": kept,
             "paper_tolerance": {name: shares(outcomes) for name, outcomes in counts["paper"].items()},
@@ -119,13 +105,9 @@ class ResidualSearch(TrialProtocol[str]):
             },
         }
 
-    def refusals(self) -> Refusals:
-        """Return the methods that do not judge a single sample, or do not run on the geometry."""
-        return {str(self.settings["geometry"]): self._contenders.refused}
-
-    @cached_property
-    def _geometry(self) -> Geometry:
-        return geometry_of(self.settings["geometry"])
+    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
+        """Build methods that name a channel nearly always."""
+        return build_contenders(names, self.geometries[g], self._noise, LOOSE_FALSE_ALARM, own)
 
     @property
     def _zero_std(self) -> float:
@@ -138,35 +120,29 @@ class ResidualSearch(TrialProtocol[str]):
         return NoiseModel(self._zero_std, scale, bound=BOUND * (self._zero_std + scale * self.settings["max_rate"]))
 
     @cached_property
-    def _contenders(self) -> Contenders:
-        names, own = self.settings["detectors"], self.settings["options"]
-        built = build_contenders(names, self._geometry, self._noise, LOOSE_FALSE_ALARM, own)
-        return built.for_single_samples()
-
-    @cached_property
     def _paper(self) -> dict[str, Detector]:
         return {
-            name: create_detector(name, self._geometry, self._noise, tolerance="paper")
-            for name in self._contenders.running
+            name: create_detector(name, self.geometries[0], self._noise, tolerance="paper")
+            for name in self.contenders[0].running
             if "tolerance" in accepted_options(detector_class(name))
         }
 
-    def _draw(self, rng: np.random.Generator, count: int, selection: str) -> tuple[Array, Index | None]:
+    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Index | None]:
         """Draw trials and keep those of a selection: z (N, n) rad/s, and the failed channel (N,); None: none is."""
-        n = self._geometry.n
+        n = self.geometries[0].n
         omega = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         scale, zero = np.clip(rng.standard_normal((2, count, n)), -CLIP, CLIP)
         failed = None
-        if selection != HEALTHY:
+        if not cell.healthy:
             failed = rng.integers(n, size=count)
             strength = rng.uniform(-1, 1, (2, count))
             off = np.sign(strength) * ((self.settings["worst"] - CLIP) * np.abs(strength) + CLIP)
             scale[np.arange(count), failed], zero[np.arange(count), failed] = off
-        along = omega @ self._geometry.axes.T
+        along = omega @ self.geometries[0].axes.T
         error = along * scale * self.settings["scale_std"] + zero * self._zero_std
         if failed is None:
             return along + error, None
-        kept = _selected(np.abs(error), failed, selection)
+        kept = _selected(np.abs(error), failed, cell.selection)
         return (along + error)[kept], failed[kept]
 
 
