@@ -324,8 +324,6 @@ class Failover:
         """Whether nothing is to be put back now: none is out of use by our hand, or the vehicle is armed."""
         return not self._state.orders or self._vehicle.armed or not self._vehicle.in_reach
 
-    # What is known -----------------------------------------------------------------------------------------------
-
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle, units = self._vehicle, []
         # What another system says of its parameters is nothing about the one that an IMU was taken out of.
@@ -343,8 +341,6 @@ class Failover:
             monitored=self.is_alone and now - self.declarations.heard < SILENT and reported,
             restore=restore,
         )
-
-    # What is done ------------------------------------------------------------------------------------------------
 
     def turn(self, now: int, restore: bool = False) -> None:
         """Do what is to be done at a time, ns; restore: put all back that is out by our hand."""
@@ -405,8 +401,6 @@ class Failover:
         size = self.errors.get(self._channels[3 * unit + axis], math.nan)
         words = "" if math.isnan(size) else f" {size if axis == 0 else -size:+.2f} rad/s"
         return f" (gyro {'xyz'[axis]}{words})"
-
-    # The file, and what is said of it all ------------------------------------------------------------------------
 
     def _restore(self) -> tuple[int, frozenset[int]]:
         try:

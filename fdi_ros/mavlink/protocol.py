@@ -142,8 +142,7 @@ class Streams:
 
     def __init__(self) -> None:
         self._wanted: dict[int, _Wanted] = {}
-        self._queue: dict[int, None] = {}  # messages to be asked for, in this order
-        self._current: int | None = None
+        self._queue: list[int] = []  # messages to be asked for, in this order; the first may be under way
 
     def want(self, messages: Iterable[int], interval: int) -> None:
         """Ask for messages, by id, at an interval in us, unless they are wanted so."""
@@ -158,45 +157,39 @@ class Streams:
 
     def ask_again(self) -> None:
         """Ask for all anew: the autopilot has."""
-        self._current = None
         for number, wanted in self._wanted.items():
             if wanted.interval != DEFAULT_INTERVAL:
                 self._enqueue(number)
 
     def _enqueue(self, number: int) -> None:
         self._wanted[number].tries = 0
-        self._queue[number] = None
+        if number not in self._queue:
+            self._queue.append(number)
 
     def due(self, now: int) -> tuple[int, int] | None:
         """Return message id and interval, us, of a request to be sent now; None: there is none."""
-        if self._current is not None:
-            current = self._wanted[self._current]
-            if now < current.asked + PATIENCE:
+        while self._queue:
+            wanted = self._wanted[self._queue[0]]
+            if wanted.tries and now < wanted.asked + PATIENCE:
                 return None
-            if current.tries >= TRIES:
-                current.answer, self._current = "no answer", None
-        if self._current is None:
-            if not self._queue:
-                return None
-            self._current = next(iter(self._queue))
-            del self._queue[self._current]
-        wanted = self._wanted[self._current]
-        wanted.asked, wanted.tries = now, wanted.tries + 1
-        return self._current, wanted.interval
+            if wanted.tries < TRIES:
+                wanted.asked, wanted.tries = now, wanted.tries + 1
+                return self._queue[0], wanted.interval
+            wanted.answer = "no answer"
+            del self._queue[0]
+        return None
 
     def acknowledged(self, result: int) -> None:
         """Take an acknowledgement (MAV_RESULT) of the request under way."""
-        if self._current is None:
-            return
-        wanted = self._wanted[self._current]
-        wanted.answer = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
-        if wanted.answer not in _HOPEFUL:
-            self._current = None
+        if self._queue and (wanted := self._wanted[self._queue[0]]).tries:
+            wanted.answer = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
+            if wanted.answer not in _HOPEFUL:
+                del self._queue[0]
 
     def check(self, number: int, rate: float, now: int) -> None:
         """Ask again for a message if it comes too slowly, so many a second."""
         wanted = self._wanted.get(number)
-        if wanted is None or wanted.interval <= 0 or number == self._current:
+        if wanted is None or wanted.interval <= 0 or number in self._queue:
             return
         after = AGAIN_REFUSED if self.refused(number) else AGAIN
         if rate < ENOUGH * 1e6 / wanted.interval and now >= wanted.asked + after:

@@ -189,9 +189,6 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
     return words
 
 
-# The whole ------------------------------------------------------------------------------------------------------------
-
-
 def _whole_message(status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
     total = len(status.channels)
     healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
@@ -295,9 +292,6 @@ def _late(unit: UnitStatus) -> str:
     return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
 
 
-# One channel ----------------------------------------------------------------------------------------------------------
-
-
 def _channel_message(channel: ChannelStatus, status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
     """Say how a channel stands, with that in which it is worse than it should be."""
     wrong = [*map(_format_frozen, _frozen_units(channel, status)), *worse.get(channel.name, ())]
@@ -367,9 +361,6 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
     )
 
 
-# One input ------------------------------------------------------------------------------------------------------------
-
-
 def _input_values(line: InputStatus) -> Values:
     return (
         ("topic", line.topic),
@@ -411,9 +402,6 @@ def _seconds(value: float) -> str:
 
 def _figure(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "none"
-
-
-# As a message ---------------------------------------------------------------------------------------------------------
 
 
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")

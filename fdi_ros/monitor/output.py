@@ -44,19 +44,15 @@ def time_index(stamp: Sequence[int] | NDArray[np.int64]) -> pandas.Index:
 class Event:
     """One change of state of one channel."""
 
-    stamp: int
-    """Stamp of the sample that brought it, ns."""
+    stamp: int  #: Stamp of the sample that brought it, ns.
     channel: int
     before: ChannelState
     after: ChannelState
     reason: Reason
-    group: tuple[int, ...]
-    """AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone."""
-    error: float
-    """Estimated error of the channel, rad/s; 0 where the reason is neither disagreement nor drift."""
+    group: tuple[int, ...]  #: AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone.
+    error: float  #: Estimated error of the channel, rad/s; 0 where the reason is neither disagreement nor drift.
 
-    row: int = field(default=0, compare=False)
-    """Row of that sample in its output."""
+    row: int = field(default=0, compare=False)  #: Row of that sample in its output.
 
     @property
     def declares(self) -> bool:
@@ -100,6 +96,11 @@ def events_of(rows: NDArray[Any]) -> list[Event]:
     ]
 
 
+def _column(name: str, about: str) -> Any:
+    """Return a property that is a column of the rows of an output."""
+    return property(lambda output: output.rows[name], doc=about)
+
+
 class Output:
     """Results for N consecutive samples of n channels.
 
@@ -117,6 +118,15 @@ class Output:
     What is not asked for is not made: one sample at a time, ten views would cost more than judging it.
     """
 
+    stamp: NDArray[np.int64] = _column("stamp", "(N,) ns.")
+    instant: NDArray[np.int64] = _column(
+        "instant", "(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."
+    )
+    rate: Array = _column("rate", "(N, 3) fused body rate, rad/s; NaN where there is none: never to be published.")
+    statistic: Array = _column("statistic", "(N,) the detector's; NaN where the sample could not be judged.")
+    threshold: Array = _column("threshold", "(N,) the detector's; NaN where the sample could not be judged.")
+    level: Array = _column("level", "(N, 3) protection level of the fused rate, rad/s; inf where there is none.")
+
     def __init__(
         self, rows: NDArray[Any], n: int, events: Sequence[Event] = (), channel_names: Sequence[str] = ()
     ) -> None:
@@ -126,34 +136,9 @@ class Output:
         self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
 
     @property
-    def stamp(self) -> NDArray[np.int64]:
-        """(N,) ns."""
-        return self.rows["stamp"]
-
-    @property
-    def instant(self) -> NDArray[np.int64]:
-        """(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."""
-        return self.rows["instant"]
-
-    @property
-    def rate(self) -> Array:
-        """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
-        return self.rows["rate"]
-
-    @property
     def valid(self) -> NDArray[np.bool_]:
         """(N,) whether there is a fused rate."""
         return self.rows["valid"].view(_FLAG)
-
-    @property
-    def statistic(self) -> Array:
-        """(N,) the detector's; NaN where the sample could not be judged."""
-        return self.rows["statistic"]
-
-    @property
-    def threshold(self) -> Array:
-        """(N,) the detector's; NaN where the sample could not be judged."""
-        return self.rows["threshold"]
 
     @property
     def alarm(self) -> NDArray[np.bool_]:
@@ -169,11 +154,6 @@ class Output:
     def residual(self) -> Array:
         """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
         return np.asarray(self.rows["residual"][:, : self.n])
-
-    @property
-    def level(self) -> Array:
-        """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
-        return self.rows["level"]
 
     @property
     def covariance(self) -> Array:
@@ -220,19 +200,14 @@ class Output:
         return len(self.rows)
 
 
-# As messages: one encoder for the live node and for the output bag ----------------------------------------------------
-
-
 Template = ImuTemplate | ChannelsTemplate
 
 
 class Topic(NamedTuple):
     """One topic that a monitor publishes."""
 
-    name: str
-    """As the node publishes it, before it is remapped."""
-    type: str
-    """Of its messages: ``sensor_msgs/msg/Imu``."""
+    name: str  # as the node publishes it, before it is remapped
+    type: str  # of its messages: ``sensor_msgs/msg/Imu``
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,12 +219,9 @@ class SampleOutput:
     """Makes a message to be filled, from the frame_id of the rate and the number of channels n."""
     fill: Callable[[Template, Any, int, int], None]
     """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
-    needs_rate: bool = False
-    """Whether it is of samples with a fused rate alone."""
-    on_demand: bool = False
-    """Whether the node leaves it out while nobody subscribes."""
-    by_path: bool = False
-    """Whether the live sample path fills it, by the same function."""
+    needs_rate: bool = False  # whether it is of samples with a fused rate alone
+    on_demand: bool = False  # whether the node leaves it out while nobody subscribes
+    by_path: bool = False  # whether the live sample path fills it, by the same function
 
 
 FUSED = SampleOutput(
@@ -268,8 +240,7 @@ INTEGRITY = SampleOutput(
     by_path=True,
 )
 """Statistic, threshold, states of the channels, protection level."""
-OUTPUTS = (FUSED, INTEGRITY)
-"""All that is said of samples, live and in an output bag."""
+OUTPUTS = (FUSED, INTEGRITY)  # all that is said of samples, live and in an output bag
 
 
 class Encoder:

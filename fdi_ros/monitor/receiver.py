@@ -31,9 +31,6 @@ from fdi_ros.monitor.output import FUSED, INTEGRITY, Encoder, Event, SampleOutpu
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import SOURCES, Source, source_of
 
-# Whether they keep coming ---------------------------------------------------------------------------------------------
-
-
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
 RATE_WINDOWS = 4  # so many measurements in a row must agree with each other: a pause or a loss is no rate
 
@@ -84,9 +81,6 @@ class SampleRateCheck:
                 f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
                 " the false-alarm rate and all times are wrong by as much"
             )
-
-
-# One at a time --------------------------------------------------------------------------------------------------------
 
 
 COUNTERS = ("duplicate", "backward", "ahead", "jumped", "late", "interpolated", "missing")
@@ -210,9 +204,6 @@ class Receiver:
             is_live(self.aligner[0], 0)
             are_parted(self.aligner[0])
             clear_declarations(aside[0])
-
-
-# Compiled or loaded before the first ----------------------------------------------------------------------------------
 
 
 _FEW = 5  # channels for a method that does not take six

@@ -27,11 +27,10 @@ from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import plus_minus
 
-CERTAIN = 4.0
-"""Two channels of a larger set surely differ from so many standard deviations on."""
+CERTAIN = 4.0  # two channels of a larger set surely differ from so many standard deviations on
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
-UNUSUAL = 3.0
-"""An error beyond so many standard deviations expected of it is not what was expected."""
+UNUSUAL = 3.0  # an error beyond so many standard deviations expected of it is not what was expected
+
 MAX_START_BIAS = 4.0
 """A bias learned at the start that is off by more ``bias.turn_on_std`` is reported: one healthy start in 16 000."""
 

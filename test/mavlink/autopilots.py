@@ -1,7 +1,8 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated autopilots, made of pymavlink: what PX4 and ArduPilot send of their IMUs, and how they answer.
+"""Simulated autopilots, made of pymavlink: what PX4 and ArduPilot send of their IMUs, and how they answer; in simulated
+time (`Conversation`), or on a real link (`Driver`).
 
 Habits, from their sources: both cut rates off to whole mrad/s towards zero and stamp SCALED_IMU in milliseconds. PX4
 sends the sample that is newest when a stream is due, with the time of that sample, of each IMU at phases of its own;
@@ -15,6 +16,7 @@ value when that is refused; it flies with the first IMU that is in use.
 from __future__ import annotations
 
 import contextlib
+import heapq
 import math
 import os
 import pty
@@ -23,13 +25,18 @@ import socket
 import threading
 import time
 import tty
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.link import now_in_steps
+from fdi_ros.mavlink.protocol import ImuSample
+from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 
 NS = 1_000_000_000
 Motion = Callable[[float], np.ndarray]
@@ -72,37 +79,32 @@ class Autopilot:
     units: int = 3
     compasses: int = 1
     system: int = 1
-    boot: int = -10 * NS
-    """Time here when it started, ns."""
+    boot: int = -10 * NS  # time here when it started, ns
     key: bytes = b""
     utc: float | None = None
     loss: float = 0.0
-    rates: dict[int, float] = field(default_factory=dict)
-    """Hz by message id, without being asked."""
+    rates: dict[int, float] = field(default_factory=dict)  # Hz by message id, without being asked
     seed: int = 0
     texts: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, float] = field(default_factory=dict)
     commands: list[tuple[int, ...]] = field(default_factory=list)
     refuses: set[int] = field(default_factory=set)
-    parameters: dict[str, float] = field(default_factory=lambda: {"INS_USE": 1.0, "INS_USE2": 1.0, "INS_USE3": 1.0})
+    parameters: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARAMETERS, 1.0))
     read_only: set[str] = field(default_factory=set)
-    sets: list[tuple[int, str, float]] = field(default_factory=list)
-    """When each PARAM_SET came, ns, and what it said."""
+    sets: list[tuple[int, str, float]] = field(default_factory=list)  # when each PARAM_SET came, ns, and what it said
     armed: bool = False
     sent: int = 0
 
     def __post_init__(self) -> None:
         self.motion = self.motion or gentle(self.units, self.seed)
-        self.start = self.boot
-        """Where the motion's time counts from, ns."""
+        self.start = self.boot  # where the motion's time counts from, ns
         self.mav, self.inbound = mavlink.MAVLink(None, self.system, 1), mavlink.MAVLink(None)
         self.inbound.robust_parsing = True
         for codec in (self.mav, self.inbound):
             if self.key:
                 codec.signing.secret_key, codec.signing.sign_outgoing = self.key, True
                 codec.signing.timestamp = now_in_steps(time.time() if self.utc is None else self.utc)
-        self.intervals = {number: round(1e6 / rate) for number, rate in self.rates.items()}
-        """us by message id."""
+        self.intervals = {number: round(1e6 / rate) for number, rate in self.rates.items()}  # us by message id
         self.due: dict[int, int] = {}
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
@@ -233,8 +235,7 @@ class Driver:
 
     def __init__(self, end: int, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
         self.ends, self.autopilots, self.garbage = [end], autopilots, garbage
-        self.silent = False
-        """The link is cut."""
+        self.silent = False  # the link is cut
         os.set_blocking(end, False)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -300,3 +301,86 @@ def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
+
+
+UTC = 1_790_000_000
+"""Unix time at the start of the simulation, s."""
+HARMLESS = {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "STATUSTEXT", "NAMED_VALUE_FLOAT"}
+"""All that may be sent; of commands only the one for intervals."""
+
+
+class Conversation:
+    """A vehicle of ours and simulated autopilots over a link with a latency, in steps of 1 ms of simulated time.
+
+    Everything that our side sends is checked to be harmless.
+    """
+
+    def __init__(
+        self,
+        *autopilots: Autopilot,
+        latency: Callable[[], int] = lambda: 3_000_000,
+        peers: tuple[Any, ...] = (),
+        may_set: bool = False,
+        **settings,
+    ) -> None:
+        self.now = 1000 * NS
+        for autopilot in autopilots:
+            autopilot.boot += self.now
+            autopilot.start += self.now
+        self.autopilots = autopilots
+        self.peers = peers or (None,) * len(autopilots)
+        self.latency, self.may_set = latency, may_set
+        self.sent: Counter[str] = Counter()
+        self.sent_to: Counter[Any] = Counter()
+        self.vehicle = Vehicle(VehicleSettings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
+        self.samples: list[tuple[int, ImuSample]] = []
+        """With the time at which each came out, ns."""
+        self.cut = False
+        self._order = count()
+        self._under_way: list[tuple[int, int, int, Any, bytes]] = []
+        self._check = mavlink.MAVLink(None)
+
+    def _send(self, data: bytes, peer: Any) -> None:
+        message = self._check.parse_char(data)
+        assert message.get_type() in HARMLESS or (self.may_set and message.param_id in PARAMETERS)
+        assert message.get_type() != "COMMAND_LONG" or message.command == 511
+        assert message.get_type() != "TIMESYNC" or message.tc1 == 0
+        assert message.get_type() != "HEARTBEAT" or message.autopilot == 8
+        self.sent[message.get_type()] += 1
+        self.sent_to[peer] += 1
+        for number, autopilot in enumerate(self.autopilots):
+            if self.peers[number] == peer or peer is None:
+                self._travel(autopilot, data, None)
+
+    def _travel(self, to: Autopilot | None, data: bytes, peer: Any) -> None:
+        if not self.cut:
+            number = -1 if to is None else self.autopilots.index(to)
+            entry = (self.now + self.latency(), next(self._order), number, peer, data)
+            heapq.heappush(self._under_way, entry)
+
+    def inject(self, data: bytes, peer: Any = None) -> None:
+        """Bytes from anybody reach us now."""
+        self.samples += [(self.now, sample) for sample in self.vehicle.feed(peer, data, self.now)]
+
+    def run(self, seconds: float) -> Conversation:
+        end = self.now + round(seconds * NS)
+        while self.now < end:
+            self.now += 1_000_000
+            for peer, autopilot in zip(self.peers, self.autopilots, strict=True):
+                for data in autopilot.step(self.now):
+                    self._travel(None, data, peer)
+            while self._under_way and self._under_way[0][0] <= self.now:
+                _, _, number, peer, data = heapq.heappop(self._under_way)
+                if number < 0:
+                    self.inject(data, peer)
+                else:
+                    for answer in self.autopilots[number].take(data, self.now):
+                        self._travel(None, answer, self.peers[number])
+            self.vehicle.tick(self.now)
+        return self
+
+    def by_unit(self) -> dict[int, list[ImuSample]]:
+        found: dict[int, list[ImuSample]] = {}
+        for _, sample in self.samples:
+            found.setdefault(sample.unit, []).append(sample)
+        return found

@@ -25,8 +25,7 @@ from fdi_ros.mavlink.failover import (
     failover_text,
     objection,
 )
-from mavlink.autopilots import NS, PARAMETERS, Autopilot
-from mavlink.conversation import Conversation
+from mavlink.autopilots import NS, PARAMETERS, Autopilot, Conversation
 from mavlink.flights import Flight
 
 MS = 1_000_000
@@ -42,38 +41,31 @@ FLIGHT = Known((FAULT, HEALTHY, HEALTHY), linked=True, armed=True, monitored=Tru
 NOW = 10 * NS + 1
 
 
-def others(**changes) -> Known:
-    return FLIGHT._replace(units=(FAULT, HEALTHY._replace(**changes), HEALTHY._replace(**changes)))
+def with_others(*units: FailoverUnit) -> Known:
+    return FLIGHT._replace(units=(FAULT, *units))
 
 
 @pytest.mark.parametrize(
-    ("state", "known", "words"),
+    ("orders", "known", "words"),
     [
-        (FailoverState(), FLIGHT._replace(linked=False), "no ArduPilot that sends each IMU"),
-        (FailoverState(), FLIGHT._replace(armed=False), "not armed"),
-        (FailoverState(), FLIGHT._replace(monitored=False), "the monitor is in doubt"),
-        (FailoverState(), FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
-        (
-            FailoverState(),
-            FLIGHT._replace(units=(FAULT, HEALTHY, FailoverUnit(ok=True, delivers=True))),
-            "INS_USE not known",
-        ),
-        (FailoverState(), FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
-        (FailoverState(left_alone=frozenset({0})), FLIGHT, "set by others"),
-        (FailoverState(), others(use=False), "no other is healthy"),
-        (FailoverState(), others(ok=False), "no other is healthy"),
-        (FailoverState(), others(delivers=False), "no other is healthy"),
-        (FailoverState({1: Order(False)}), FLIGHT, "limit"),
-        (
-            FailoverState(orders={1: Order(False)}),
-            FLIGHT._replace(units=(FAULT, HEALTHY, FAULT)),
-            "no other is healthy",
-        ),
+        ({}, FLIGHT._replace(linked=False), "no ArduPilot that sends each IMU"),
+        ({}, FLIGHT._replace(armed=False), "not armed"),
+        ({}, FLIGHT._replace(monitored=False), "the monitor is in doubt"),
+        ({}, FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
+        ({}, with_others(HEALTHY, FailoverUnit(ok=True, delivers=True)), "INS_USE not known"),
+        ({}, FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
+        ({}, with_others(*2 * [HEALTHY._replace(use=False)]), "no other is healthy"),
+        ({}, with_others(*2 * [HEALTHY._replace(ok=False)]), "no other is healthy"),
+        ({}, with_others(*2 * [HEALTHY._replace(delivers=False)]), "no other is healthy"),
+        ({1: Order(False)}, FLIGHT, "limit"),
+        ({1: Order(False)}, with_others(HEALTHY, FAULT), "no other is healthy"),
     ],
 )
-def test_it_is_not_taken_out_if(state: FailoverState, known: Known, words: str) -> None:
+def test_it_is_not_taken_out_if(orders: dict[int, Order], known: Known, words: str) -> None:
+    state = FailoverState(orders)
     assert objection(state, known, 0, 1) == words
     assert ("set", 0, False, "") not in decide(state, known, NOW)[1]
+    assert objection(FailoverState(left_alone={0}), FLIGHT, 0, 1) == "set by others"
 
 
 def test_an_old_declaration_is_not_acted_on_and_it_is_said_once() -> None:
@@ -276,9 +268,7 @@ def test_a_file_that_cannot_be_written_in_flight_is_told_and_written_later(flyin
     assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
 
 
-def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
-    flying: Monitored, tmp_path: Path
-) -> None:
+def test_a_companion_that_dies_tells_and_puts_back_at_its_next_start(flying: Monitored, tmp_path: Path) -> None:
     autopilot = flying.autopilots[0]
     flying.declare("imu_1.y")
     flying.run(1.0)
@@ -287,10 +277,7 @@ def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
     autopilot.texts.clear()
     autopilot.boot = -100 * NS
     again = Monitored(tmp_path, autopilot).run(12.0)
-    assert autopilot.texts == [
-        (2, "FDI: IMU 1 (imu_1) out of use"),
-        (6, "FDI: IMU 1 (imu_1) in use again"),
-    ]
+    assert autopilot.texts == [(2, "FDI: IMU 1 (imu_1) out of use"), (6, "FDI: IMU 1 (imu_1) in use again")]
     assert autopilot.flies_with == 0
     assert again.failover.status("failover", again.now)[2] == "ready"
 
@@ -317,12 +304,10 @@ def test_an_operator_puts_back(flying: Monitored) -> None:
     assert flying.failover.restore(flying.now) == (True, "no IMU is out of use by failover")
 
 
-@pytest.mark.parametrize(
-    ("text", "words"), [("[]", "does not say which"), ('{"system_id": 1, "out_of_use": [4]}', "does not say which")]
-)
-def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str, words: str) -> None:
+@pytest.mark.parametrize("text", ["[]", '{"system_id": 1, "out_of_use": [4]}'])
+def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "out.json").write_text(text)
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(ConfigError, match="does not say which"):
         Monitored(tmp_path, Autopilot("ardupilot"))
     (tmp_path / "out.json").chmod(0o666)
     with pytest.raises(ConfigError, match="others can write it"):

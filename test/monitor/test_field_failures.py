@@ -21,9 +21,7 @@ from monitor.streams import (
     stream,
     struck,
 )
-from vehicles import vehicle
 
-from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import PREFIX, describe
 from fdi_ros.monitor.output import ChannelState, Reason
@@ -98,30 +96,6 @@ def test_a_value_repeats_because_the_sensor_is_still_and_quantised(settings, noi
     assert declarations(pipeline, output) == ([("g3", "FAULTY")] if len(z[rows]) > 1 else [])
     assert output.valid.all()
     assert len(z[rows]) or (output.state[4:] == ChannelState.OK).all()
-
-
-@pytest.mark.parametrize("ratio", [3, 5, 10, 20])
-def test_a_precise_quantised_sensor_among_noisy_ones_is_not_stuck_at_rest(ratio):
-    fine = 0.002
-    pipeline = Pipeline(config(noise__noise_std=[fine] + [fine * ratio] * 5))
-    rng = np.random.default_rng(ratio)
-    z = rng.normal(0, fine * ratio, (2000, 6))
-    z[:, 0] = np.round(rng.normal(0, 0.2 * fine, 2000) / fine) * fine
-    assert declarations(pipeline, pipeline.process(Block(stream(pipeline.geometry, 2000).stamp, z))) == []
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_one_axis_turns_non_finite_for_one_sample(value):
-    pipeline = Pipeline(parallel(2))
-    block = stream(pipeline.geometry, 500)
-    block.z[250, 4] = value
-    output = pipeline.process(block)
-    assert output.valid.all()
-    assert np.isfinite(output.rate).all()
-    assert declarations(pipeline, output) == []
-    assert pipeline.status().channels[4].counts["non-finite"] == 1
-    assert output.state[250, 4] == ChannelState.SUSPECT
-    assert output.state[251, 4] == ChannelState.OK
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3])
@@ -222,21 +196,6 @@ def test_a_gap_is_no_clean_time():
     late = stream(pipeline.geometry, 300)
     output = pipeline.process(Block(late.stamp + 3_600_000_000_000, late.z))
     assert (output.state[:, 2] == ChannelState.FAULTY).all()
-
-
-@pytest.mark.parametrize(("seed", "units"), [(0, 2), (4, 3), (5, 3)])
-def test_a_unit_that_repeats_its_values_after_a_fault_of_its_own_has_no_new_fault(seed, units):
-    flown = vehicle(seed, "flight with rest", units=units)
-    z = flown.block.z.copy()
-    z[3000:, 3] += 0.2
-    for row in range(3600, len(z) - 20, 200):
-        z[row : row + 12, 3:6] = z[row - 1, 3:6]
-    settings = {"input": "imus", "imus.topics": [f"/imu_{k}" for k in range(units)], "noise.noise_std": [0.003]}
-    axes = {"geometry.preset": "axes", "geometry.axes": flown.axes.ravel().tolist(), "noise.scale_std": [0.01]}
-    output = Pipeline(Config.from_parameters(settings | axes)).process(Block(flown.block.stamp, z))
-    declared = [event for event in output.events if event.declares and event.stamp > flown.block.stamp[3600]]
-    assert not declared
-    assert output.state[-1, 3] == ChannelState.FAULTY
 
 
 def test_values_that_repeat_across_a_hole_in_the_stream_are_not_frozen():

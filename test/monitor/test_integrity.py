@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import config, mounted, parallel
 
-from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.core.subsets import fill_level, passes_test, prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
@@ -211,25 +210,6 @@ def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     assert (level[300] <= status.protection_level_after_loss).all()
     assert (level[300] >= level[0]).all()
     assert pipeline.status().protection_level == tuple(level[300])
-
-
-def test_the_level_is_that_of_the_motion_in_the_sample_and_of_the_bias_that_remains():
-    # All channels see the same of this turn: all errors grow alike.
-    still, turning = np.zeros((20, 6)), np.ones((20, 6))
-    model = {"noise.scale_std": 0.002, "integrity.max_rate": 2.0, "integrity.max_acceleration": 0.0}
-    pipeline = two_alike(**model)
-    level = pipeline.process(block(np.vstack([still, turning]))).level
-    assert level[0] == pytest.approx(two_alike().process(block(still)).level[0], rel=1e-12)
-    assert level[-1] == pytest.approx(level[0] * math.hypot(1.0, 0.002 / 0.0025), rel=1e-9)
-    # What is foretold after a loss is for the greatest motion.
-    assert np.isinf(pipeline.status().protection_level_after_loss).all(), "without its parallel one it is unchecked"
-    turned = monitor(**model)
-    level = turned.process(block(still)).level
-    assert (turned.status().protection_level_after_loss > level[-1] * math.hypot(1.0, 0.004 / 0.0025)).all()
-    learning = monitor(**{"bias.startup_bias_duration": 1.0})
-    learned = learning.process(block(0.0025 * np.random.default_rng(9).standard_normal((130, 6)))).level[-1]
-    share = 6 / (EFFICIENCY * 100)
-    assert learned == pytest.approx(level[0] * math.sqrt(1 + share), rel=1e-9)
 
 
 def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight():

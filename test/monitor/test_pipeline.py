@@ -174,17 +174,6 @@ def test_a_detector_that_cannot_run_on_the_channels_left_says_so():
     assert "5" in status.note
 
 
-def test_bias_is_not_learned_while_moving_and_learned_at_the_next_rest():
-    pipeline = Pipeline(config(bias__startup_bias_duration=1.0))
-    block = stream(pipeline.geometry, 1000)
-    quiet = np.random.default_rng(5).normal(0, SIGMA, (1000, 6)) + 0.01
-    assert not pipeline.process(block[:450]).valid.any()
-    assert "refused, not at rest" in pipeline.status().bias_state
-    assert pipeline.process(Block(block.stamp[450:], quiet[450:])).valid[-1]
-    assert pipeline.status().bias_state == "learned"
-    np.testing.assert_allclose(pipeline.status().bias, 0.01, atol=SIGMA)
-
-
 @pytest.mark.parametrize("lasts", [False, True])
 def test_a_reset_clears_what_is_over_and_what_lasts_is_declared_again(lasts):
     pipeline = Pipeline(config())
@@ -251,21 +240,6 @@ def test_steps_end_where_something_happens_and_events_say_the_row_of_their_sampl
         seen += [(event.channel, event.after.name, seconds(event)) for event in step.events]
     assert seen[-2:] == [(3, "SUSPECT", pytest.approx(5.0)), (3, "FAULTY", pytest.approx(5.03))]
     assert seen == [(event.channel, event.after.name, seconds(event)) for event in output.events]
-
-
-@pytest.mark.parametrize(("restless", "words"), [([3], "learned"), ([1, 3], "refused, not at rest: g2")])
-def test_the_level_is_that_of_the_channels_fused(restless, words):
-    """A channel whose bias was not learned delivers, agrees, and is not fused; of two nobody's bias is learned."""
-    pipeline, names = Pipeline(config(bias__startup_bias_duration=1.0)), [f"g{k + 1}" for k in restless]
-    block = stream(pipeline.geometry, 190, size=0.0)
-    z = block.z.copy()
-    z[:100, restless] += np.random.default_rng(1).normal(0, 10 * SIGMA, (100, len(restless)))
-    output = pipeline.process(Block(block.stamp, z))
-    assert pipeline.status().bias_state.startswith(words)
-    assert output.valid[-1] == (words == "learned")
-    assert (output.state[-1, restless] == ChannelState.UNCHECKED).all()
-    others = Pipeline(config(bias__startup_bias_duration=1.0, excluded_channels=names)).process(block)
-    assert words != "learned" or output.level[-1] == pytest.approx(others.level[-1])
 
 
 @pytest.mark.parametrize(
