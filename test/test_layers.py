@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.system.installation import REQUIRED
+from fdi_ros.system import REQUIRED
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (

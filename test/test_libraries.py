@@ -13,10 +13,10 @@ import pytest
 import yaml
 from test_layers import PACKAGE
 
+from fdi_ros import system
 from fdi_ros.errors import FdiError
-from fdi_ros.system import installation
 
-WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(installation.BAGS)!r}))\n"
+WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(system.BAGS)!r}))\n"
 """As if some libraries were not installed; where they are not, this changes nothing."""
 
 
@@ -59,7 +59,7 @@ def test_numba_is_bounded_by_the_version_that_is_tested_here(root):
 def test_libraries_named_as_required_are_those_of_setup_py(root):
     (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
     names = set(re.findall(r'"(\w+)>=', required))
-    assert names == {*installation.REQUIRED, "numpy", "numba", "PyYAML"}
+    assert names == {*system.REQUIRED, "numpy", "numba", "PyYAML"}
 
 
 VERBS_WITHOUT = """
@@ -79,11 +79,11 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     more = {"replay": config, "sweep": config, "calibrate": [*config, *out], "convert": out, "setup": out}
     more |= {"fleet": out, "inspect": []}
     lacking = {"setup": ["scipy"], "calibrate": ["scipy"], "fleet": ["pyarrow", "scipy"]}
-    if not all(map(installation.there, (*installation.BAGS, "scipy", "pyarrow"))):
+    if not all(map(system.there, (*system.BAGS, "scipy", "pyarrow"))):
         lacking = {}
     bag = PACKAGE.parent / "bags" / "cone_flight"
     commands = {verb: [verb, *map(str, (bag, *words))] for verb, words in more.items()}
-    asked = [(words, installation.BAGS) for words in commands.values()]
+    asked = [(words, system.BAGS) for words in commands.values()]
     asked += [(commands[verb], names) for verb, names in lacking.items()]
     done = python(VERBS_WITHOUT, asked)
     assert done.stdout == "2\n" * len(asked), done.stderr
@@ -92,7 +92,7 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     for verb, line in zip(more, lines[: len(more)], strict=True):
         assert re.fullmatch(rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*", line), line
     assert lines[len(more) :] == [
-        f"fdi: fdi {verb} needs {' and '.join(names)}: {installation._pip()} {' '.join(names)}"
+        f"fdi: fdi {verb} needs {' and '.join(names)}: {system._pip()} {' '.join(names)}"
         for verb, names in lacking.items()
     ]
 
@@ -108,10 +108,10 @@ def test_without_what_reads_recordings_the_player_says_what_brings_it():
 def test_the_command_is_one_that_pip_obeys_here(monkeypatch, tmp_path):
     """The Python of Debian and Ubuntu refuses a plain pip install outside of an environment (PEP 668)."""
     (tmp_path / "EXTERNALLY-MANAGED").write_text("")
-    monkeypatch.setattr(installation.sysconfig, "get_path", lambda name: str(tmp_path))
+    monkeypatch.setattr(system.sysconfig, "get_path", lambda name: str(tmp_path))
     cases = {sys.base_prefix: "pip install --user --break-system-packages one_x", "/env": "pip install one_x"}
     for prefix, words in cases.items():
-        monkeypatch.setattr(installation.sys, "prefix", prefix)
-        monkeypatch.setattr(installation, "REQUIRED", ("one_x",))
+        monkeypatch.setattr(system.sys, "prefix", prefix)
+        monkeypatch.setattr(system, "REQUIRED", ("one_x",))
         with pytest.raises(FdiError, match=f"^who needs one_x: {words}$"):
-            installation.require("who", ["one_x", "sys"])
+            system.require("who", ["one_x", "sys"])

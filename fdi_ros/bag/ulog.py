@@ -34,8 +34,8 @@ from fdi_ros.bag.flight_log import SETTINGS, FlightLog
 from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, parts, per_time, possible_start
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
+from fdi_ros.system import require
 from fdi_ros.system.files import ULOG_BYTES, ULOG_FIELDS, ULOG_MESSAGE_COST, ULOG_OTHER_BYTES, ULOG_TOPIC_COST
-from fdi_ros.system.installation import require
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEAD = 3  # bytes of a message before its content: two of its size, one of its kind

@@ -11,15 +11,41 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
+from types import FrameType
 
-from fdi_ros.cli import STOPPED, heeded
+from fdi_ros.cli import STOPPED
+
+PATIENCE = 2.0  # s in which further signals do not disturb the end: what is half written is removed
+
+
+class Stop:
+    """Handler of signals: the first is as from the keyboard, and one that comes much later ends the process at once.
+
+    So does the first while nothing is open yet.
+    """
+
+    def __init__(self) -> None:
+        self.running = False
+        self.asked: float | None = None  # when
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal."""
+        now = time.monotonic()
+        if not self.running or (self.asked is not None and now - self.asked > PATIENCE):
+            os._exit(STOPPED)
+        if self.asked is None:
+            self.asked = now
+            raise KeyboardInterrupt
 
 
 def fdi() -> int:
     """Run the command line; return its exit code."""
-    for number in heeded():
-        # Nothing is open yet, or any more.
-        signal.signal(number, lambda *_: os._exit(STOPPED))
+    stop = Stop()
+    # A shell has what it starts in the background ignore the keyboard.
+    heeded = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
+    for number in heeded:
+        signal.signal(number, stop)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             # Closed (>&-): whatever is opened next would get its number, and what is printed.
@@ -28,9 +54,12 @@ def fdi() -> int:
     from fdi_ros.cli.command_line import main
 
     try:
-        return main()
+        stop.running = True
+        return main(stopped=lambda: stop.asked is not None)
+    except KeyboardInterrupt:
+        return STOPPED
     finally:
-        for number in heeded():
+        for number in heeded:
             # While Python ends, it gives signals their first effect back; what is ignored stays so.
             signal.signal(number, signal.SIG_IGN)
 

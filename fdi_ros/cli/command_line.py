@@ -1,10 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Command line of the offline verbs: none of their logic here.
+"""The command line: its verbs, what each takes, and what an end of one means; what they do stands in other modules.
 
-A verb stands in a module of its own, or beside verbs of its kind, with its parser; a new one is one more entry of
-`VERBS`.
+Neither NumPy nor Numba is imported before a verb runs: usage errors come at once, and help without the compiler.
 """
 
 from __future__ import annotations
@@ -13,42 +12,307 @@ import argparse
 import contextlib
 import io
 import logging
+import math
 import os
+import pkgutil
 import shutil
-import signal
 import sys
 import textwrap
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from fdi_ros import __version__
-from fdi_ros.cli import STOPPED, Stop, heeded
-from fdi_ros.cli.many import FLEET, MONTECARLO
-from fdi_ros.cli.recording import CALIBRATE, CONVERT, INSPECT, SETUP
-from fdi_ros.cli.replay import REPLAY, SWEEP
-from fdi_ros.cli.settings import COMPILE, GEOMETRY, SHIPPED, WATCH
+from fdi_ros.cli import STOPPED
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
-from fdi_ros.system.installation import require, resolve
+from fdi_ros.system import BAGS, POOL, PROGRESS, require, resolve, shipped_files
 from fdi_ros.system.text import LINE, shown
 
+# Verbs ----------------------------------------------------------------------------------------------------------------
+
+Options = Mapping[str, Any]  # what argparse is told of an argument, or of it beside what `SHARED` says
+
+
+class Verb(NamedTuple):
+    """One verb."""
+
+    meaning: str
+    examples: Sequence[str]  # the first is the one to begin with
+    arguments: Mapping[str, Options]  # by name, several names with spaces between; what is not said is as in `SHARED`
+    run: str  # module of this folder and function, which returns the exit code
+    libraries: Sequence[str] = ()  # that the verb needs and a live node does not
+
+
+def takes(words: str, **options: Any) -> Options:
+    """Return what argparse is told of an argument, help first."""
+    return {"help": words, **options}
+
+
+def takes_path(words: str = "", **options: Any) -> Options:
+    """Return what it is told of a path."""
+    return {"type": Path, "metavar": "FILE", "help": words, **options}
+
+
+def shipped(kind: str) -> str:
+    """List the shipped files of a kind, for a help."""
+    return ", ".join(path.name for path in shipped_files() if path.parent.name == kind)
+
+
+_CONFIG = "ROS 2 parameter file{}, a shipped one by its name alone; may be repeated, later ones win"
+DETECTOR_NAMES = ", ".join(reversed(DETECTORS))  # for a help, the one that flies first
+SHARED: Mapping[str, Options] = {
+    "bag": takes_path("rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file", metavar="BAG"),
+    "--config": takes_path(_CONFIG.format(""), type=resolve, action="append", required=True),
+    "--start": takes("from here, seconds from the start", type=float, default=0.0, metavar="S"),
+    "--end": takes("up to here", type=float, default=math.inf, metavar="S"),
+    "--fault": {"action": "append", "default": [], "metavar": "'KEY=VALUE ...'"},
+    "--detector": takes(f"use this detector instead of the configured one: {DETECTOR_NAMES}", metavar="NAME"),
+    "--csv": takes_path(),
+    "--report": takes_path("write a page with tables and plots", metavar="FILE.html"),
+    "--json": takes_path(
+        "write all figures as JSON, in SI units; - is standard output, tables then go to standard error"
+    ),
+    "--force": takes("overwrite files that exist", action="store_true"),
+    "--quiet": takes("print nothing but errors; no progress", action="store_true"),
+    "--degrees": takes("print angular rates in deg/s; what is read and written stays in rad/s", action="store_true"),
+    "--workers": takes("processes; default: as many as there are cores", type=int, metavar="N"),
+    "--scheduler": takes(
+        "Dask scheduler to work instead: tls://host:port (certificates: Dask's configuration), or where nobody"
+        " else reaches it tcp://host:port",
+        metavar="ADDRESS",
+    ),
+}
+"""Arguments of several verbs."""
+PART: Mapping[str, Options] = {"--start": {}, "--end": {}}
+WORKERS: Mapping[str, Options] = {"--workers": {}, "--scheduler": {}}
+RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}
+"""What every verb takes that has results."""
+_SETTINGS: Mapping[str, Options] = {
+    "--output": takes_path("parameter file to write", required=True),
+    **PART,
+    "--reference": takes(
+        "triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike",
+        default="",
+        metavar="NAME",
+    ),
+    "--proof": takes_path(
+        "prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
+        type=resolve,
+        metavar="RECORDING",
+    ),
+}
+"""What settings are made of, and where they are written."""
 VERBS = {
-    "setup": SETUP,
-    "replay": REPLAY,
-    "inspect": INSPECT,
-    "convert": CONVERT,
-    "calibrate": CALIBRATE,
-    "geometry": GEOMETRY,
-    "montecarlo": MONTECARLO,
-    "sweep": SWEEP,
-    "fleet": FLEET,
-    "watch": WATCH,
-    "shipped": SHIPPED,
-    "compile": COMPILE,
+    "setup": Verb(
+        "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+        (
+            "fdi setup my_flight --output my_gyros.yaml",
+            "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
+        ),
+        {
+            "bag": {},
+            **_SETTINGS,
+            "--report": takes("page of what was found; default: beside the parameter file"),
+            **RESULTS,
+            "--degrees": {},
+        },
+        "recording:run_setup",
+        (*BAGS, *POOL, "scipy"),
+    ),
+    "replay": Verb(
+        "pass a recording through the monitor, with or without injected faults",
+        (
+            "fdi replay my_log.bin",
+            "fdi replay my_flight --config my_gyros.yaml",
+            "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
+            "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
+        ),
+        {
+            "bag": {},
+            "--config": takes(
+                _CONFIG.format("; default: what fdi inspect writes, where units are mounted alike"),
+                required=False,
+                default=[],
+            ),
+            "--fault": takes("inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated"),
+            "--scenario": takes_path(
+                f"inject the faults of a scenario file; shipped: {shipped('scenarios')}", type=resolve
+            ),
+            "--detector": {},
+            **PART,
+            "--check": takes(
+                "exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
+                " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
+                " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
+                " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
+                " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
+                metavar="'TERM ...'",
+            ),
+            "--csv": takes("write a line for every sample"),
+            "--report": takes("write a report to be looked at"),
+            "--output": takes_path("write a bag of what the node would have published", metavar="DIR"),
+            **RESULTS,
+            "--force": takes("overwrite outputs that exist"),
+            "--degrees": {},
+        },
+        "replay:run_replay",
+        (*BAGS, *PROGRESS),
+    ),
+    "inspect": Verb(
+        "say what is in a recording and print a starting config for it",
+        ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
+        {
+            "bag": {},
+            "--output --write": takes_path("write the config to a file, too"),
+            **RESULTS,
+            "--degrees": {},
+        },
+        "recording:run_inspect",
+        (*BAGS, *PROGRESS),
+    ),
+    "convert": Verb(
+        "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
+        ("fdi convert flight.bin --output flight_bag",),
+        {
+            "bag": {},
+            "--output": takes_path("rosbag2 folder to write, with one MCAP file", metavar="DIR", required=True),
+            **RESULTS,
+            "--force": takes("overwrite a bag made by fdi"),
+        },
+        "recording:run_convert",
+        (*BAGS, *PROGRESS),
+    ),
+    "calibrate": Verb(
+        "fit axes, biases and noise to a recording and write a config",
+        ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
+        {
+            "bag": {},
+            "--config": takes(_CONFIG.format(" to start from")),
+            **_SETTINGS,
+            "--report": {},
+            **RESULTS,
+            "--degrees": {},
+        },
+        "recording:run_calibrate",
+        (*BAGS, *POOL, "scipy"),
+    ),
+    "geometry": Verb(
+        "say what a mounting can detect and isolate, before it flies",
+        ("fdi geometry two_triads.yaml", "fdi geometry my_gyros.yaml --degrees --report mounting.html"),
+        {
+            "config": takes_path(
+                "ROS 2 parameter file; of several, later ones win", type=resolve, nargs="+", metavar="CONFIG"
+            ),
+            "--report": takes("write a page with tables and a picture"),
+            **RESULTS,
+            "--degrees": {},
+        },
+        "settings:run_geometry",
+    ),
+    "montecarlo": Verb(
+        "compare detectors over many simulated trials",
+        ("fdi montecarlo power.yaml --trials 200 --report power.html",),
+        {
+            "study": takes_path(f"what to run; shipped: {shipped('studies')}", type=resolve, metavar="STUDY.yaml"),
+            "--trials": takes("trials per cell, instead of the file's", type=int, metavar="N"),
+            "--seed": takes("seed, instead of the file's", type=int, metavar="S"),
+            **WORKERS,
+            "--report": takes("write curves and tables as one page"),
+            **RESULTS,
+        },
+        "settings:run_montecarlo",
+        POOL,
+    ),
+    "sweep": Verb(
+        "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
+        (
+            "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
+            "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"
+            " --compare likelihood_ratio cusum",
+        ),
+        {
+            "bag": {},
+            "--config": {},
+            "--fault": takes(
+                "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases,"
+                " drifts, noise, scale factors, stuck, dropout"
+            ),
+            "--times": takes("times per channel and fault; default 10", type=int, default=10, metavar="N"),
+            "--within": takes("watch a fault for so long; default 5", type=float, default=5.0, metavar="S"),
+            "--detector": {},
+            "--compare": takes(
+                "other detectors (as of --detector) or parameter files beside it", nargs="+", default=[], metavar="NAME"
+            ),
+            "--seed": takes("of signs and random faults; default 1", type=int, default=1, metavar="S"),
+            "--workers": takes("processes; default 1", default=1),
+            **PART,
+            "--csv": takes("write a line for every fault"),
+            "--report": {},
+            **RESULTS,
+        },
+        "replay:run_sweep",
+        (*BAGS, *POOL),
+    ),
+    "fleet": Verb(
+        "judge many recordings: tables of flights and episodes, and a page of what needs a person",
+        ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
+        {
+            "paths": takes("recordings, and folders with recordings", nargs="+", metavar="PATH"),
+            "--config": takes(
+                _CONFIG.format("; default: of each recording what fdi inspect writes for it"),
+                required=False,
+                default=[],
+            ),
+            "--output": takes_path("folder for the tables and the page", metavar="DIR", required=True),
+            "--calibrate": takes(
+                "each: calibrate each recording on itself, where it allows that; default none",
+                choices=("none", "each"),
+                default="none",
+            ),
+            **WORKERS,
+            **RESULTS,
+            "--force": takes("begin anew where the folder holds a run with other settings"),
+        },
+        "replay:run_fleet",
+        (*BAGS, *POOL, "pyarrow", "scipy"),
+    ),
+    "watch": Verb(
+        "show a running monitor: residuals, states, rates and events as they come",
+        ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
+        {
+            "--node": takes("the monitor; default: the only one running", default="", metavar="/NS/NAME"),
+            "--plain": takes("line by line, as where the output is no terminal", action="store_true"),
+        },
+        "command_line:run_watch",
+    ),
+    "shipped": Verb(
+        "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
+        ("fdi shipped", "fdi shipped two_imus.yaml"),
+        {
+            "name": takes("only this file, such as two_imus.yaml", nargs="?", default="", metavar="NAME"),
+            "--node": takes(
+                "print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
+                action="append",
+                default=[],
+                metavar="NAME",
+            ),
+            **RESULTS,
+        },
+        "settings:run_shipped",
+    ),
+    "compile": Verb(
+        "compile now what else is compiled when it is first used, for images and CI",
+        ("fdi compile", "fdi compile --detector sequential"),
+        {"--detector": takes(f"for these detectors; default: for all: {DETECTOR_NAMES}", nargs="+"), **RESULTS},
+        "settings:run_compile",
+    ),
 }
 FIRST = ("inspect", "setup", "replay", "watch")  # what one needs first
+
+# A run ----------------------------------------------------------------------------------------------------------------
+
 DEFECT = 70  # EX_SOFTWARE of sysexits.h
 EXIT_CODES = (
     "Exit codes: 0 done, and a verdict that is good; 1 a replay that does not meet its --check; 2 something asked for"
@@ -57,16 +321,115 @@ EXIT_CODES = (
 )
 
 
+def main(argv: Sequence[str] | None = None, stopped: Callable[[], bool] = lambda: False) -> int:
+    """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70.
+
+    ``stopped``: whether a signal has come; what it broke off may have failed in any way.
+    """
+    try:
+        code = _run(argv)
+        sys.stdout.flush()
+        return code
+    except SystemExit:
+        # Of argparse: help, version, or a usage error.
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            _let_go_of_output()
+        raise
+    except KeyboardInterrupt:
+        return STOPPED
+    except BrokenPipeError:
+        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
+        _let_go_of_output()
+        return 0
+    except Exception as error:
+        return STOPPED if stopped() else _failure(error)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    """Run a verb and return its exit code."""
+    parser = _parser()
+    given = parser.parse_args(argv)
+    if given.verb is None:
+        parser.print_help()
+        return 0
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What a terminal cannot show is escaped.
+            stream.reconfigure(errors="backslashreplace")
+    # That something has to be compiled is no error: with --quiet it is not logged.
+    logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
+    verb = VERBS[given.verb]
+    require(f"fdi {given.verb}", verb.libraries)
+    run: Callable[[argparse.Namespace], int] = pkgutil.resolve_name(f"fdi_ros.cli.{verb.run}")
+    if "quiet" not in given:
+        # What has no results, `fdi watch`, does not wait for the compiler.
+        return run(given)
+    from fdi_ros.compiling.notice import announced
+
+    with announced():
+        return run(given)
+
+
+def run_watch(arguments: argparse.Namespace) -> int:
+    """Show a running monitor until interrupted; without NumPy, unlike all other verbs."""
+    from fdi_ros.ros.watch import watch
+
+    return watch(arguments.node, arguments.plain)
+
+
+def _failure(error: Exception) -> int:
+    """Say what has ended a verb; return the exit code."""
+    if isinstance(error, FdiError):
+        return _refused(str(error))
+    if isinstance(error, MemoryError):
+        return _refused("there is not enough memory")
+    if isinstance(error, OSError):
+        where = f" {error.filename}" if error.filename else ""
+        return _refused(f"cannot read or write{where}: {error.strerror or error}")
+    with contextlib.suppress(OSError):
+        traceback.print_exception(error)
+        print(
+            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
+            " above and the command, to the maintainers named in its package.xml",
+            file=sys.stderr,
+        )
+    return DEFECT
+
+
+def _refused(words: str) -> int:
+    """Say what is wrong, in one line; return the exit code."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _let_go_of_output()
+    with contextlib.suppress(OSError):
+        # An error quotes what it refuses, which may come from anywhere.
+        print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
+    return 2
+
+
+def _let_go_of_output() -> None:
+    """Have what is left of standard output go nowhere: it would be tried once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+# Parser ---------------------------------------------------------------------------------------------------------------
+
+
+class _Parser(argparse.ArgumentParser):
+    """Quotes what it refuses as it may be shown; parsers of verbs are of its kind."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and end."""
+        super().error(shown(message, LINE))
+
+
 class _PrintCompletion(argparse.Action):
     """Prints a completion script: made once, it costs nothing at each key, and the shell needs no Python for it."""
 
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option_string: Any = None) -> None:
         """Print it and end."""
         try:
             require("--print-completion", ("shtab",))
@@ -94,139 +457,13 @@ def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
                 _complete(verb, files)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Quotes what it refuses as it may be shown; parsers of verbs are of its kind."""
+class _FaultKinds:
+    """Looked up when the help is printed: it needs NumPy."""
 
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, and end."""
-        super().error(shown(message, LINE))
+    def __str__(self) -> str:
+        from fdi_ros.faults.kinds import FAULT_KINDS
 
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70."""
-    stop = Stop()
-    before = {}
-    with contextlib.suppress(ValueError):
-        # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
-        before = {number: signal.signal(number, stop) for number in heeded()}
-    try:
-        return _run(argv, stop)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _run(argv: Sequence[str] | None, stop: Stop) -> int:
-    """Run a verb, and turn whatever ends it into an exit code."""
-    try:
-        code = _verb(argv)
-        sys.stdout.flush()
-        return code
-    except SystemExit:
-        # Of argparse: help, version, or a usage error.
-        try:
-            sys.stdout.flush()
-        except BrokenPipeError:
-            _let_go_of_output()
-        raise
-    except KeyboardInterrupt:
-        return STOPPED
-    except BrokenPipeError:
-        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
-        _let_go_of_output()
-        return 0
-    except Exception as error:
-        # What a signal breaks off may fail in any way.
-        return STOPPED if stop.asked else _failure(error)
-
-
-def _verb(argv: Sequence[str] | None) -> int:
-    """Run a verb and return its exit code."""
-    parser = _parser()
-    given = parser.parse_args(argv)
-    if given.verb is None:
-        parser.print_help()
-        return 0
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            # What a terminal cannot show is escaped.
-            stream.reconfigure(errors="backslashreplace")
-    # That something has to be compiled is no error: with --quiet it is not logged.
-    logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
-    verb = VERBS[given.verb]
-    require(f"fdi {given.verb}", verb.libraries)
-    with _compiling_shown(given):
-        return verb.run(given)
-
-
-def _failure(error: Exception) -> int:
-    """Say what has ended a verb; return the exit code."""
-    if isinstance(error, FdiError):
-        return _refused(str(error))
-    if isinstance(error, MemoryError):
-        return _refused("there is not enough memory")
-    if isinstance(error, OSError):
-        where = f" {error.filename}" if error.filename else ""
-        return _refused(f"cannot read or write{where}: {error.strerror or error}")
-    with contextlib.suppress(OSError):
-        traceback.print_exception(error)
-        print(
-            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
-            " above and the command, to the maintainers named in its package.xml",
-            file=sys.stderr,
-        )
-    return DEFECT
-
-
-def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
-    """Show whatever a verb has to compile; what has no results, `fdi watch`, does not wait for the compiler."""
-    if "quiet" not in given:
-        return contextlib.nullcontext()
-    from fdi_ros.cli.outputs import bar_of
-    from fdi_ros.compiling.notice import announced
-
-    return announced(bar_of(given))
-
-
-def _refused(words: str) -> int:
-    """Say what is wrong, in one line; return the exit code."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        _let_go_of_output()
-    with contextlib.suppress(OSError):
-        # An error quotes what it refuses, which may come from anywhere.
-        print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
-    return 2
-
-
-def _let_go_of_output() -> None:
-    """Have what is left of standard output go nowhere: it would be tried once more at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _overview() -> str:
-    """Say what there is: first what one needs first, with an example each."""
-    width = max(40, min(shutil.get_terminal_size().columns, 110))
-    wide = max(map(len, VERBS)) + 2
-
-    def lines(name: str, example: bool) -> list[str]:
-        text = textwrap.fill(
-            VERBS[name].meaning, width, initial_indent=f"  {name:<{wide}}", subsequent_indent=" " * (wide + 2)
-        )
-        return [text, f"{' ' * (wide + 4)}{VERBS[name].examples[0]}"] if example else [text]
-
-    rest = [name for name in VERBS if name not in FIRST]
-    return "\n".join(
-        (
-            "Gyro fault detection and isolation, offline.",
-            "\nfirst:",
-            *(line for name in FIRST for line in lines(name, True)),
-            "\nthen:",
-            *(line for name in rest for line in lines(name, False)),
-            "\nfdi VERB --help says more of each, with examples.",
-        )
-    )
+        return ", ".join(FAULT_KINDS)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -250,9 +487,25 @@ def _parser() -> argparse.ArgumentParser:
         description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
         epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
         added = verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
-        verb.add_to(added)
+        for names, own in verb.arguments.items():
+            action = added.add_argument(*names.split(), **{**SHARED.get(names, {}), **own})
+            if names == "--fault":
+                action.help = f"{action.help}; kinds: %(kinds)s"
+                vars(action)["kinds"] = _FaultKinds()
     return parser
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _overview() -> str:
+    """Say what there is: first what one needs first, with an example each."""
+    width = max(40, min(shutil.get_terminal_size().columns, 110))
+    wide = max(map(len, VERBS)) + 2
+
+    def line(name: str) -> str:
+        first, others = f"  {name:<{wide}}", " " * (wide + 2)
+        return textwrap.fill(VERBS[name].meaning, width, initial_indent=first, subsequent_indent=others)
+
+    lines = ["Gyro fault detection and isolation, offline.", "\nfirst:"]
+    for name in FIRST:
+        lines += [line(name), f"{' ' * (wide + 4)}{VERBS[name].examples[0]}"]
+    lines += ["\nthen:", *(line(name) for name in VERBS if name not in FIRST)]
+    return "\n".join([*lines, "\nfdi VERB --help says more of each, with examples."])

@@ -11,116 +11,78 @@ import platform
 import re
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
 
 from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
-from fdi_ros.compiling.notice import WORDS, View, clock, compiling_seconds, is_compiling
+from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.verdict import Severity, with_first_line_coloured
 from fdi_ros.system.files import STANDARD_OUTPUT, is_open_already, is_stream, open_regular, real_path, whole, write_json
-from fdi_ros.system.installation import PROGRESS, there
 from fdi_ros.system.text import LINE, shown, visible
 
 # Progress -------------------------------------------------------------------------------------------------------------
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TIMED_FORMAT = "{desc}, {elapsed}"
-_COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
 SAID_EVERY = 10.0  # how often the share done is said where there is no terminal, s
 _TICK = 1.0  # how often the time is drawn anew, s
 
 
-class Progress:
-    """A bar on the last line of a terminal, wiped at the end; elsewhere a line now and then, begun with ``what``.
+@contextmanager
+def progress(stream: TextIO, quiet: bool, what: str = "", timed: bool = False) -> Iterator[Callable[[float], None]]:
+    """Show how much is done: a bar on the last line of a terminal, wiped at the end; elsewhere a line now and then.
 
-    Timed: no share done is known, so it says what is done, and for how long already. Quiet: nothing is drawn.
+    Gives what is to be called with the share done, 0 to 1. The line begins with ``what``. ``timed``: no share is known,
+    so it says what is done, and for how long already. ``quiet``: nothing is shown.
     """
+    if quiet:
+        yield lambda share: None
+        return
+    from tqdm import tqdm
 
-    def __init__(self, stream: TextIO, quiet: bool = False, what: str = "", timed: bool = False) -> None:
-        from tqdm import tqdm
+    shown, begun, compiled, ended = _TIMED_FORMAT if timed else _FORMAT, clock(), compiling_seconds(), threading.Event()
+    # None: tqdm asks the stream whether it is a terminal.
+    bar = tqdm(total=1.0, desc=what, file=stream, disable=None, bar_format=shown, leave=False)
+    done = 0.0
 
-        self._stream, self._what = stream, f"{what}: " if what else ""
-        self._share, self._begun, self._compiled = 0.0, clock(), compiling_seconds()
-        # None: tqdm asks the stream whether it is a terminal.
-        disable, shown = True if quiet else None, _TIMED_FORMAT if timed else _FORMAT
-        self._bar = tqdm(total=1.0, desc=what, file=stream, disable=disable, bar_format=shown, leave=False)
-        self._ended = threading.Event()
-        self._thread = None if quiet else threading.Thread(target=self._tick, daemon=True)
-
-    def __enter__(self) -> Progress:
-        if self._thread is not None:
-            self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._bar.close()
-
-    def _tick(self) -> None:
+    def tick() -> None:
         """Draw the time anew, or say now and then how much is done, whatever keeps the rest waiting."""
-        while not self._ended.wait(SAID_EVERY if self._bar.disable else _TICK):
+        while not ended.wait(SAID_EVERY if bar.disable else _TICK):
             if is_compiling():
                 continue  # That has lines of its own.
-            if not self._bar.disable:
-                self._bar.refresh()
+            if not bar.disable:
+                bar.refresh()
                 continue
-            spent, share = clock() - self._begun, self._share
-            done = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
+            spent, share = clock() - begun, done
+            words = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
             with suppress(OSError, ValueError):
-                self._stream.write(f"fdi: {self._what}{done} after {spent:.0f} s\n")
-                self._stream.flush()
+                stream.write(f"fdi: {what}{': ' if what else ''}{words} after {spent:.0f} s\n")
+                stream.flush()
 
-    def show(self, share: float) -> None:
-        """Draw the share done, 0 to 1; time spent compiling is none of the work."""
-        before, self._compiled = self._compiled, compiling_seconds()
-        if not self._bar.disable:
-            self._bar.start_t += self._compiled - before
-        self._bar.update(share - self._bar.n)
-        self._share = share
+    def show(share: float) -> None:
+        nonlocal compiled, done
+        before, compiled = compiled, compiling_seconds()
+        if not bar.disable:
+            # Time spent compiling is none of the work.
+            bar.start_t += compiled - before
+        bar.update(share - bar.n)
+        done = share
 
-
-class CompileBar(View):
-    """The share compiled, on the last line of a terminal while anything is compiled: a `View` of `announced`."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._bar: Any = None
-
-    def begin(self) -> None:
-        """Say that it begins."""
-        from tqdm import tqdm
-
-        self._stream.write(f"{WORDS}\n")
-        self._bar = tqdm(total=1.0, desc="compiling", file=self._stream, bar_format=_COMPILE_FORMAT, leave=False)
-
-    def draw(self, share: float) -> None:
-        """Draw the share done."""
-        if self._bar is not None:
-            self._bar.n = share
-            self._bar.refresh()
-
-    def wipe(self) -> None:
-        """Leave the line to others."""
-        if self._bar is not None:
-            self._bar.clear()
-
-
-def bar_of(arguments: argparse.Namespace) -> CompileBar | None:
-    """Return what shows the share compiled; None: there is no terminal, or it is to be quiet."""
-    shown = sys.stderr.isatty() and not arguments.quiet and all(map(there, PROGRESS))
-    return CompileBar(sys.stderr) if shown else None
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        thread.join()
+        bar.close()
 
 
 # Files and words ------------------------------------------------------------------------------------------------------
@@ -144,22 +106,23 @@ _KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}  # what is wr
 class Outputs:
     """What a verb was asked for: files, refused before any work is done and confirmed when it is, and words.
 
-    ``names``: of the options that say where to write, in the order in which that is confirmed. ``sources``: what is
-    read, never overwritten wherever its files lie; None: not given. ``output``: what is written where ``--output``
-    says; None: whoever writes it looks at what is there. `BagError` if one may not be written, or two are one.
+    ``names``: of the options that say where to write, in the order in which that is confirmed; ``targets``: what they
+    say. ``sources``: what is read, never overwritten wherever its files lie; None: not given. ``output``: what is
+    written where ``--output`` says; None: whoever writes it looks at what is there. `BagError` if one may not be
+    written, or two are one.
     """
 
     def __init__(
         self,
         arguments: argparse.Namespace,
         names: Sequence[str],
-        sources: Sequence[Path | None] = (),
+        sources: Iterable[Path | None] = (),
         output: Kind | None = Kind.PARAMETERS,
     ) -> None:
         self._arguments = arguments
-        self._targets: dict[str, Path] = {name: path for name in names if (path := getattr(arguments, name))}
+        self.targets: dict[str, Path] = {name: path for name in names if (path := getattr(arguments, name))}
         kinds = {**_KINDS, "output": output}
-        wanted = [(path, kind) for name, path in self._targets.items() if (kind := kinds[name]) is not None]
+        wanted = [(path, kind) for name, path in self.targets.items() if (kind := kinds[name]) is not None]
         folders = [path for path, kind in wanted if kind is Kind.FOLDER]
         taken: set[Path] = set()
         for target, kind in wanted:
@@ -178,15 +141,9 @@ class Outputs:
         ``severity``: of the first line, where that is a verdict.
         """
         if not self._arguments.quiet:
-            stream = sys.stderr if any(map(is_open_already, self._targets.values())) else sys.stdout
+            stream = sys.stderr if any(map(is_open_already, self.targets.values())) else sys.stdout
             text = visible(text)
             stream.write(text if severity is None else with_first_line_coloured(text, severity, stream))
-
-    def confirm(self, *names: str) -> None:
-        """Say what was written where these options say, or all of them."""
-        for target in [self._targets[name] for name in names or self._targets if name in self._targets]:
-            if target != STANDARD_OUTPUT:
-                self.say(f"wrote {shown(target, LINE)}\n")
 
     def finish(
         self,
@@ -196,7 +153,7 @@ class Outputs:
         severity: Severity | None = None,
         **others: Callable[[Path], object],
     ) -> int:
-        """Write page, figures and other files where they were asked for, all or none, and say the text.
+        """Write page, figures and other files where they were asked for, all or none; say the text, and all targets.
 
         `severity` is that of the first line of the text, where that is a verdict; `others` write the files of other
         options, by name. Returns the exit code.
@@ -206,12 +163,14 @@ class Outputs:
         with ExitStack() as stack:
             # They take their places at the end: where one cannot be written, there is none.
             for name, write in others.items():
-                if name in self._targets:
-                    write(stack.enter_context(whole(self._targets[name])))
+                if name in self.targets:
+                    write(stack.enter_context(whole(self.targets[name])))
             if figures is not None:
-                write_json(self._targets.get("json"), figures)
+                write_json(self.targets.get("json"), figures)
         self.say(text, severity)
-        self.confirm()
+        for target in self.targets.values():
+            if target != STANDARD_OUTPUT:
+                self.say(f"wrote {shown(target, LINE)}\n")
         return 0 if severity is None else severity.exit_code
 
 

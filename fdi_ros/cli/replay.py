@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording through the monitor: ``fdi replay``, as it is or with faults; ``fdi sweep``, which faults are found."""
+"""Through the monitor: ``fdi replay``, a recording; ``fdi sweep``, many faults; ``fdi fleet``, many recordings."""
 
 from __future__ import annotations
 
@@ -10,39 +10,38 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.cli.arguments import FILE, PART, RESULTS, Verb, config_files, shared, shipped
+from fdi_ros.cli.outputs import Kind, Outputs, about, check_part, check_target, config_words, progress, versions
+from fdi_ros.cli.settings import compile_for_workers
+from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
-from fdi_ros.errors import ConfigError
-from fdi_ros.system.installation import BAGS, POOL, PROGRESS, resolve
+from fdi_ros.errors import BagError, ConfigError, FdiError
+from fdi_ros.faults.fault import load_scenario, parse_fault
+from fdi_ros.mavlink.failover import failover_text
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.pipeline import build_geometry
+from fdi_ros.replay.check import failures, parse_check
+from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
+from fdi_ros.replay.page import Report
+from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.summary import Summary, as_json
+from fdi_ros.replay.words import sample_rate_notes, summary_text, verdict
+from fdi_ros.report.layout import unit_of
+from fdi_ros.setup.findings import refuse_degrees
+from fdi_ros.setup.starting_config import assumed_config
+from fdi_ros.system import resolve
+from fdi_ros.system.files import whole, write_json, write_text
+from fdi_ros.system.text import shown, storable
 
 if TYPE_CHECKING:
-    from fdi_ros.cli.outputs import Outputs
-    from fdi_ros.config.config import Config
-    from fdi_ros.model.geometry import Geometry
-    from fdi_ros.model.samples import Block
-    from fdi_ros.replay.run import Request, Sink
-    from fdi_ros.replay.summary import Summary
     from fdi_ros.replay.sweep import Plan, Subject
 
 
-def _replay(arguments: Namespace) -> int:
+def run_replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
-    from fdi_ros.cli.outputs import Kind, Outputs, Progress
-    from fdi_ros.mavlink.failover import failover_text
-    from fdi_ros.monitor.pipeline import build_geometry
-    from fdi_ros.replay.check import failures, parse_check
-    from fdi_ros.replay.page import Report
-    from fdi_ros.replay.run import replay
-    from fdi_ros.replay.summary import as_json
-    from fdi_ros.replay.words import summary_text, verdict
-    from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.findings import refuse_degrees
-    from fdi_ros.system.files import whole, write_json
-
     request, assumed = _request(arguments)
     geometry = build_geometry(request.config)
     required = [] if arguments.check is None else parse_check(arguments.check, len(request.faults), geometry)
@@ -51,9 +50,9 @@ def _replay(arguments: Namespace) -> int:
     refuse_degrees(arguments.bag, request.config)
     unit = unit_of(arguments.degrees)
     report = Report(geometry, request.config.sample_rate, unit) if arguments.report is not None else None
-    with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
+    with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
         sinks = _sinks(arguments, request, geometry, stack)
-        summary = replay(request, [*sinks, report] if report else sinks, progress.show)
+        summary = replay(request, [*sinks, report] if report else sinks, show)
         found = verdict(summary, unit)
         figures = {**as_json(summary), "verdict": {"severity": found.severity.value, "words": verdict(summary).words}}
         unmet = failures(required, summary)
@@ -78,8 +77,6 @@ def _replay(arguments: Namespace) -> int:
 
 def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
     """Say what came of the check; return the exit code."""
-    from fdi_ros.replay.words import sample_rate_notes
-
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
     for line in sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ():
         print(f"fdi: warning: {line}", file=sys.stderr)
@@ -92,32 +89,21 @@ def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: 
 
 def _request(arguments: Namespace) -> tuple[Request, str]:
     """Return what to replay; and what was assumed, where no settings were given."""
-    from fdi_ros.cli.outputs import check_part
-    from fdi_ros.config.config import Config
-    from fdi_ros.faults.fault import load_scenario, parse_fault
-    from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD
-    from fdi_ros.replay.run import Request
-    from fdi_ros.setup.starting_config import assumed_config
-
-    changes = {"detector.name": arguments.detector} if arguments.detector else {}
     if arguments.config:
         config, assumed = Config.from_file(arguments.config), ""
     else:
         config, assumed = assumed_config(arguments.bag)
-    config = config.replaced(changes) if changes else config
+    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
     faults = tuple(parse_fault(text) for text in arguments.fault)
     if arguments.scenario is not None:
         faults += load_scenario(arguments.scenario)
     check_part(arguments)
-    request = Request(arguments.bag, config, faults, arguments.start, arguments.end)
-    return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request, assumed
+    period = DIAGNOSTICS_PERIOD if arguments.output else 0
+    return Request(arguments.bag, config, faults, arguments.start, arguments.end, period=period), assumed
 
 
 def _sinks(arguments: Namespace, request: Request, geometry: Geometry, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
-    from fdi_ros.replay.outputs import CsvFile, OutputBag
-    from fdi_ros.system.files import whole
-
     sinks: list[Sink] = []
     if arguments.csv is not None:
         path = stack.enter_context(whole(arguments.csv))
@@ -137,8 +123,6 @@ def _written(value: object) -> str:
 
 def _about_replay(arguments: Namespace, request: Request, assumed: str) -> dict[str, str]:
     """Say what was run, for the report."""
-    from fdi_ros.cli.outputs import about, config_words
-
     changed = "; ".join(f"{name}: {_written(value)}" for name, value in request.config.changed.items())
     more = {
         "detector": request.config.detector.name,
@@ -149,54 +133,13 @@ def _about_replay(arguments: Namespace, request: Request, assumed: str) -> dict[
     return about(arguments, config_words(arguments) or f"none; assumed: {assumed}", more)
 
 
-REPLAY = Verb(
-    "pass a recording through the monitor, with or without injected faults",
-    (
-        "fdi replay my_log.bin",
-        "fdi replay my_flight --config my_gyros.yaml",
-        "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
-        "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
-    ),
-    {
-        **shared("bag"),
-        **config_files("; default: what fdi inspect writes, where units are mounted alike", required=False, default=[]),
-        "--fault": {"help": "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated"},
-        "--scenario": {
-            "type": resolve,
-            "metavar": "FILE",
-            "help": f"inject the faults of a scenario file; shipped: {shipped('scenarios')}",
-        },
-        **shared("--detector"),
-        **PART,
-        "--check": {
-            "metavar": "'TERM ...'",
-            "help": "exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
-            " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
-            " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
-            " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
-            " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
-        },
-        "--csv": {"help": "write a line for every sample"},
-        "--report": {"help": "write a report to be looked at"},
-        "--output": {**FILE, "help": "write a bag of what the node would have published", "metavar": "DIR"},
-        **RESULTS,
-        "--force": {"help": "overwrite outputs that exist"},
-        **shared("--degrees"),
-    },
-    _replay,
-    (*BAGS, *PROGRESS),
-)
-
-
 # Faults of many sizes -------------------------------------------------------------------------------------------------
-
 
 MOST_TIMES = 1000
 
 
-def _sweep(arguments: Namespace) -> int:
+def run_sweep(arguments: Namespace) -> int:
     """Sweep, print the tables, write what was asked for."""
-    from fdi_ros.cli.outputs import Outputs, Progress, about, check_part, config_words
     from fdi_ros.replay.sweep import sweep
     from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
 
@@ -206,8 +149,8 @@ def _sweep(arguments: Namespace) -> int:
     compared = filter(Path.exists, map(resolve, arguments.compare))
     outputs = Outputs(arguments, ("json", "csv", "report"), [arguments.bag, *arguments.config, *compared])
     subjects = _subjects(arguments, configs)
-    with Progress(sys.stderr, arguments.quiet, "faults") as progress:
-        results = sweep(subjects, plan, arguments.workers, progress.show)
+    with progress(sys.stderr, arguments.quiet, "faults") as show:
+        results = sweep(subjects, plan, arguments.workers, show)
     text, figures = sweep_text(results, plan, arguments.bag.name), sweep_figures(results, plan, str(arguments.bag))
     tried = {
         "compared with": ", ".join(arguments.compare) or "nothing",
@@ -240,9 +183,6 @@ def _plan(arguments: Namespace) -> Plan:
 
 def _configs(arguments: Namespace) -> dict[str, Config]:
     """Return the configs to be tried by name: the one given, and those to compare it with."""
-    from fdi_ros.config.config import Config
-    from fdi_ros.monitor.pipeline import build_geometry
-
     config = Config.from_file(arguments.config)
     config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
     by_detector = arguments.compare and all(other in DETECTORS for other in arguments.compare)
@@ -277,34 +217,50 @@ def _alignment(config: Config) -> object:
     return config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout
 
 
-SWEEP = Verb(
-    "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
-    (
-        "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
-        "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1' --compare likelihood_ratio cusum",
-    ),
-    {
-        **shared("bag", "--config"),
-        "--fault": {
-            "help": "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts,"
-            " noise, scale factors, stuck, dropout"
-        },
-        "--times": {"type": int, "default": 10, "metavar": "N", "help": "times per channel and fault; default 10"},
-        "--within": {"type": float, "default": 5.0, "metavar": "S", "help": "watch a fault for so long; default 5"},
-        **shared("--detector"),
-        "--compare": {
-            "nargs": "+",
-            "default": [],
-            "metavar": "NAME",
-            "help": "other detectors (as of --detector) or parameter files beside it",
-        },
-        "--seed": {"type": int, "default": 1, "metavar": "S", "help": "of signs and random faults; default 1"},
-        "--workers": {"default": 1, "help": "processes; default 1"},
-        **PART,
-        "--csv": {"help": "write a line for every fault"},
-        **shared("--report"),
-        **RESULTS,
-    },
-    _sweep,
-    (*BAGS, *POOL),
-)
+# Many recordings ------------------------------------------------------------------------------------------------------
+
+PAGE = "fleet.html"
+
+
+def run_fleet(arguments: Namespace) -> int:
+    """Judge them, write tables and page, print what needs a person."""
+    from fdi_ros.fleet.judge import find_recordings, judge_all
+    from fdi_ros.fleet.tables import Fleet, Tables
+    from fdi_ros.system.jobs import worker_count
+
+    workers = worker_count(arguments.workers)
+    names = ", ".join(shown(file.name) for file in arguments.config)
+    parameters = with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
+    paths, unread = find_recordings(arguments.paths)
+    outputs = Outputs(arguments, ("output", "json"), [*paths, *arguments.config], output=None)
+    folder = arguments.output.absolute()
+    if folder.exists():
+        check_target(folder / PAGE, Kind.PAGE, force=True)
+    tables = Tables(folder, {"config": parameters, "calibrate": arguments.calibrate}, arguments.force)
+    compile_for_workers(arguments)
+    try:
+        with progress(sys.stderr, arguments.quiet, "flights") as show:
+            given = parameters, arguments.calibrate == "each", tables
+            judge_all(paths, *given, workers, arguments.scheduler, show)
+    except KeyboardInterrupt:
+        print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
+        raise
+    except (FdiError, OSError):
+        tables.give_up()
+        raise
+    fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
+    head = {
+        "recordings": f"{len(paths)}, from {', '.join(map(str, arguments.paths))}",
+        "config": config_words(arguments) or "what fdi inspect writes for each recording",
+        "calibrated": arguments.calibrate,
+        "versions": versions(),
+    }
+    write_text(folder / PAGE, fleet.html(head))
+    others = len(tables.flights) - len(paths)
+    more = [f"The tables have {others} more, of other runs: not counted here."] if others else []
+    more += [f"Not searched: {shown(line)}." for line in unread]
+    text, figures = fleet.text() + "".join(f"{line}\n" for line in more), fleet.figures() | {"not_searched": unread}
+    code = outputs.finish(text, figures, severity=fleet.verdict.severity)
+    if not fleet.judged:
+        raise BagError(f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why")
+    return code

@@ -1,22 +1,44 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Without a recording: ``fdi geometry``, ``fdi shipped`` (files), ``fdi compile``, ``fdi watch`` (a live monitor)."""
+"""Without a recording: ``fdi geometry``, ``fdi montecarlo``, ``fdi shipped`` (files), ``fdi compile``."""
 
 from __future__ import annotations
 
 import difflib
 import json
+import logging
+import multiprocessing
+import os
 import re
+import sys
 import time
 from argparse import Namespace
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from functools import partial
+from typing import Any
 
-from fdi_ros.cli.arguments import DETECTOR_NAMES, FLAG, RESULTS, Verb, shared
+import numpy as np
+
+from fdi_ros.cli.outputs import Outputs, config_words, progress
+from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
+from fdi_ros.compiling.notice import share_logged
+from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS, detector_class
-from fdi_ros.errors import ConfigError, FdiError
-from fdi_ros.system.installation import resolve, shipped_files
+from fdi_ros.detectors.papers.guaranteed import Guaranteed
+from fdi_ros.errors import ConfigError, FdiError, StudyError
+from fdi_ros.estimator.blocks import rests
+from fdi_ros.estimator.error_states import SIGNALS, Layout, fill_signals
+from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.receiver import warm_detector, warm_path
+from fdi_ros.report.layout import unit_of
+from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
+from fdi_ros.system import BAGS, shipped_files, there
+from fdi_ros.system.files import plain
 
 MADE = "diagnostics.yaml"  # the file that can be made for nodes
 _NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # full name of a node
@@ -24,45 +46,35 @@ _ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
 """In the file, a regular expression of statuses of any monitor."""
 
 
-def _geometry(arguments: Namespace) -> int:
+def run_geometry(arguments: Namespace) -> int:
     """Assess the mounting, print the tables, write the page."""
-    from fdi_ros.cli.outputs import Outputs, config_words
-    from fdi_ros.config.config import Config
-    from fdi_ros.report.layout import unit_of
-    from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
-
     outputs = Outputs(arguments, ("report", "json"), arguments.config)
     result = assess(Config.from_file(arguments.config))
-    unit, title = unit_of(arguments.degrees), config_words(arguments)
-    page = partial(mounting_page, result, title, unit)
+    unit = unit_of(arguments.degrees)
+    page = partial(mounting_page, result, config_words(arguments), unit)
     return outputs.finish(mounting_text(result, unit), mounting_figures(result), page)
 
 
-GEOMETRY = Verb(
-    "say what a mounting can detect and isolate, before it flies",
-    ("fdi geometry two_triads.yaml", "fdi geometry my_gyros.yaml --degrees --report mounting.html"),
-    {
-        "config": {
-            "type": resolve,
-            "nargs": "+",
-            "metavar": "CONFIG",
-            "help": "ROS 2 parameter file; of several, later ones win",
-        },
-        "--report": {"help": "write a page with tables and a picture"},
-        **RESULTS,
-        **shared("--degrees"),
-    },
-    _geometry,
-)
+def run_montecarlo(arguments: Namespace) -> int:
+    """Run the study; print its headline table."""
+    from fdi_ros.experiments.montecarlo import load_study, run_study
+    from fdi_ros.experiments.report import headline, report
+
+    if arguments.scheduler is not None and arguments.workers is not None:
+        raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
+    outputs = Outputs(arguments, ("report", "json"), [arguments.study])
+    study = load_study(arguments.study, arguments.trials, arguments.seed)
+    compile_for_workers(arguments)
+    with progress(sys.stderr, arguments.quiet, study.name) as show:
+        result = run_study(study, arguments.workers, arguments.scheduler, show)
+    return outputs.finish(f"{headline(result)}\n", plain(result), lambda: report(result))
 
 
-def _shipped(arguments: Namespace) -> int:
+def run_shipped(arguments: Namespace) -> int:
     """Print the path of every shipped file, or of those of one name; with nodes, the file made for them.
 
     `ConfigError` if no shipped file has that name, or it is not made for nodes.
     """
-    from fdi_ros.cli.outputs import Outputs
-
     if arguments.node and arguments.name != MADE:
         raise ConfigError(f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}")
     files = shipped_files()
@@ -102,29 +114,11 @@ def made_for(nodes: Sequence[str], text: str) -> str:
     return text.replace(timeout, f"{timeout}          num_items: {len(names)}\n", 1)
 
 
-SHIPPED = Verb(
-    "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
-    ("fdi shipped", "fdi shipped two_imus.yaml"),
-    {
-        "name": {"nargs": "?", "default": "", "metavar": "NAME", "help": "only this file, such as two_imus.yaml"},
-        "--node": {
-            "action": "append",
-            "default": [],
-            "metavar": "NAME",
-            "help": "print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
-        },
-        **RESULTS,
-    },
-    _shipped,
-)
+# Compiling ahead ------------------------------------------------------------------------------------------------------
 
 
-def _compile(arguments: Namespace) -> int:
+def run_compile(arguments: Namespace) -> int:
     """Compile, and say how long it took and where the results are kept."""
-    from fdi_ros.cli.ahead import compile_now
-    from fdi_ros.cli.outputs import Outputs, bar_of
-    from fdi_ros.compiling.compiled import INTERPRETED, folder
-
     if INTERPRETED:
         raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")
     names = arguments.detector or list(DETECTORS)
@@ -132,38 +126,50 @@ def _compile(arguments: Namespace) -> int:
         detector_class(name)
     outputs = Outputs(arguments, ("json",))
     begun = time.perf_counter()
-    new = compile_now(names, bar_of(arguments))
+    new = compile_now(names)
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     figures = {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())}
     return outputs.finish(f"{what} {folder()}\n", figures)
 
 
-COMPILE = Verb(
-    "compile now what else is compiled when it is first used, for images and CI",
-    ("fdi compile", "fdi compile --detector sequential"),
-    {"--detector": {"nargs": "+", "help": f"for these detectors; default: for all: {DETECTOR_NAMES}"}, **RESULTS},
-    _compile,
-)
+def compile_for_workers(arguments: Namespace) -> None:
+    """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
+    if arguments.scheduler is None and missing():
+        compile_now()
 
 
-def _watch(arguments: Namespace) -> int:
-    """Show a monitor until interrupted."""
-    from fdi_ros.ros.process import NO_ROS
+def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
+    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
 
-    try:
-        from fdi_ros.ros.watch import watch
-    except ImportError as error:
-        raise FdiError(f"watch {NO_ROS} ({error})") from error
-    return watch(arguments.node, arguments.plain)
+    Return how many functions had to be compiled.
+    """
+    # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
+    parts: list[tuple[Any, ...]] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
+    # Spawned: forking a process that has threads can hang.
+    spawned = multiprocessing.get_context("spawn")
+    logged = share_logged() if missing() else nullcontext()
+    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=spawned) as pool, logged:
+        return sum(pool.map(_quietly, parts))
 
 
-WATCH = Verb(
-    "show a running monitor: residuals, states, rates and events as they come",
-    ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
-    {
-        "--node": {"default": "", "metavar": "/NS/NAME", "help": "the monitor; default: the only one running"},
-        "--plain": {**FLAG, "help": "line by line, as where the output is no terminal"},
-    },
-    _watch,
-)
+def _quietly(part: tuple[Any, ...]) -> int:
+    """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
+    LOG.setLevel(logging.ERROR)
+    before = compilations()
+    part[0](*part[1:])
+    return compilations() - before
+
+
+def warm_verbs() -> None:
+    """Compile what the offline verbs need besides, whatever the detector."""
+    if all(map(there, BAGS)):
+        from fdi_ros.bag.dataflash import find_records
+        from fdi_ros.bag.mcap_file import walk
+
+        walk(b"")
+        sizes, found = np.zeros(256, dtype=np.int64), np.empty((2, 1), dtype=np.int64)
+        find_records(np.frombuffer(b"\0", dtype=np.uint8), sizes, True, found)
+    rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
+    fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
+    Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))

@@ -359,8 +359,7 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
             LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
 
     def _load_index(self) -> Any:
-        found = self._read(self._index_path, super()._load_index)
-        return {} if found is None else found
+        return self._read(self._index_path, super()._load_index) or {}
 
     def _load_data(self, name: str) -> Any:
         found = self._read(self._data_path(name), functools.partial(super()._load_data, name))
@@ -370,32 +369,23 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
         return found
 
     def _read(self, path: str, load: Callable[[], Any]) -> Any:
-        if not self._is_ours(path):
-            return None
         try:
+            self._close()
+            check_trusted(path)
             return load()
+        except DistrustError as error:
+            LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
         except FileNotFoundError:
-            return None
+            pass
         except Exception as error:  # A file that was cut off, or is no pickle at all, may raise anything.
             LOG.warning("compiled code in %s is damaged, and compiled anew: %s", path, type(error).__name__)
-            return None
+        return None
 
     def _close(self) -> None:
         """Check that nobody else can write the folder of the function, nor any between it and that of all results."""
         inside, top = Path(self._cache_path), folder()
         for one in (inside, *(parent for parent in inside.parents if parent.is_relative_to(top))):
             close_to_others(one)
-
-    def _is_ours(self, path: str) -> bool:
-        try:
-            self._close()
-            check_trusted(path)
-        except DistrustError as error:
-            LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
-            return False
-        except OSError:
-            return False
-        return True
 
     @contextlib.contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:

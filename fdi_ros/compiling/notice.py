@@ -25,7 +25,6 @@ LOG = logging.getLogger("fdi_ros")
 _PASS = "numba:run_pass"  # every compilation, and nothing that is only loaded, goes through the passes of the compiler
 _WHOLE = "numba:compile"  # one function, with all that it calls
 WORDS = "compiling what every sample passes through, once: half a minute to two (fdi compile does it beforehand)"
-TICK = 0.5  # how often the share done is shown anew, s
 YOUNG_OBJECTS = 7000
 """The compiler makes millions of objects that last: looking for garbage among them ten times as often as this, which is
 Python's default, is a seventh of its time. More seldom still costs memory and saves nothing."""
@@ -90,61 +89,46 @@ def clock() -> float:
     return time.perf_counter() - compiling_seconds()
 
 
-class View:
-    """Shows that something is compiled: in the log, with a bar in letters now and then; a terminal derives its own."""
+@contextlib.contextmanager
+def share_logged() -> Iterator[None]:
+    """Log that what is missing is compiled within, here or in other processes, and now and then how far it is."""
+    LOG.warning(WORDS)
+    begun, over = time.monotonic(), threading.Event()
 
-    def __init__(self) -> None:
-        self._begun = self._next = 0.0
+    def tick() -> None:
+        most = before = missing()
+        while not over.wait(LOG_PERIOD):
+            left = missing()
+            # What is to be compiled may become more on the way.
+            most = max(most, left)
+            if most and (left != before or is_compiling()):
+                share, spent = 1 - left / most, time.monotonic() - begun
+                LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), spent)
+            before = left
 
-    def begin(self) -> None:
-        """Say it, before the first compilation."""
-        LOG.warning(WORDS)
-        self._begun = time.monotonic()
-        self._next = self._begun + LOG_PERIOD
-
-    def draw(self, share: float) -> None:
-        """Show the share done, 0 to 1; called from a thread of its own while something is compiled."""
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + LOG_PERIOD
-            LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), now - self._begun)
-
-    def wipe(self) -> None:
-        """Make room: for now nothing is compiled."""
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextlib.contextmanager
-def announced(view: View | None = None) -> Iterator[None]:
-    """Say, before anything is compiled within, that it is, and how far it is; view: where, default the log."""
-    shown, lock, first = view or View(), threading.Lock(), [0]
-    over = threading.Event()
+def announced() -> Iterator[None]:
+    """Log, before anything is compiled within, that it is, and now and then how far it is."""
+    with contextlib.ExitStack() as stack:
+        begun = False
 
-    def tick() -> None:
-        while not over.wait(TICK):
-            with lock:
-                if _watch.depth:
-                    left = missing()
-                    # What is to be compiled may become more on the way.
-                    first[0] = max(first[0], left)
-                    shown.draw(1 - left / first[0] if first[0] else 0.0)
+        def hook(begins: bool) -> None:
+            nonlocal begun
+            if not begun:
+                begun = True
+                stack.enter_context(share_logged())
 
-    def hook(begins: bool) -> None:
-        with lock:
-            if not begins:
-                shown.wipe()
-            elif not thread.is_alive():
-                first[0] = missing()
-                shown.begin()
-                thread.start()
-
-    thread = threading.Thread(target=tick, daemon=True)
-    try:
-        with _watch.calling(hook):
-            yield
-    finally:
-        over.set()
-        if thread.is_alive():
-            thread.join()
+        stack.enter_context(_watch.calling(hook))
+        yield
 
 
 @contextlib.contextmanager

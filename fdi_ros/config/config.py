@@ -36,7 +36,6 @@ from fdi_ros.config.settings import (
     NoiseConfig,
     Value,
     check,
-    check_length,
     fields_of,
     setting,
 )
@@ -74,10 +73,7 @@ class Config:
     def from_parameters(cls, parameters: Mapping[str, Any]) -> Config:
         """Build from ``{"section.field": value}``; what is not given keeps its default.
 
-        Raises
-        ------
-        ConfigError
-            If a parameter is unknown, of the wrong type or out of its range, or two contradict each other.
+        `ConfigError` if a parameter is unknown, of the wrong type or out of its range, or two contradict each other.
         """
         sections: dict[str, dict[str, Any]] = {}
         for name, value in parameters.items():
@@ -93,19 +89,10 @@ class Config:
 
     @classmethod
     def from_file(cls, path: str | Path | Sequence[str | Path], overrides: Mapping[str, Any] | None = None) -> Config:
-        """Read a ROS 2 parameter file, or several.
+        """Read a ROS 2 parameter file; of several, later ones win, as with ``--params-file`` of ROS.
 
-        Parameters
-        ----------
-        path
-            Of the file; of several, later ones win, as with ``--params-file`` of ROS.
-        overrides
-            ``{"section.field": value}``, which win over all of them.
-
-        Raises
-        ------
-        ConfigError
-            If a file is missing, is no parameter file, or holds a bad parameter.
+        ``overrides``: ``{"section.field": value}``, which win over all of them. `ConfigError` if a file is missing, is
+        no parameter file, or holds a bad parameter.
         """
         files = [path] if isinstance(path, (str, Path)) else path
         given = {name: value for file in files for name, value in read_parameter_file(file).items()}
@@ -187,10 +174,13 @@ def unknown_parameter(name: str) -> str:
 
 def check_lengths(config: Config, per: str, count: int) -> None:
     """Check the lists that have values for each channel, or for each triad; `ConfigError` if one has another length."""
-    values = config.parameters()
+    values: dict[str, Any] = config.parameters()
     for name, declared in PARAMETERS.items():
-        if declared.per == per:
-            check_length(declared, values[name], count, name, ConfigError)
+        lengths = (*declared.other_lengths, declared.each * count)
+        if declared.per == per and len(values[name]) not in lengths:
+            each = "one" if declared.each == 1 else declared.each
+            expected = f"{' or '.join(map(str, lengths))} ({each} per {per})"
+            raise ConfigError(f"{name} has {len(values[name])} values, expected {expected}")
 
 
 MIN_LEARNED = 10
@@ -344,13 +334,27 @@ def parameters_of(text: str) -> dict[str, Any]:
     return parameters_in(parse_yaml(text, "config", ConfigError), "config")
 
 
-def parameter_file(parameters: Mapping[str, Any], origin: str, remarks: Mapping[str, str] | None = None) -> str:
-    """Return the text of a parameter file with the parameters ``{"section.field": value}``.
+def parameter_file(
+    parameters: Mapping[str, Any],
+    origin: str,
+    remarks: Mapping[str, str] | None = None,
+    node: str = "/**",
+    ros: Mapping[str, Any] | None = None,
+) -> str:
+    """Return the text of a parameter file of a node with the parameters ``{"section.field": value}``.
 
     ``origin``: lines of comment at the top, where the values come from. ``remarks``: what is to be said of single
-    values besides unit and meaning, by parameter.
+    values besides unit and meaning, by parameter. ``ros``: parameters that are no settings.
     """
-    return _text("/**", {}, parameters, origin, remarks or {})
+    lines = textwrap.indent(_yaml(ros), " " * 4).splitlines() if ros else []
+    section = ""
+    for name in filter(parameters.__contains__, PARAMETERS):
+        before, section = section, name.rpartition(".")[0]
+        if section != before:
+            lines += ["", f"    {section}:"]
+        lines += _entry(name, parameters[name], (remarks or {}).get(name, ""), 6 if section else 4)
+    top = [*(f"# {line}" for line in origin.splitlines()), f"{node}:"]
+    return "\n".join([*top, f"  ros__parameters:{'' if lines else ' {}'}", *lines]) + "\n"
 
 
 def with_parameters(
@@ -380,7 +384,7 @@ def with_parameters(
     values = Config.from_parameters(given).parameters()
     kept = {name: values[name] for name in given if name not in without}
     node = monitors.pop() if len(monitors) == 1 else "/**"
-    text = _text(node, ros, {**kept, **changes}, origin, remarks)
+    text = parameter_file({**kept, **changes}, origin, remarks, node, ros)
     return f"{text}\n{_yaml(others)}" if others else text
 
 
@@ -393,22 +397,6 @@ def _update(tree: dict[Any, Any], new: Mapping[Any, Any]) -> None:
             _update(tree[key], value)
         else:
             tree[key] = value
-
-
-def _text(
-    node: str, ros: Mapping[str, Any], parameters: Mapping[str, Any], origin: str, remarks: Mapping[str, str]
-) -> str:
-    lines = textwrap.indent(_yaml(dict(ros)), " " * 4).splitlines() if ros else []
-    section = ""
-    for name in PARAMETERS:
-        if name not in parameters:
-            continue
-        before, section = section, name.rpartition(".")[0]
-        if section != before:
-            lines += ["", f"    {section}:"]
-        lines += _entry(name, parameters[name], remarks.get(name, ""), 6 if section else 4)
-    top = [*(f"# {line}" for line in origin.splitlines()), f"{node}:"]
-    return "\n".join([*top, f"  ros__parameters:{'' if lines else ' {}'}", *lines]) + "\n"
 
 
 def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:

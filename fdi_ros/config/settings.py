@@ -9,7 +9,6 @@ is declared with `setting`; its type is the annotation.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -76,15 +75,6 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
     return tuple(_check_one(field, kind, item, name, error) for item in items)
 
 
-def check_length(field: Field, values: Any, count: int, name: str, error: type[FdiError]) -> None:
-    """Check the length of a list that has values for each of count channels or triads; name and error as of `check`."""
-    lengths = (*field.other_lengths, field.each * count)
-    if len(values) not in lengths:
-        each = "one" if field.each == 1 else field.each
-        expected = f"{' or '.join(map(str, lengths))} ({each} per {field.per})"
-        raise error(f"{name} has {len(values)} values, expected {expected}")
-
-
 _EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}
 
 
@@ -99,11 +89,11 @@ def _check_one(field: Field, kind: str, value: Any, name: str, error: type[FdiEr
 
 
 def _check_number(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> float:
-    unit, number = field.unit_suffix, None
-    with contextlib.suppress(TypeError, ValueError, OverflowError):
-        number = None if isinstance(value, bool) else float(value)
-    if number is None:
-        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
+    unit = field.unit_suffix
+    try:
+        number = float("no number" if isinstance(value, bool) else value)
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}") from None
     if not field.low <= number <= field.high:
         raise error(f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")
     if kind == "int" and not number.is_integer():
@@ -115,8 +105,21 @@ def _check_number(field: Field, kind: str, value: Any, name: str, error: type[Fd
 
 
 LEAST_NOISE = 1e-9  # of a sample, rad/s: less is that of rounding, of a value that does not change
-_PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}  # one value per channel, or one for all
-_PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}  # one value per triad, or none
+
+
+def _per_channel(*about: Any, lengths: tuple[int, ...] = (1,)) -> Any:
+    """Declare a list with one value per channel, or with another number of them (one: for all)."""
+    return setting(*about, per="channel", other_lengths=lengths)
+
+
+def _per_triad(*about: Any, each: int = 1) -> Any:
+    """Declare a list with so many values per triad, or none."""
+    return setting(*about, per="triad", each=each, other_lengths=(0,))
+
+
+def _live(*about: Any, **more: Any) -> Any:
+    """Declare a field that may be changed while the node runs."""
+    return setting(*about, runtime=True, **more)
 
 
 class Input(NamedTuple):
@@ -137,11 +140,11 @@ class ChannelsConfig:
 
     topic: str = setting("gyro_channels", "topic of the channels, one std_msgs/Float64MultiArray a sample")
     names: tuple[str, ...] = setting((), "name of each channel; empty: g1, g2, ... or imu_1.x, ...")
-    units: tuple[str, ...] = setting(
+    units: tuple[str, ...] = _per_channel(
         (),
         "name of the unit (chip, housing) that each channel belongs to and that may fail as a whole; empty: the triads"
         " of the preset, or by names with a point",
-        **{**_PER_CHANNEL, "other_lengths": (0,)},
+        lengths=(0,),
     )
 
 
@@ -150,13 +153,12 @@ class ImusConfig:
     """Input as one sensor_msgs/Imu topic per triad."""
 
     topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
-    names: tuple[str, ...] = setting((), "name of each triad; empty: imu_1, imu_2, ...", **_PER_TRIAD)
-    mounts: tuple[float, ...] = setting(
-        *((), "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001),
-        **{**_PER_TRIAD, "each": 9},
+    names: tuple[str, ...] = _per_triad((), "name of each triad; empty: imu_1, imu_2, ...")
+    mounts: tuple[float, ...] = _per_triad(
+        (), "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001, each=9
     )
-    delays: tuple[float, ...] = setting(
-        (), "delay of each triad: measured that much before its stamp; empty: none", "s", -0.1, 0.1, **_PER_TRIAD
+    delays: tuple[float, ...] = _per_triad(
+        (), "delay of each triad: measured that much before its stamp; empty: none", "s", -0.1, 0.1
     )
     max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
     timeout: float = setting(0.1, "a unit silent for so long is not waited for; its input is STALE", "s", 0.001, 10.0)
@@ -179,21 +181,19 @@ class GeometryConfig:
 class NoiseConfig:
     """Error of a healthy channel; one value, or one per channel."""
 
-    noise_std: tuple[float, ...] = setting(
-        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", LEAST_NOISE, 10.0, **_PER_CHANNEL
+    noise_std: tuple[float, ...] = _per_channel(
+        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", LEAST_NOISE, 10.0
     )
-    scale_std: tuple[float, ...] = setting(
-        (0.0,), "standard deviation of the scale factor", "", 0.0, 1.0, **_PER_CHANNEL
+    scale_std: tuple[float, ...] = _per_channel((0.0,), "standard deviation of the scale factor", "", 0.0, 1.0)
+    timing_std: tuple[float, ...] = _per_channel((0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0)
+    bound: tuple[float, ...] = _per_channel(
+        (),
+        "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std",
+        *("rad/s", 1e-9, 100.0),
+        lengths=(0, 1),
     )
-    timing_std: tuple[float, ...] = setting(
-        (0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0, **_PER_CHANNEL
-    )
-    bound: tuple[float, ...] = setting(
-        *((), "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std", "rad/s", 1e-9, 100.0),
-        **{**_PER_CHANNEL, "other_lengths": (0, 1)},
-    )
-    bias_walk: tuple[float, ...] = setting(
-        (5e-5,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0, **_PER_CHANNEL
+    bias_walk: tuple[float, ...] = _per_channel(
+        (5e-5,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0
     )
     acceleration_window: float = setting(
         0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0
@@ -204,9 +204,7 @@ class NoiseConfig:
 class BiasConfig:
     """Bias subtracted before the channels are compared."""
 
-    fixed: tuple[float, ...] = setting(
-        (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, **{**_PER_CHANNEL, "other_lengths": (0,)}
-    )
+    fixed: tuple[float, ...] = _per_channel((), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, lengths=(0,))
     turn_on_std: float = setting(
         0.02, "standard deviation of a bias from one start to the next, where it is not learned", "rad/s", 0.0, 1.0
     )
@@ -221,11 +219,6 @@ class BiasConfig:
     )
 
 
-def _live(*about: Any, **more: Any) -> Any:
-    """Declare a field that may be changed while the node runs; parameters as of `setting`."""
-    return setting(*about, runtime=True, **more)
-
-
 @dataclass(frozen=True)
 class DetectorConfig:
     """The detector and its options; each detector takes its own."""
@@ -238,8 +231,7 @@ class DetectorConfig:
         0.0, "alarms on healthy channels per sample; 0: use the rate per hour", "", 0.0, 0.5
     )
     confidence: float = _live(
-        *(0.999, "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out"),
-        *("", 0.5, 0.999999),
+        0.999, "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out", "", 0.5, 0.999999
     )
     tolerance: str = _live(
         "calibrated",
@@ -261,9 +253,8 @@ class DetectorConfig:
 class HealthConfig:
     """Checks of each channel by itself."""
 
-    max_rate: tuple[float, ...] = setting(
-        *((34.9,), "a value beyond this is out of range (saturated); one, or one per channel", "rad/s", 1e-3, 1e4),
-        **_PER_CHANNEL,
+    max_rate: tuple[float, ...] = _per_channel(
+        (34.9,), "a value beyond this is out of range (saturated); one, or one per channel", "rad/s", 1e-3, 1e4
     )
     range_recovery_time: float = setting(
         0.1, "after a value out of range, alarms do not count towards a declaration for this long", "s", 0.0, 10.0
@@ -300,8 +291,8 @@ class IntegrityConfig:
     risk: float = setting(
         1e-7, "allowed probability at one sample of an unnoticed error above the level; 0: no level", "", 0.0, 0.1
     )
-    fault_rate: tuple[float, ...] = setting(
-        (1e-4,), "faults of a channel; one, or one per channel", "1/h", 0.0, 1.0, **_PER_CHANNEL
+    fault_rate: tuple[float, ...] = _per_channel(
+        (1e-4,), "faults of a channel; one, or one per channel", "1/h", 0.0, 1.0
     )
     exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
     max_rate: float = setting(2.0, "body rate for which the level after one more loss is foretold", "rad/s", 0.0, 100.0)

@@ -25,8 +25,8 @@ from typing import Any
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.protocol import NS
+from fdi_ros.system import require
 from fdi_ros.system.files import open_regular
-from fdi_ros.system.installation import require
 
 MOST_AT_ONCE = 1 << 15  # bytes that are read before others get their turn
 MOST_WAITING = 1 << 12  # bytes that wait to be sent: half a second of a slow line. What is more is dropped.

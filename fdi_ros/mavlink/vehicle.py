@@ -40,7 +40,7 @@ from fdi_ros.mavlink.protocol import (
     read,
     understood,
 )
-from fdi_ros.system.installation import require
+from fdi_ros.system import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 AUTOPILOT_COMPONENT = 1

@@ -16,7 +16,7 @@ from fdi_ros.core.decision import REASONS, ChannelState, Reason
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, fill_imu, fill_integrity
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
-from fdi_ros.system.installation import require
+from fdi_ros.system import require
 from fdi_ros.system.text import date_of, html_table
 
 if TYPE_CHECKING:

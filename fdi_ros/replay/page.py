@@ -37,7 +37,7 @@ from fdi_ros.report.layout import (
     time_layout,
 )
 from fdi_ros.report.spectrum import Spectrum
-from fdi_ros.system.installation import there
+from fdi_ros.system import there
 from fdi_ros.system.text import date_of
 
 HOLE = 1.0  # no curve is drawn over a longer time without a sample, s

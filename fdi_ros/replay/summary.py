@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from fdi_ros.monitor.output import time_index
 from fdi_ros.replay.episodes import DECLARED, NOTHING_HAPPENED, Story
 from fdi_ros.replay.outcomes import OutcomeKind
-from fdi_ros.system.installation import require
+from fdi_ros.system import require
 
 if TYPE_CHECKING:
     import pandas

@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.system.installation import resolve
+from fdi_ros.system import resolve
 from launch import Action, LaunchContext
 
 LEVELS = ("debug", "info", "warn", "error", "fatal")

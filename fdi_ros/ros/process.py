@@ -22,7 +22,7 @@ from types import FrameType
 from typing import Any
 
 from fdi_ros.errors import ConfigError, FdiError
-from fdi_ros.system.installation import BAGS, require
+from fdi_ros.system import BAGS, require
 
 TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""

@@ -30,7 +30,7 @@ from typing import Any
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 from fdi_ros.errors import StudyError
-from fdi_ros.system.installation import require
+from fdi_ros.system import require
 
 Job = tuple[Any, ...]  # arguments of one call; picklable
 Function = Callable[..., Any]

@@ -22,10 +22,10 @@ import pytest
 from bag import logs
 
 from fdi_ros.cli import command_line
-from fdi_ros.cli.outputs import Progress
+from fdi_ros.cli.outputs import progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import FAULT_KINDS
-from fdi_ros.system.installation import shipped_files
+from fdi_ros.system import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -105,6 +105,7 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
     assert (found["start_ns"], found["start"]) == (1750000000000000000, "2025-06-15T15:06:40+00:00")
     assert found["size_bytes"] == sum(path.stat().st_size for path in flight.iterdir())
     assert [topic["messages"] for topic in found["topics"]] == [6001] * 3
+    assert figures("shipped", config.name)["files"] == [str(config)]
     found = figures("geometry", root / "config" / "two_imus.yaml")["smallest_within"]
     (at_rest,) = (one for one in found if one["condition"] == "at rest")
     assert len(at_rest["rad_s"]["imu_1.x"]) == len(at_rest["within_s"])
@@ -174,52 +175,29 @@ def test_a_sound_flight_and_quiet_say_nothing(fdi, replay):
     assert logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
 
 
-COMPLETED = (
-    ("fdi replay --che", "--check"),
-    ("fdi insp", "inspect"),
-    ("fdi replay fli", "flight.mcap"),
-    ("fdi replay x --config my", "my.yaml"),
-    ("fdi geometry my", "my.yaml"),
-    ("fdi fleet fli", "flight.mcap"),
-    ("fdi replay x --detector cu", "cusum"),
-    ("fdi compile --detector seq", "sequential"),
-    ("fdi sweep x --compare li", "likelihood_ratio"),
-)
+COMPLETED = {
+    "fdi replay --che": "--check",
+    "fdi insp": "inspect",
+    "fdi replay fli": "flight.mcap",
+    "fdi replay x --config my": "my.yaml",
+    "fdi geometry my": "my.yaml",
+    "fdi fleet fli": "flight.mcap",
+    "fdi replay x --detector cu": "cusum",
+    "fdi compile --detector seq": "sequential",
+    "fdi sweep x --compare li": "likelihood_ratio",
+}
+AT_EACH_KEY = "COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _shtab_fdi; echo ${COMPREPLY[*]}"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_a_shell_completes_verbs_options_files_and_detectors(capsys, tmp_path, shell):
-    """As typed: at a prompt of its own, with the key."""
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
+def test_bash_completes_verbs_options_files_and_detectors(capsys, tmp_path):
     with pytest.raises(SystemExit, match="0"):
-        command_line.main(["--print-completion", shell])
-    (tmp_path / "_fdi").write_text(capsys.readouterr().out)
-    for name in ("flight.mcap", "my.yaml"):
-        (tmp_path / name).touch()
-    begin = "source ./_fdi" if shell == "bash" else "fpath=($PWD $fpath); autoload -U compinit; compinit -u -D"
-    terminal, other = os.openpty()
-    command = [shell, *(("--norc", "--noprofile") if shell == "bash" else ("-f",)), "-i"]
-    environment = {**os.environ, "PS1": "$ ", "TERM": "dumb", "HISTFILE": "/dev/null", "INPUTRC": "/dev/null"}
-    process = subprocess.Popen(
-        command, stdin=other, stdout=other, stderr=other, cwd=tmp_path, env=environment, start_new_session=True
-    )
-    os.close(other)
-    # What is completed is written to a file by the shell itself, not read from its screen.
-    os.write(terminal, f'{begin}; fdi() {{ echo "fdi $*" >> said; }}\n'.encode())
-    try:
-        for k, (words, _) in enumerate(COMPLETED, 1):
-            os.write(terminal, f"{words}\t\n".encode())
-            end = time.monotonic() + 60
-            while not (said := tmp_path / "said").exists() or len(said.read_text().splitlines()) < k:
-                assert time.monotonic() < end, words
-                time.sleep(0.02)
-    finally:
-        process.kill()
-        process.wait()
-        os.close(terminal)
-    lines = [line.split() for line in said.read_text().splitlines()]
-    assert lines == [[*words.split()[:-1], expected] for words, expected in COMPLETED]
+        command_line.main(["--print-completion", "bash"])
+    for name, text in (("_fdi", capsys.readouterr().out), ("flight.mcap", ""), ("my.yaml", "")):
+        (tmp_path / name).write_text(text)
+    command = ["bash", "-c", f"source ./_fdi; while read -ra COMP_WORDS; do {AT_EACH_KEY}; done"]
+    typed = "".join(f"{words}\n" for words in COMPLETED)
+    done = subprocess.run(command, input=typed, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert done.stdout.splitlines() == list(COMPLETED.values())
 
 
 def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
@@ -285,16 +263,16 @@ def test_compile_leaves_nothing_to_compile(fdi, refused):
 
 NEW_FORMS = """
 import sys
-from fdi_ros.cli import ahead
 from fdi_ros.cli.command_line import main
+from fdi_ros.cli.settings import warm_path, warm_verbs
 from fdi_ros.compiling import compiled
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.monitor.receiver import warm_detector
 
-ahead.warm_path()
+warm_path()
 for name in DETECTORS:
     warm_detector(name)
-ahead.warm_verbs()
+warm_verbs()
 forms = lambda: {(one.py_func.__qualname__, form) for one in compiled._dispatchers for form in one.signatures}
 before = forms()
 for words in eval(sys.argv[1]):
@@ -369,14 +347,8 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ("replay none --config CONFIG", "no recording at none"),
         ("replay empty.mcap --config CONFIG", "empty.mcap is empty"),
         ("replay FLIGHT --config none.yaml", "cannot read config none.yaml: No such file or directory"),
-        (
-            "replay FLIGHT --config THREE",
-            "no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64Mult",
-        ),
-        (
-            "replay FLIGHT --config FIVE",
-            "no usable message on: gyro_channels (6001 malformed, expected 5 values in each",
-        ),
+        ("replay FLIGHT --config THREE", "no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64"),
+        ("replay FLIGHT --config FIVE", "no usable message on: gyro_channels (6001 malformed, expected 5 values in"),
         ("replay FLIGHT --config TYPO", "unknown parameter 'nosie.noise_std', did you mean 'noise.noise_std'"),
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
@@ -387,15 +359,9 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         (f"{REPLAY} --start 9 --end 3", "expected 0 <= start < end"),
         (f"{REPLAY} --start 900", "has no usable message"),
         (f"{REPLAY} --json none/s.json", "there is no folder"),
-        (
-            f"{SIGN} start=2'",
-            "fault sign on g1 starts at 2 s, expected at least 3 s: until then the biases are learned",
-        ),
+        (f"{SIGN} start=2'", "sign on g1 starts at 2 s, expected at least 3 s: until then the biases are learned"),
         (f"{SIGN} start=32.5' --start 30", "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then"),
-        (
-            f"{SIGN} start=9' --end 9",
-            "fault sign on g1 starts at 9 s, expected at most 8.99 s: that is the last sample",
-        ),
+        (f"{SIGN} start=9' --end 9", "sign on g1 starts at 9 s, expected at most 8.99 s: that is the last sample"),
         (f"{REPLAY} --check 'false=0 dlay<1'", "'dlay<1' begins with 'dlay', expected one of"),
         (f"{REPLAY} --check 'delay>1'", "'delay>1' is compared by '>', expected delay<NUMBER"),
         (f"{REPLAY} --check false", "'false' has no bound, expected false<NUMBER or"),
@@ -593,42 +559,36 @@ def test_a_defect_of_ours_is_told_from_a_check_that_is_not_met(fdi, monkeypatch)
     assert f"{command_line.DEFECT} a defect" in command_line.EXIT_CODES
 
 
-def test_shipped_says_where_files_are_in_words_and_as_json(fdi, config):
-    assert fdi("shipped", config.name) == (0, f"{config}\n", "")
-    code, out, err = fdi("shipped", config.name, "--json", "-", "--quiet")
-    assert (code, json.loads(out)["files"], err) == (0, [str(config)], "")
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True
 
 
 def test_a_terminal_sees_a_bar_that_is_wiped_in_the_end():
-    with Progress(stream := Terminal()) as progress:
-        progress.show(0.25)
+    with progress(stream := Terminal(), False) as show:
+        show(0.25)
         time.sleep(0.11)
-        progress.show(0.5)
+        show(0.5)
     assert " 50 %|" in stream.getvalue()
     assert stream.getvalue().endswith(" \r")
     # What has no share done says what it is and for how long.
-    with Progress(timed := Terminal(), what="fitting", timed=True):
+    with progress(timed := Terminal(), False, "fitting", timed=True):
         pass
     assert "fitting, 00:00" in timed.getvalue()
     assert "\n" not in stream.getvalue() + timed.getvalue()
 
 
 def test_where_there_is_no_terminal_a_line_says_now_and_then_how_much_is_done(monkeypatch):
-    with Progress(short := io.StringIO(), timed=True) as progress:
-        progress.show(0.5)
+    with progress(short := io.StringIO(), False, timed=True) as show:
+        show(0.5)
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
-    with Progress(stream := io.StringIO(), what="power") as progress:
-        progress.show(0.25)
+    with progress(stream := io.StringIO(), False, "power") as show:
+        show(0.25)
         while "25%" not in stream.getvalue():
             time.sleep(0.01)
     assert re.search(r"^fdi: power: 25% done, about 0 s left after 0 s$", stream.getvalue(), re.MULTILINE)
     for quiet in (io.StringIO(), Terminal()):
-        with Progress(quiet, quiet=True) as progress:
-            progress.show(0.25)
+        with progress(quiet, True) as show:
+            show(0.25)
             time.sleep(0.1)
         assert quiet.getvalue() == short.getvalue() == ""
