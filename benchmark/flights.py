@@ -33,7 +33,7 @@ from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.faults.fault import fault_from
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.run import Sink, replay
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.starting_config import starting_config_of
 
@@ -121,7 +121,7 @@ class Replayed:
 def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), end: float = np.inf) -> Replayed:
     """Replay a recording, or its beginning."""
     kept = Kept()
-    replay(Request(recorded.path, config, faults, recorded.start, min(end, recorded.end)), [kept])
+    replay(recorded.path, config, faults, recorded.start, min(end, recorded.end), sinks=[kept])
     assert kept.pipeline is not None
     stamp = np.concatenate([output.stamp for output in kept.outputs])
     alone = np.concatenate([faulty(output) for output in kept.outputs])

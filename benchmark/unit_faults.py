@@ -30,7 +30,7 @@ from trials import START, Array, Asked, Flight, Rng, Row, faulty, is_state, ways
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.replay.run import Request, replay
+from fdi_ros.replay.run import replay
 
 LENGTH, ONSET = 120.0, 20.0  # of a flight, and when a fault begins that is not there from the start, s
 COUNTED = ("other", "single", "unit", "in_sets")
@@ -109,7 +109,7 @@ def outputs(config: Config, block: Block, late: Array) -> tuple[list[Output], Pi
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flight"
         write_bag(block, config.topics, path, late)
-        replay(Request(path, config), [kept])
+        replay(path, config, sinks=[kept])
     assert kept.pipeline is not None
     return kept.outputs, kept.pipeline
 

@@ -126,7 +126,8 @@ MEANING: dict[str, dict[str, str]] = {
 }
 """What the settings of each kind of study mean."""
 
-REPLAY = "replay/summary.py"  # module of which the classes are the result of a replay
+REPLAY = {"replay/outcomes.py": ("Outcome", "StateChange", "FaultEffect", "Scores"), "replay/summary.py": ()}
+"""Modules of which these classes, or all, are the result of a replay."""
 SWEEP_MODULE = "replay/sweep_report.py"
 SWEEP: dict[str, tuple[str, dict[str, str]]] = {
     "sweep_figures": (
@@ -227,9 +228,10 @@ def studies() -> str:
 def results() -> str:
     """Fields of the results: of a replay as its classes describe them."""
     parts = ["## What `fdi replay --json` writes"]
-    for name, words, rows in _classes(PACKAGE / REPLAY):
-        if rows:
-            parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
+    for module, wanted in REPLAY.items():
+        for name, words, rows in _classes(PACKAGE / module):
+            if name in wanted or (rows and not wanted):
+                parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
     parts.append("## What `fdi sweep --json` writes")
     given = _keys(PACKAGE / SWEEP_MODULE)
     for function, (title, meaning) in SWEEP.items():
@@ -309,15 +311,18 @@ def _keys(path: Path) -> dict[str, list[str]]:
 
 
 def _classes(path: Path) -> Iterable[tuple[str, str, list[Row]]]:
-    """Classes of a module: name, first line of the docstring, and the fields with what stands below each."""
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+    """Classes of a module: name, first line of the docstring, and the fields with what stands behind or below each."""
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    for node in ast.parse(text).body:
         if not isinstance(node, ast.ClassDef):
             continue
         rows = []
         for field, after in zip(node.body, [*node.body[1:], None], strict=True):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
                 said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-                meaning = str(after.value.value) if said else ""  # type: ignore[union-attr]
+                behind = lines[field.lineno - 1].partition("  # ")[2]
+                meaning = str(after.value.value) if said else behind  # type: ignore[union-attr]
                 rows.append((f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", " ".join(meaning.split())))
         yield node.name, (ast.get_docstring(node) or "").partition("\n")[0], rows
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from fdi_ros.monitor.output import Event as Event
     from fdi_ros.monitor.output import Output as Output
     from fdi_ros.monitor.pipeline import Pipeline as Pipeline
-    from fdi_ros.replay.front import read as read
-    from fdi_ros.replay.front import replay as replay
+    from fdi_ros.replay.run import read as read
+    from fdi_ros.replay.run import replay as replay
 
 __version__ = "0.2.0"
 
@@ -48,7 +48,7 @@ _HOMES = {
     "Output": "fdi_ros.monitor.output",
     "Pipeline": "fdi_ros.monitor.pipeline",
     "create_detector": "fdi_ros.detectors",
-    "read": "fdi_ros.replay.front",
+    "read": "fdi_ros.replay.run",
 }
 __all__ = [*_HOMES, "replay"]
 

@@ -17,7 +17,6 @@ import fdi_ros
 from fdi_ros.bag.samples import joined, read_block
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import time_index
-from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.system.text import html_table, shown
 
@@ -58,7 +57,7 @@ def test_a_recording_is_read_in_blocks(flight, config):
 
 def test_a_replay_says_what_the_verb_says(flight, config, root):
     fault = {"channel": "imu_2.y", "kind": "bias", "size": 0.15, "start": 28}
-    same = run_replay(Request(flight, config, (parse_fault(FAULT),), end=31.0)).scores
+    same = run_replay(flight, config, (parse_fault(FAULT),), end=31.0).scores
     assert same.isolated == 1
     # A module of it has been imported, and it is a function all the same.
     assert "fdi_ros.replay.run" in sys.modules

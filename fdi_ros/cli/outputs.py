@@ -23,7 +23,7 @@ from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.report.verdict import Severity, with_first_line_coloured
+from fdi_ros.report.layout import Severity, with_first_line_coloured
 from fdi_ros.system.files import STANDARD_OUTPUT, is_open_already, is_stream, open_regular, real_path, whole, write_json
 from fdi_ros.system.text import LINE, shown, visible
 

@@ -18,17 +18,16 @@ from fdi_ros.cli.settings import compile_for_workers
 from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import BagError, ConfigError, FdiError
-from fdi_ros.faults.fault import load_scenario, parse_fault
+from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.mavlink.failover import failover_text
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import build_geometry
-from fdi_ros.replay.check import failures, parse_check
-from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
+from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
-from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary, as_json
-from fdi_ros.replay.words import sample_rate_notes, summary_text, verdict
+from fdi_ros.replay.words import failures, parse_check, sample_rate_notes, summary_text, verdict
 from fdi_ros.report.layout import unit_of
 from fdi_ros.setup.findings import refuse_degrees
 from fdi_ros.setup.starting_config import assumed_config
@@ -42,24 +41,29 @@ if TYPE_CHECKING:
 
 def run_replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
-    request, assumed = _request(arguments)
-    geometry = build_geometry(request.config)
-    required = [] if arguments.check is None else parse_check(arguments.check, len(request.faults), geometry)
+    config, assumed = (Config.from_file(arguments.config), "") if arguments.config else assumed_config(arguments.bag)
+    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
+    faults = [parse_fault(text) for text in arguments.fault]
+    faults += [] if arguments.scenario is None else load_scenario(arguments.scenario)
+    check_part(arguments)
+    geometry = build_geometry(config)
+    required = [] if arguments.check is None else parse_check(arguments.check, len(faults), geometry.channel_names)
     sources = [arguments.bag, *arguments.config, arguments.scenario]
     outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
-    refuse_degrees(arguments.bag, request.config)
+    refuse_degrees(arguments.bag, config)
     unit = unit_of(arguments.degrees)
-    report = Report(geometry, request.config.sample_rate, unit) if arguments.report is not None else None
+    report = Report(geometry, config.sample_rate, unit) if arguments.report is not None else None
     with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
-        sinks = _sinks(arguments, request, geometry, stack)
-        summary = replay(request, [*sinks, report] if report else sinks, show)
+        sinks = [*_sinks(arguments, config, geometry, stack), *([report] if report else [])]
+        part = (arguments.start, arguments.end)
+        summary = replay(arguments.bag, config, faults, *part, sinks=sinks, progress=show)
         found = verdict(summary, unit)
         figures = {**as_json(summary), "verdict": {"severity": found.severity.value, "words": verdict(summary).words}}
         unmet = failures(required, summary)
         if arguments.check is not None:
             figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
         if report:
-            page = report.html(summary, _about_replay(arguments, request, assumed))
+            page = report.html(summary, _about_replay(arguments, config, faults, assumed))
             stack.enter_context(whole(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
@@ -72,7 +76,7 @@ def run_replay(arguments: Namespace) -> int:
     if arguments.check is not None:
         return _say_check(arguments, outputs, summary, unmet)
     # Who injects faults tries the monitor: what it then finds is no news of the gyros.
-    return 0 if request.faults else code
+    return 0 if faults else code
 
 
 def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
@@ -87,22 +91,7 @@ def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: 
     return 1 if unmet else 0
 
 
-def _request(arguments: Namespace) -> tuple[Request, str]:
-    """Return what to replay; and what was assumed, where no settings were given."""
-    if arguments.config:
-        config, assumed = Config.from_file(arguments.config), ""
-    else:
-        config, assumed = assumed_config(arguments.bag)
-    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
-    faults = tuple(parse_fault(text) for text in arguments.fault)
-    if arguments.scenario is not None:
-        faults += load_scenario(arguments.scenario)
-    check_part(arguments)
-    period = DIAGNOSTICS_PERIOD if arguments.output else 0
-    return Request(arguments.bag, config, faults, arguments.start, arguments.end, period=period), assumed
-
-
-def _sinks(arguments: Namespace, request: Request, geometry: Geometry, stack: ExitStack) -> list[Sink]:
+def _sinks(arguments: Namespace, config: Config, geometry: Geometry, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
     sinks: list[Sink] = []
     if arguments.csv is not None:
@@ -110,7 +99,7 @@ def _sinks(arguments: Namespace, request: Request, geometry: Geometry, stack: Ex
         sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
     if arguments.output is not None:
         path = stack.enter_context(whole(arguments.output))
-        sinks.append(stack.enter_context(OutputBag(path, request.config, geometry.n)))
+        sinks.append(stack.enter_context(OutputBag(path, config, geometry.n)))
     return sinks
 
 
@@ -121,13 +110,13 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about_replay(arguments: Namespace, request: Request, assumed: str) -> dict[str, str]:
+def _about_replay(arguments: Namespace, config: Config, faults: Sequence[Fault], assumed: str) -> dict[str, str]:
     """Say what was run, for the report."""
-    changed = "; ".join(f"{name}: {_written(value)}" for name, value in request.config.changed.items())
+    changed = "; ".join(f"{name}: {_written(value)}" for name, value in config.changed.items())
     more = {
-        "detector": request.config.detector.name,
-        "faults": "; ".join(map(str, request.faults)) or "none",
-        "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
+        "detector": config.detector.name,
+        "faults": "; ".join(map(str, faults)) or "none",
+        "seeds": ", ".join(str(fault.seed) for fault in faults) or "none needed",
         "settings other than the default": changed,
     }
     return about(arguments, config_words(arguments) or f"none; assumed: {assumed}", more)

@@ -28,13 +28,7 @@ from fdi_ros.system.yaml_file import read_yaml
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault, validated.
-
-    Raises
-    ------
-    FaultError
-        If a value is out of range.
-    """
+    """One fault; `FaultError` if a value is out of range."""
 
     channel: str
     """A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas."""
@@ -47,8 +41,8 @@ class Fault:
     def __post_init__(self) -> None:
         check_fields(self, f"fault {self.kind.name}")
         if not self.stop > self.start:
-            words = f"stop is {self.stop:g} s, expected more than start {self.start:g} s"
-            raise FaultError(f"fault {self.kind.name}: {words}")
+            expected = f"expected more than start {self.start:g} s"
+            raise FaultError(f"fault {self.kind.name}: stop is {self.stop:g} s, {expected}")
 
     @property
     def size(self) -> float | None:
@@ -70,25 +64,19 @@ class Fault:
 
     def __str__(self) -> str:
         words = [f"channel={self.channel}", f"kind={self.kind.name}", f"start={self.start:.12g}"]
-        if self.stop != math.inf:
-            words.append(f"stop={self.stop:.12g}")
-        if self.seed:
-            words.append(f"seed={self.seed}")
+        words += [] if self.stop == math.inf else [f"stop={self.stop:.12g}"]
+        words += [f"seed={self.seed}"] if self.seed else []
         options = {name: getattr(self.kind, name) for name in self.kind.options()}
         return " ".join(words + [f"{name}={value:.12g}" for name, value in options.items() if value is not None])
 
 
-_KEYS = ("channel", "kind", "start", "stop", "seed")
-"""What every fault may be given, besides the options of its kind."""
+_KEYS = ("channel", "kind", "start", "stop", "seed")  # what every fault may be given, besides the options of its kind
 
 
 def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
     """Build a kind of fault by its name in `FAULT_KINDS`, with its options; None is the same as not given.
 
-    Raises
-    ------
-    FaultError
-        If there is no such kind, or an option is missing, out of range or not taken by it.
+    `FaultError` if there is no such kind, or an option is missing, out of range or not taken by it.
     """
     if name not in FAULT_KINDS:
         raise FaultError(f"unknown fault kind {name!r}, expected one of: {', '.join(FAULT_KINDS)}")
@@ -103,10 +91,7 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
 def fault_from(items: Mapping[str, Any]) -> Fault:
     """Build a fault from names and values, as a scenario file or the command line gives them.
 
-    Raises
-    ------
-    FaultError
-        If a name is unknown or a value does not fit.
+    `FaultError` if a name is unknown or a value does not fit.
     """
     for name in ("channel", "kind"):
         if not isinstance(items.get(name), str) or not items[name]:
@@ -138,10 +123,7 @@ def key_values(text: str) -> dict[str, str]:
 def load_scenario(path: str | Path) -> tuple[Fault, ...]:
     """Read the faults of a scenario file: a mapping with a list ``faults``.
 
-    Raises
-    ------
-    FaultError
-        If the file is missing, is no scenario, or a fault in it is wrong.
+    `FaultError` if the file is missing, is no scenario, or a fault in it is wrong.
     """
     document = read_yaml(path, "scenario", FaultError)
     entries = document.get("faults") if isinstance(document, dict) else None
@@ -164,16 +146,11 @@ class Injector:
     Parameters
     ----------
     faults
-        What to inject; several on one channel act one after the other.
+        What to inject; several on one channel act one after the other. `FaultError` if there is no such channel.
     channel_names
         Names of the n channels of the stream.
     start_stamp
         Stamp that the times of the faults count from, ns; None: that of the first sample.
-
-    Raises
-    ------
-    FaultError
-        If a fault strikes a channel that is not there.
     """
 
     def __init__(self, faults: Sequence[Fault], channel_names: Sequence[str], start_stamp: int | None = None) -> None:
@@ -220,9 +197,7 @@ class Injector:
             return block
         if self.start_stamp is None:
             self.start_stamp = int(block.stamp[0])
-        time = self.time(block.stamp)
-        active = self.active(block.stamp)
-        z = block.z.copy()
+        time, active, z = self.time(block.stamp), self.active(block.stamp), block.z.copy()
         received = np.ones(z.shape, dtype=bool) if block.received is None else block.received.copy()
         for k, fault in enumerate(self.faults):
             index = list(self.channels[k])

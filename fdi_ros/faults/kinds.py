@@ -56,13 +56,7 @@ FAULT_KINDS: dict[str, type[FaultKind]] = {}
 
 
 class FaultKind(ABC):
-    """One kind of fault with its options, validated; a frozen dataclass.
-
-    Raises
-    ------
-    FaultError
-        If an option is missing or out of range.
-    """
+    """One kind of fault with its options, a frozen dataclass; `FaultError` if one is missing or out of range."""
 
     name: ClassVar[str]
     study_size: ClassVar[float | None] = None
@@ -77,8 +71,7 @@ class FaultKind(ABC):
     def __post_init__(self) -> None:
         check_fields(self, f"fault {self.name}")
         if getattr(self, "size", None) == 0 and self.has_signed_size():
-            unit = self.options()["size"].unit_suffix
-            raise FaultError(f"fault {self.name}: size is 0{unit}, which changes nothing")
+            raise FaultError(f"fault {self.name}: size is 0{self.options()['size'].unit_suffix}, which changes nothing")
 
     @classmethod
     def options(cls) -> dict[str, Field]:

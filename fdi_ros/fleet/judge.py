@@ -30,10 +30,10 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
-from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary
 from fdi_ros.replay.words import sample_rate_notes, verdict
-from fdi_ros.report.verdict import Severity
+from fdi_ros.report.layout import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
@@ -193,7 +193,7 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
     seen = _Seen(config.sample_rate)
-    summary = replay(Request(path, config), [seen])
+    summary = replay(path, config, sinks=[seen])
     if seen.first is None:
         raise BagError("its topics have no time in common: there is no sample of all channels")
     row = _row(replace(flight, date=_date(seen.first), noise=seen.noise), summary)

@@ -25,8 +25,7 @@ import pyarrow.parquet as parquet
 
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
-from fdi_ros.report.layout import Column, Section, figures_of, html_table, number, page, told
-from fdi_ros.report.verdict import Severity, Verdict
+from fdi_ros.report.layout import Column, Section, Severity, Verdict, figures_of, html_table, number, page, told
 from fdi_ros.system.files import open_regular, plain, whole, write_text
 from fdi_ros.system.text import shown, storable
 

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording through the pipeline: run, evaluated, checked, written, reported. Called, it replays: `front.replay`."""
+"""A recording through the pipeline: run, evaluated, checked, written, reported. Called, it replays: `run.replay`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class _Callable(ModuleType):
     """Package that can be called: ``fdi_ros.replay`` is a verb, too."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Replay a recording; arguments as of `fdi_ros.replay.front.replay`, whose docstring explains them."""
-        from fdi_ros.replay.front import replay
+        """Replay a recording; arguments as of `fdi_ros.replay.run.replay`, whose docstring explains them."""
+        from fdi_ros.replay.run import replay
 
         return replay(*arguments, **named)
 

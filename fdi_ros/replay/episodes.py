@@ -9,37 +9,20 @@ operator does between two flights. Biases stay: the sensors are the same, and a 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.model.samples import Block
-from fdi_ros.replay.size import Size
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""
 HOLE = 1.0  # a fault is not injected where samples are missing for longer than this while it is watched, s
-
-
-class Stretches:
-    """Cuts the blocks of a stream where a new stretch begins."""
-
-    def __init__(self) -> None:
-        self._last: int | None = None
-
-    def cut(self, block: Block) -> Iterator[tuple[bool, Block]]:
-        """Yield the parts of the next block, and of each whether a new stretch begins with it; never the first."""
-        if not len(block):
-            yield False, block
-        for rows in pieces(block.stamp, GAP):
-            anew = self._last is not None and int(block.stamp[rows.start]) - self._last > GAP * 1e9
-            self._last = int(block.stamp[rows.stop - 1])
-            yield anew, block[rows]
 
 
 def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
@@ -50,6 +33,22 @@ def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
 
 DECLARED = ("FAULTY", "AMBIGUOUS")
 """States of an episode in which a fault was declared; in one that is STALE channels gave nothing."""
+Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
+
+
+@dataclass(frozen=True)
+class Size:
+    """The error of one channel while it stood declared, if it alone was wrong."""
+
+    rad_s: float  # with its sign; of what varies or is noise, root mean square
+    std_rad_s: float  # standard error of that: by chance, and by the scale factors and biases that are not known
+    course: Course
+    """steady; growing, shrinking (then the size is that at the declaration); varying; noisy; proportional to the rate
+    along the axis; gone before the end."""
+    last_rad_s: float  # in the last batch
+    slope_rad_s2: float | None = None  # of what grows or shrinks
+    share_of_rate: float | None = None  # of what is proportional to the rate: an error of the scale factor
+    gone_s: float | None = None  # since when it has stayed away, s from the first message
 
 
 @dataclass(frozen=True)
@@ -306,24 +305,15 @@ def _rate(one: Episode, unit: Unit) -> str:
     return ", ".join([*words, level or "no protection level at times"])
 
 
-def story_lines(story: Story, episodes: Sequence[Episode], unit: Unit = RADIANS) -> list[str]:
-    """Tell of the first episodes in a sentence each, of several stretches with the number of each."""
-    several = len(story.stretches) > 1
-    told = episodes[:MOST_TOLD]
-    lines = [f"{f'stretch {one.stretch}: ' if several else ''}{episode_words(one, unit)}." for one in told]
-    more = len(episodes) - len(told) + story.more
-    return [*lines, f"And {more} more episode{'s' if more > 1 else ''}."] if more else lines
-
-
 def stretch_words(story: Story) -> list[str]:
     """Tell of the stretches where there are several: each is judged for itself."""
     if len(story.stretches) < 2:
         return []
     lines = []
     for number, one in enumerate(story.stretches, 1):
-        own = [episode for episode in story.declared if episode.stretch == number]
+        own = sum(episode.stretch == number for episode in story.declared)
         share = f"{100 * one.judged / max(1, one.samples):.3g} % judged"
-        count = f"{len(own)} episode{'s' if len(own) != 1 else ''}" if own else "nothing declared"
+        count = f"{own} episode{'s' if own != 1 else ''}" if own else "nothing declared"
         lines.append(f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}")
     return lines
 

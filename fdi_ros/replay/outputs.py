@@ -105,7 +105,6 @@ class InputWatch:
 
 
 NODE = "/fdi_node"  # what ``~`` stands for: the node as it is called by default, in no namespace
-DIAGNOSTICS_PERIOD = 1_000_000_000  # ns
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -116,6 +115,7 @@ class OutputBag(Sink):
     """
 
     stops_at_events = True
+    period = 1_000_000_000  # of the regular diagnostics, ns
 
     def __init__(self, path: Path, config: Config, channels: int) -> None:
         self._config = config

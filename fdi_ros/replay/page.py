@@ -13,12 +13,13 @@ import numpy as np
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.decision import ChannelState
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.samples import Array, Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode, Story, detail_words, episode_words, stretch_words
+from fdi_ros.replay.outcomes import Outcome, StateChange
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import AutopilotText, Outcome, StateChange, Summary
+from fdi_ros.replay.summary import AutopilotText, Summary
 from fdi_ros.replay.words import fault_sections, notes, sentences, verdict
 from fdi_ros.report.layout import (
     FINE,
@@ -68,7 +69,7 @@ class Report(Sink):
         self._store = PageStore({**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)})
         self._first_states: list[str] = []
         self._spectrum = Spectrum(self.names, rate) if there("scipy") else None
-        self._peak = {"statistic": 0.0, "threshold": 0.0}
+        self._peaks = np.zeros(2)  # of statistic and threshold
         self._origin: int | None = None  # stamp that times count from, ns
         self._last = 0.0
 
@@ -80,46 +81,40 @@ class Report(Sink):
         """Break the curves: nothing is recorded between the last sample and the next."""
         if self._spectrum:
             self._spectrum.begin_stretch()
-        self._store.add(np.array([self._last]), [np.full((1, len(self._store.kinds)), np.nan)])
+        self._store.add(np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan))
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Take the next samples."""
-        self.add_output(np.asarray((output.stamp - (self._origin or 0)) * 1e-9), output)
-
-    def add_output(self, time: Array, output: Output) -> None:
-        """Take in the next samples; time (N,) s from the first message."""
+        """Take in the next samples."""
         if not len(output):
             return
+        time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         if not self._first_states:
             self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
-        rates = [output.rate, deviation, output.level, output.residual]
-        columns = [output.statistic, output.threshold, *(values * self._unit.factor for values in rates)]
+        rates = np.column_stack([output.rate, deviation, output.level, output.residual]) * self._unit.factor
+        columns = np.column_stack([output.statistic, output.threshold, rates])
         # Curves also break where samples are missing for a while within a stretch.
         holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
             if k:
                 self.begin_stretch()
             if len(part):
-                self._store.add(time[part], [column[part] for column in columns])
+                self._store.add(time[part], columns[part])
                 self._last = float(time[part[-1]])
             if self._spectrum:
                 self._spectrum.add(output.residual[part])
-        for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
-            self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
+        judged = columns[:, :2]
+        self._peaks = np.maximum(self._peaks, judged.max(axis=0, initial=0.0, where=np.isfinite(judged)))
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
         scores, story, unit = summary.scores, summary.story, self._unit
-        common = {
-            "shapes": _shades(summary),
-            "marks": _marks(scores.faults, story.episodes),
-        }
+        common = {"shapes": _shades(summary), "marks": _marks(scores.faults, story.episodes)}
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
-        states = _timeline(self.names, self._first_states, summary)
         said = _autopilot_marks(summary)
         # Words are read best where little else is.
-        states["layout"] |= {**common, "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)]}
+        quiet = {**common, "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)]}
+        states = _timeline(self.names, self._first_states, summary, quiet)
         statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
         stretches = stretch_words(story)
         spectrum = self._spectrum and self._spectrum.section(unit)
@@ -162,19 +157,17 @@ class Report(Sink):
         words = (
             "Drag across a plot to zoom all plots in time, double-click to see everything; arrow keys move the cursor."
         )
-        if self._store.width > 1:
-            words += (
-                f" A long recording: of every {self._store.width} samples the smallest and the largest value are drawn;"
-                " close up, the lines between them are no course of time."
-            )
-        return words
+        if self._store.width == 1:
+            return words
+        return (
+            f"{words} A long recording: of every {self._store.width} samples the smallest and the largest value are"
+            " drawn; close up, the lines between them are no course of time."
+        )
 
     def _statistic(self, layout: Mapping[str, Any]) -> Figure:
-        log = self._peak["statistic"] > LOG_FROM * self._peak["threshold"] > 0
-        lines = [
-            _line("statistic", "statistic", _INK, 1.2),
-            _line("threshold", "threshold", "#e0662f", 1.8, dash="dash"),
-        ]
+        log = self._peaks[0] > LOG_FROM * self._peaks[1] > 0
+        threshold = _line("threshold", "threshold", "#e0662f", 1.8, dash="dash")
+        lines = [_line("statistic", "statistic", _INK, 1.2), threshold]
         figure = _plot(lines, 240, "statistic, and threshold", True, layout)
         figure["layout"]["yaxis"]["type"] = "log" if log else "linear"
         return figure
@@ -220,7 +213,7 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
 
 
 def _episode_section(story: Story, scored: bool, unit: Unit, origin: int | None) -> Section:
-    """Lay out the episodes, a card each, with a link to the time in the plots."""
+    """Lay out the episodes, a card each: its sentence, a link to its time in the plots, what else is known of it."""
     if not story.episodes:
         return Section("What happened", "", ["Nothing was declared, and no channel fell silent."])
     more = max(0, len(story.episodes) - MOST_CARDS) + story.more
@@ -233,7 +226,6 @@ def _episode_section(story: Story, scored: bool, unit: Unit, origin: int | None)
 
 
 def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
-    """Lay out an episode: its sentence, when, and what else is known of it."""
     room = max(SHOWN_AROUND, 0.2 * one.duration_s)
     low, high = max(0.0, one.start_s - room), one.end_s + room
     link = f'<a href="#t={low:.3f},{high:.3f}">show it</a>'
@@ -263,13 +255,12 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
 
 def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
     levels = summary.monitor.protection_level
-    titled = {"at end": levels.at_end, "after one more loss": levels.after_one_more_loss}
-
-    def say(values: Sequence[float | None]) -> str:
+    found = {}
+    for when, values in {"at end": levels.at_end, "after one more loss": levels.after_one_more_loss}.items():
         words = ("none" if value is None else f"{value * unit.factor:.4g}" for value in values)
-        return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + f" {unit.name}"
-
-    return {f"protection level {when}": say(values) for when, values in titled.items()}
+        axes = " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True))
+        found[f"protection level {when}"] = f"{axes} {unit.name}"
+    return found
 
 
 def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:
@@ -303,10 +294,10 @@ GAPS_HINT = "Grey: gaps; each stretch between them is judged for itself."
 SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
-def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary) -> Figure:
+def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more: Mapping[str, Any]) -> Figure:
     """Draw the states of the channels, a row each; first: those with the first sample, empty: none came."""
     scores, holes = summary.scores, summary.story.gaps
-    begin, end = scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
+    begin, end = scores.start_s, max(scores.end_s, scores.start_s + 1e-9)
     current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
     spans: dict[str, dict[str, list[Any]]] = {}
 
@@ -314,9 +305,10 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary) -> F
         state, since, reason = current[name]
         into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
         for low, high in _recorded(since, max(until, since), holes):
-            words = f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s"
-            for values, value in zip(into.values(), (names.index(name), low, high, words), strict=True):
-                values.append(value)
+            into["row"].append(names.index(name))
+            into["from"].append(low)
+            into["to"].append(high)
+            into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
 
     changes = [event for event in scores.events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
@@ -331,6 +323,7 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary) -> F
     ]
     layout = time_layout(36 + 24 * len(names), rows=list(names), title="States")
     layout["xaxis"]["range"] = [begin, end]
+    layout |= more
     return {"data": data, "layout": layout}
 
 

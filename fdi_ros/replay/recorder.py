@@ -14,7 +14,8 @@ if the others are well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -30,16 +31,17 @@ from fdi_ros.replay.episodes import (
     HOLE,
     Apart,
     Candidate,
+    Course,
     Episode,
     Evidence,
     RateMeanwhile,
+    Size,
     Step,
     Story,
     Stretch,
     episode_words,
 )
-from fdi_ros.replay.outcomes import finite
-from fdi_ros.replay.size import CERTAIN, Batches
+from fdi_ros.replay.outcomes import SQUARED, finite
 
 Told = NDArray[np.uint8]  # states, of which those that say nothing are OK
 ReasonOf = Callable[[set[int]], str]
@@ -68,8 +70,8 @@ class _Open:
     std_before: float
     after_hole: bool
     steps: list[Step] = field(default_factory=list)
-    batches: dict[int, Batches] = field(default_factory=dict)
-    pairs: dict[tuple[int, int], Batches] = field(default_factory=dict)
+    batches: dict[tuple[int, ...], Batches] = field(default_factory=dict)
+    """Errors of single channels, and by how much the pairs of one axis differ."""
     ratio: float = float("nan")
     alarms: int = 0
     last_alarm: float | None = None
@@ -121,9 +123,7 @@ class Recorder:
         before = np.vstack([self._before, told[:-1]])
         self._add_to_stretch(time, output, before)
         changes = np.flatnonzero((told != before).any(axis=1)).tolist()
-        # Where nothing changes, the last samples are enough.
-        first = 0 if changes else max(0, int(np.searchsorted(time, time[-1] - TOGETHER)) - 1)
-        self._tail = np.vstack([self._tail, np.column_stack([time[first:], _stds(output, slice(first, None))])])
+        self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
         changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
         reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
         for begin, end in pairwise(edges):
@@ -189,12 +189,18 @@ class Recorder:
             self._follow_set(one, now, new, at, reason_of)
         taken = set().union(*(one.members for one in self._open if one.kind == S.FAULTY and one.since == at))
         for group in self._by_unit(new[S.FAULTY] - taken):
-            self._open.append(self._opened(S.FAULTY, group, at, reason_of(group), std))
+            self._begin(S.FAULTY, group, at, reason_of(group), std)
         if new[S.AMBIGUOUS] and not any(one.kind == S.AMBIGUOUS for one in self._open):
-            self._open.append(self._opened(S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std))
+            self._begin(S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std)
         hidden = set().union(*(one.members for one in self._open if one.kind != S.STALE))
         for group in self._by_unit(new[S.STALE] - hidden):
-            self._silent(group, at, reason_of(group), std)
+            # Channels that fall silent right after others of their unit are one episode with them.
+            unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
+            silent = [one for one in self._open if one.kind == S.STALE and one.members <= unit]
+            if lately := [one for one in silent if at - one.start <= TOGETHER]:
+                self._step(lately[0], lately[0].members | group, lately[0].since)
+            else:
+                self._begin(S.STALE, group, at, reason_of(group), std)
         ended = [one for one in self._open if self._is_over(one, now)]
         self._open = [one for one in self._open if one not in ended]
         self._episodes_ended(ended, at)
@@ -230,19 +236,10 @@ class Recorder:
             one.reason = reason_of(named) or one.reason
         self._step(one, members, at)
 
-    def _silent(self, group: set[int], at: float, reason: str, std: float) -> None:
-        """Open an episode of channels that give nothing, or add them to that of their unit."""
-        unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
-        for one in self._open:
-            if one.kind == S.STALE and one.members <= unit and at - one.start <= TOGETHER:
-                self._step(one, one.members | group, one.since)
-                return
-        self._open.append(self._opened(S.STALE, group, at, reason, std))
-
-    def _opened(self, kind: ChannelState, members: set[int], at: float, reason: str, std: float) -> _Open:
-        one = _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
-        self._step(one, members, at)
-        return one
+    def _begin(self, kind: ChannelState, members: set[int], at: float, reason: str, std: float) -> None:
+        """Open an episode."""
+        self._open.append(_Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER))
+        self._step(self._open[-1], members, at)
 
     def _step(self, one: _Open, members: set[int], at: float) -> None:
         """Note who it is from now on."""
@@ -254,8 +251,7 @@ class Recorder:
         if one.steps and (one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS):
             one.steps.pop()
         one.steps.append(step)
-        one.batches = {i: one.batches[i] for i in channels if i in one.batches}
-        one.pairs = {pair: batches for pair, batches in one.pairs.items() if members.issuperset(pair)}
+        one.batches = {key: batches for key, batches in one.batches.items() if members.issuperset(key)}
 
     def _by_unit(self, channels: set[int]) -> list[set[int]]:
         """Channels that change together: those of one unit are one, others each for itself."""
@@ -292,51 +288,52 @@ class Recorder:
 
     def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
         """Add the errors that the channels of an episode have by the others."""
-        geometry, residual = self._geometry, output.residual[rows]
+        axes, residual = self._geometry.axes, output.residual[rows]
+
+        def add(key: tuple[int, ...], gain: Array, error: Array) -> None:
+            if key not in one.batches:
+                noise, scale, bias = np.sqrt((gain**2 * self._stds**2).sum(axis=1)).tolist()
+                one.batches[key] = Batches(float(time[0]), noise, scale, bias)
+            one.batches[key].add(time, error, output.rate[rows] @ axes[key[0]])
+
         trusted = ~np.isin(told, (S.FAULTY, S.STALE, S.EXCLUDED))
         for i in sorted(one.members):
-            gain = self._gain(trusted, i)
-            if gain is None:
-                continue
-            used = np.flatnonzero(gain)
-            error = residual[:, used] @ gain[used]
-            rate = output.rate[rows] @ geometry.axes[i]
-            if i not in one.batches:
-                one.batches[i] = self._batches(float(time[0]), gain)
-            one.batches[i].add(time, error, rate)
+            if (gain := self._gain(trusted, i)) is not None:
+                used = np.flatnonzero(gain)
+                add((i,), gain, residual[:, used] @ gain[used])
         for a, b in self._pairs if one.kind == S.AMBIGUOUS else ():
             if {a, b} <= one.members:
-                if (a, b) not in one.pairs:
-                    both = np.zeros(geometry.n)
-                    both[[a, b]] = 1.0
-                    one.pairs[a, b] = self._batches(float(time[0]), both)
-                scale = float(geometry.axes[a] @ geometry.axes[b]) / float(geometry.axes[b] @ geometry.axes[b])
-                rate = output.rate[rows] @ geometry.axes[a]
-                one.pairs[a, b].add(time, residual[:, a] - scale * residual[:, b], rate)
+                both = np.isin(np.arange(len(axes)), (a, b)).astype(np.float64)
+                scale = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
+                add((a, b), both, residual[:, a] - scale * residual[:, b])
 
     def _apart(self, one: _Open) -> Apart | None:
         """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
-        sizes = {pair: size for pair, batches in one.pairs.items() if (size := batches.size(one.since)) is not None}
-        pair = max(sizes, key=lambda pair: abs(sizes[pair].rad_s) / (sizes[pair].std_rad_s or np.inf), default=None)
-        if one.kind != S.AMBIGUOUS or pair is None:
+        if one.kind != S.AMBIGUOUS:
             return None
-        size = sizes[pair]
+        pairs = {key: batches.size(one.since) for key, batches in one.batches.items() if len(key) > 1}
+        sizes = {pair: size for pair, size in pairs.items() if size is not None}
+        if not sizes:
+            return None
+        pair, size = max(sizes.items(), key=lambda item: abs(item[1].rad_s) / (item[1].std_rad_s or np.inf))
         if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
             return None
         names = tuple(self._geometry.channel_names[i] for i in pair)
         return Apart(names, one_of_words(self._geometry, pair), size)
 
-    def _batches(self, begin: float, gain: Array) -> Batches:
-        """For an error made of the channels with these gains (n,)."""
-        noise, scale, bias = np.sqrt((gain**2 * self._stds**2).sum(axis=1)).tolist()
-        return Batches(begin, noise, scale, bias)
-
     def _gain(self, trusted: NDArray[np.bool_], i: int) -> Array | None:
         """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
         key = trusted.tobytes(), i
         if key not in self._gains:
+            axes = self._geometry.axes
             others = [k for k in np.flatnonzero(trusted).tolist() if k != i]
-            self._gains[key] = error_gain(self._geometry.axes, i, others)
+            gain = None
+            if spans_space(axes[others]):
+                gain = np.zeros(len(axes))
+                gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
+                gain[np.abs(gain) < 1e-9] = 0.0
+                gain[i] = 1.0
+            self._gains[key] = gain
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
@@ -354,10 +351,8 @@ class Recorder:
         if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
             return None
         geometry, names = self._geometry, self._geometry.channel_names
-        candidates = [
-            Candidate(names[i], axis_words(geometry, i), one.batches[i].size(one.since) if i in one.batches else None)
-            for i in sorted(one.members)
-        ]
+        sizes = {i: one.batches[i,].size(one.since) for i in one.members if (i,) in one.batches}
+        candidates = [Candidate(names[i], axis_words(geometry, i), sizes.get(i)) for i in sorted(one.members)]
         episode = Episode(
             stretch=len(self._stretches) + 1,
             state=one.kind.name,
@@ -381,19 +376,128 @@ class Recorder:
         return replace(episode, words=episode_words(episode))
 
 
-def error_gain(axes: Array, i: int, others: Sequence[int]) -> Array | None:
-    """Row (n,) that makes what a channel is off by, by some others, of the values of all; None: these do not tell."""
-    if not spans_space(axes[others]):
-        return None
-    gain = np.zeros(len(axes))
-    gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
-    gain[np.abs(gain) < 1e-9] = 0.0
-    gain[i] = 1.0
-    return gain
-
-
-def _stds(output: Output, rows: slice) -> Array:
-    """Root of the trace of the covariance of some samples, rad/s; NaN: no rate."""
+def _stds(output: Output) -> Array:
+    """Root of the trace of the covariance (N,), rad/s; NaN: no rate."""
     with np.errstate(invalid="ignore"):
-        stds = np.sqrt(output.rows["covariance"][rows][:, _DIAGONAL].sum(axis=1))
-    return np.where(output.valid[rows], stds, np.nan)
+        stds = np.sqrt(output.rows["covariance"][:, _DIAGONAL].sum(axis=1))
+    return np.where(output.valid, stds, np.nan)
+
+
+# The size of an error, and what it did over time: memory does not grow ------------------------------------------------
+
+
+MOST = 512  # batches kept; when there would be more, neighbours are put together
+FIRST_WIDTH = 0.1  # of a batch, s
+LONGER = 12
+"""Batches that the standard error is taken from, put together of those kept: an error hangs together for less."""
+FEW = 4  # batches from which on their scatter says something
+CERTAIN = 4.0  # a trend is one from so many of its standard errors on
+TREND = 0.3  # and from a change of such a share of the size on
+PASSED = 0.25  # an error has passed when it stays below such a share of what it was
+LASTING = 1.0  # time over which the size at the declaration is taken, and for which an error must have stayed away, s
+ROUNDING = 1e-12  # share of a mean square that is rounding
+SMALL = 0.5  # a mean below such a share of the scatter is not what the error is
+LOUD = 3.0  # an error is noise where it scatters so many times as much as the channel's noise lets it
+
+
+class Batches:
+    """Means of an error over batches of time, from ``begin`` on, s.
+
+    ``noise``: standard deviation that it alone gives the error in one sample, rad/s. ``scale``, ``bias``: standard
+    deviation of what unknown scale factors make of the rate, as a share of it, and of unknown biases, rad/s.
+    """
+
+    def __init__(self, begin: float, noise: float, scale: float = 0.0, bias: float = 0.0) -> None:
+        self._begin, self._noise, self._scale, self._bias = begin, noise, scale, bias
+        self._width = FIRST_WIDTH
+        # Of each batch: samples, sum, sum of squares.
+        self._sums = np.zeros((3, MOST))
+        self._with_rate = np.zeros(2)  # sum of error times rate, and of the squared rate
+
+    def add(self, time: Array, error: Array, rate: Array) -> None:
+        """Take in samples (N,): time, s; error and rate along the axis, rad/s; what is not finite does not count."""
+        known = np.isfinite(error) & (np.abs(error) < SQUARED)
+        time, error, rate = time[known], error[known], np.nan_to_num(rate[known])
+        if not len(time):
+            return
+        while time[-1] - self._begin >= MOST * self._width:
+            self._sums = np.hstack([self._sums.reshape(3, -1, 2).sum(axis=2), np.zeros((3, MOST // 2))])
+            self._width *= 2
+        number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
+        number = np.minimum(number, MOST - 1)
+        for k, values in enumerate((None, error, error**2)):
+            self._sums[k] += np.bincount(number, values, MOST)
+        self._with_rate += float(error @ rate), float(rate @ rate)
+
+    def size(self, declared: float) -> Size | None:
+        """Sum up; declared: time of the declaration, s. None: no sample was known."""
+        count, total, square = self._sums
+        used = np.flatnonzero(count)
+        if not len(used):
+            return None
+        mean: Array = np.asarray(total[used] / count[used], dtype=np.float64)
+        middle: Array = np.asarray(self._begin + (used + 0.5) * self._width, dtype=np.float64)
+        samples, whole = float(count.sum()), float(total.sum() / count.sum())
+        mean_square = float(square.sum() / samples)
+        scatter = mean_square - whole**2
+        scatter = scatter if scatter > ROUNDING * mean_square else 0.0
+        lasting = math.hypot(self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias)
+        std = math.hypot(_standard_error(mean, scatter, samples), lasting)
+        last = float(mean[-1])
+        rms, (product, rates) = math.sqrt(mean_square), self._with_rate.tolist()
+        # The share of its mean square that a regression on the rate explains.
+        explained = product**2 / (rates * samples * mean_square) if rates > 0.0 and mean_square > 0.0 else 0.0
+        if explained > 0.5 and explained > 2 * whole**2 / mean_square:
+            chance = _standard_error(mean, scatter, samples)
+            return Size(rms, chance, "proportional", last, share_of_rate=product / rates)
+        at = (middle >= declared) & (middle < declared + max(LASTING, self._width))
+        here = mean[at] if at.any() else mean[-1:]
+        then = float(here.mean())
+        gone = self._gone(used, mean, then)
+        if gone is not None:
+            before = middle < gone
+            part, samples_then = mean[before], float(count[used][before].sum())
+            error = math.hypot(_standard_error(part, scatter, samples_then), lasting)
+            return Size(float(part.mean()), error, "gone", last, gone_s=round(gone, 3))
+        slope = _trend(middle, mean)
+        if slope is not None and abs(slope) * (middle[-1] - middle[0]) > TREND * abs(whole):
+            course: Course = "growing" if slope * (then or whole) > 0 else "shrinking"
+            straight = mean - slope * (middle - middle.mean())
+            chance = float(straight.std(ddof=2)) / math.sqrt(len(here))
+            return Size(then, math.hypot(chance, lasting), course, last, slope)
+        if abs(whole) < SMALL * math.sqrt(scatter):
+            wander = float(mean.var()) if len(mean) >= FEW else 0.0
+            if wander > max(0.5 * scatter, (CERTAIN * std) ** 2):
+                return Size(rms, std, "varying", last)
+            if scatter > (LOUD * self._noise) ** 2:
+                return Size(rms, rms / math.sqrt(2.0 * samples), "noisy", last)
+        return Size(whole, std, "steady", last)
+
+    def _gone(self, used: NDArray[np.intp], mean: Array, then: float) -> float | None:
+        """Since when the means have stayed well below what they were at the declaration, s; None: they have not."""
+        large = np.flatnonzero(np.abs(mean) >= PASSED * abs(then))
+        if not len(large) or large[-1] == len(mean) - 1:
+            return None
+        since = self._begin + (used[large[-1]] + 1) * self._width
+        lasted = self._begin + (used[-1] + 1) * self._width - since
+        return float(since) if lasted >= max(LASTING, 2 * self._width) else None
+
+
+def _standard_error(means: Array, scatter: float, samples: float) -> float:
+    """Of the mean of all, from the scatter of the batch means and that of single samples, whichever says more."""
+    by_sample = scatter / max(samples, 1.0)
+    if len(means) >= 2 * LONGER:
+        means = np.array([part.mean() for part in np.array_split(means, LONGER)])
+    by_batch = float(means.var(ddof=1)) / len(means) if len(means) >= FEW else 0.0
+    return math.sqrt(max(by_sample, by_batch))
+
+
+def _trend(time: Array, mean: Array) -> float | None:
+    """Slope of a straight line through the means (k,), where it is certain; else None."""
+    if len(mean) < 2 * FEW:
+        return None
+    x = time - time.mean()
+    slope = float(x @ mean / (x @ x))
+    rest = mean - mean.mean() - slope * x
+    std = math.sqrt(float(rest @ rest) / (len(mean) - 2) / float(x @ x))
+    return slope if abs(slope) > CERTAIN * std else None

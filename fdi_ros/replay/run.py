@@ -3,17 +3,18 @@
 
 """A stream through the monitor: what it would have declared, and when.
 
-    recording, or samples at hand -> segments -> faults -> monitor -> evaluation, episodes, sinks
+    recording, or samples at hand -> stretches -> faults -> monitor -> evaluation, episodes, sinks
 
 `Walk` is the only place where what was recorded or simulated passes a monitor; `Judge` is a walk that says what came of
-it; `replay` judges a recording. The stream passes block by block; memory does not grow with it.
+it; `replay` judges a recording, `read` only reads it. The stream passes block by block; memory does not grow with it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,18 +26,19 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
-from fdi_ros.faults.fault import Fault, Injector
+from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
-from fdi_ros.replay.episodes import Stretches
-from fdi_ros.replay.evaluate import Evaluation
-from fdi_ros.replay.outcomes import finite
+from fdi_ros.monitor.status import ChannelStatus
+from fdi_ros.replay.episodes import GAP, Episode, pieces
+from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
     AutopilotText,
     BiasResult,
+    ChannelResult,
     DelayResult,
     Judgement,
     MonitorResult,
@@ -45,8 +47,12 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
+from fdi_ros.setup.starting_config import assumed_config, starting_config_of
 
 OnProgress = Callable[[float], None]  # called with the share done, 0 to 1
+Source = str | PathLike[str]
+ConfigSource = Config | Source | None
+"""Settings, or a parameter file; None: what ``fdi inspect`` writes for the recording."""
 PORTION = 16384  # samples judged at once where many are at hand: their outputs take little memory
 LAST_SAMPLES = 1_000_000_000
 """A channel whose values end no sooner than this before the recording delivers to its end, ns."""
@@ -57,6 +63,7 @@ class Sink:
 
     stops_at_events: ClassVar[bool] = False
     """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
+    period: ClassVar[int] = 0  # it looks at recording and pipeline at multiples of this time of recording, ns; 0: never
 
     def tap(self, batch: Batch, rows: Int) -> None:
         """Take raw messages as they are read: those rows of a batch that are used."""
@@ -71,7 +78,7 @@ class Sink:
         """Take the next samples, with the pipeline as it is right after them."""
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
-        """Look at recording and pipeline: once per period of the recording, where there is one."""
+        """Look at recording and pipeline: once per period of the recording, where a sink has one."""
 
 
 class Kept(Sink):
@@ -100,7 +107,7 @@ class Walk:
     def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
         self.pipeline, self.sinks = pipeline, sinks
         self.seconds = 0.0  # spent in the pipeline
-        self._stretches = Stretches()
+        self._last: int | None = None  # stamp of the last sample, ns
 
     def take(self, block: Block) -> None:
         """Take the next samples, of any number."""
@@ -110,10 +117,14 @@ class Walk:
 
     def pieces(self, block: Block) -> Iterator[Block]:
         """Cut the next block at gaps; each piece is to be fed before the next."""
-        for anew, piece in self._stretches.cut(block):
-            if anew:
-                self.begin_stretch(int(piece.stamp[0]))
-            yield piece
+        if not len(block):
+            yield block
+        for rows in pieces(block.stamp, GAP):
+            first = int(block.stamp[rows.start])
+            if self._last is not None and first - self._last > GAP * 1e9:
+                self.begin_stretch(first)
+            self._last = int(block.stamp[rows.stop - 1])
+            yield block[rows]
 
     def begin_stretch(self, first: int) -> None:
         """Forget what is declared and suspected; first: stamp of the next sample, ns."""
@@ -187,7 +198,7 @@ class Judge(Walk):
     def add(self, block: Block, output: Output, rows: slice) -> None:
         """Take in what came of some rows of the piece."""
         self.evaluation.add(output, None if self._clean is None else self._clean[rows])
-        self._recorder.add(self.evaluation.times(output.stamp), output)
+        self._recorder.add(np.round(self.injector.time(output.stamp), 9), output)
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
@@ -197,7 +208,7 @@ class Judge(Walk):
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [one.name for one in status.channels if status.is_far(one)]
         monitor = MonitorResult(
-            channels=tuple(evaluation.channel_at(end, i, one) for i, one in enumerate(status.channels)),
+            channels=tuple(self._channels(end, status.channels)),
             delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
             degraded=tuple(self._degraded.values()),
             bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
@@ -205,7 +216,28 @@ class Judge(Walk):
             protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
         )
-        return Judgement(status.detector, evaluation.scores(), monitor, evaluation.explained(self._recorder.story(end)))
+        story = self._recorder.story(end)
+        episodes = tuple(replace(one, injected=self._explaining(one)) for one in story.episodes)
+        return Judgement(status.detector, evaluation.scores(), monitor, replace(story, episodes=episodes))
+
+    def _channels(self, end: float, statuses: Sequence[ChannelStatus]) -> Iterator[ChannelResult]:
+        """Yield each channel as it was at a time near the end, s, with what its status at the end says beside."""
+        found = zip(statuses, self.evaluation.unchecked.tolist(), self.evaluation.residual_rms, strict=True)
+        for status, unchecked, rms in found:
+            changes = [one for one in self.evaluation.events if one.channel == status.name]
+            before = [one for one in changes if one.at_s <= end]
+            state, since, reason = status.state.name, None, status.reason.value
+            if before:
+                state, since, reason = before[-1].state, before[-1].at_s, before[-1].reason
+            elif changes:
+                state, reason = changes[0].before, ""
+            drift, noise = status.drift, status.noise or None
+            yield ChannelResult(status.name, state, since, reason, drift, noise, unchecked, rms)
+
+    def _explaining(self, one: Episode) -> tuple[str, ...]:
+        """Name the injected faults that explain an episode."""
+        known = [followed.fault for followed in self.evaluation.faults if followed.explains(one.start_s, one.ever)]
+        return tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
 
     @property
     def _end(self) -> float:
@@ -229,53 +261,101 @@ class Judge(Walk):
 # A recording ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Request:
-    """What is to be replayed."""
+def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:
+    """Read a recording block by block, aligned as the node aligns its messages.
 
-    bag: Path  # rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file
-    config: Config
-    faults: tuple[Fault, ...] = ()  # to be injected
-    start: float = 0.0
-    end: float = math.inf  # part of the recording, s from its first message
-    period: int = 0  # the sinks look at the pipeline at multiples of this time of recording, ns; 0: never
+    Parameters
+    ----------
+    path
+        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
+    config
+        Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording.
+    start, end
+        Part to be read, s from the first message.
 
-
-def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
-    """Replay a recording once; sinks take the outputs of the monitor, progress is called with the share done.
-
-    `FdiError` if the recording, the settings or the faults do not fit.
+    Returns
+    -------
+    Blocks of consecutive samples: stamps (N,) ns, values (N, n) rad/s, as `Pipeline.process` takes them. `FdiError` if
+    there is no such recording, or it lacks a topic of the settings.
     """
-    begun, config = clock(), request.config
-    injector = Injector(request.faults, build_geometry(config).channel_names)
-    judge = Judge(Pipeline.from_config(config), injector, sinks)
+    bag = Path(path)
+    if config is None:
+        settings = Config.from_parameters(starting_config_of(bag, f"{bag}: no settings for it").parameters)
+    else:
+        settings = Config.of(config)
+    # Refused now, not with the first block.
+    recording = Recording(bag)
+    samples = Samples(recording, settings, build_geometry(settings).n, start, end)
+
+    def blocks() -> Iterator[Block]:
+        with recording:
+            yield from samples.blocks()
+
+    return blocks()
+
+
+def replay(
+    path: Source,
+    config: ConfigSource = None,
+    faults: Sequence[Fault | str | Mapping[str, Any]] = (),
+    start: float = 0.0,
+    end: float = math.inf,
+    *,
+    sinks: Sequence[Sink] = (),
+    progress: OnProgress | None = None,
+) -> Summary:
+    """Replay a recording as ``fdi replay`` does.
+
+    Parameters
+    ----------
+    path, start, end
+        As of `read`.
+    config
+        Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording, if its units are
+        mounted alike.
+    faults
+        To be injected, each in words or as a mapping: ``"channel=imu_2.y kind=bias size=0.2 start=30"`` or
+        ``{"channel": "imu_2.y", "kind": "bias", "size": 0.2, "start": 30}``.
+    sinks
+        Take the outputs of the monitor as they come.
+    progress
+        Called with the share done, 0 to 1.
+
+    Returns
+    -------
+    What was declared, what became of the faults, and the state of the monitor at the end. `FdiError` if recording,
+    settings or faults do not fit, or there are no settings and none can be assumed.
+    """
+    bag = Path(path)
+    settings = assumed_config(bag)[0] if config is None else Config.of(config)
+    begun, period = clock(), max((sink.period for sink in sinks), default=0)
+    injector = Injector(tuple(map(_fault, faults)), build_geometry(settings).channel_names)
+    judge = Judge(Pipeline.from_config(settings), injector, sinks)
 
     def tap(batch: Batch, rows: Int) -> None:
         for sink in sinks:
             sink.tap(batch, rows)
 
-    with Recording(request.bag) as recording:
-        span = (request.start, request.end)
-        samples = Samples(recording, config, len(injector.channel_names), *span, tap, request.period)
+    with Recording(bag) as recording:
+        samples = Samples(recording, settings, len(injector.channel_names), start, end, tap, period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
-                first, learned = float(injector.time(block.stamp[0])), config.bias.startup_bias_duration
+                first, learned = float(injector.time(block.stamp[0])), settings.bias.startup_bias_duration
                 why = "until then the biases are learned" if learned > 0 else "there the part that is read begins"
-                injector.refuse_between(-math.inf, first + learned if learned > 0 else request.start, why)
+                injector.refuse_between(-math.inf, first + learned if learned > 0 else start, why)
             for piece in judge.pieces(block):
                 for sink in sinks:
                     sink.begin(samples)
                 judge.feed(piece)
-                for sink in sinks if request.period else ():
+                for sink in sinks if period else ():
                     sink.tick(samples, judge.pipeline)
             if progress is not None:
                 progress(samples.progress)
         if judge.evaluation.samples:
-            last = float(injector.time(np.array(judge.evaluation.last)))
-            injector.refuse_between(last, math.inf, "that is the last sample")
+            injector.refuse_between(judge.evaluation.time(judge.evaluation.last), math.inf, "that is the last sample")
         stream = StreamResult(
-            sample_rate=SampleRate(config.sample_rate, judge.rate),
+            sample_rate=SampleRate(settings.sample_rate, judge.rate),
             origin_ns=samples.origin,
             messages=samples.messages,
             malformed=samples.malformed,
@@ -285,6 +365,12 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
         )
         texts = [AutopilotText(judge.evaluation.time(one.stamp), one.kind, one.text) for one in recording.texts]
     judgement = judge.judgement()
-    end = judgement.scores.start_s + judgement.scores.duration_s
-    said = tuple(replace(one, at_s=round(one.at_s, 6)) for one in texts if judgement.scores.start_s <= one.at_s <= end)
-    return Summary(**vars(judgement), bag=str(request.bag), stream=stream, seconds=clock() - begun, autopilot=said)
+    scores = judgement.scores
+    said = tuple(replace(one, at_s=round(one.at_s, 6)) for one in texts if scores.start_s <= one.at_s <= scores.end_s)
+    return Summary(**vars(judgement), bag=str(bag), stream=stream, seconds=clock() - begun, autopilot=said)
+
+
+def _fault(given: Fault | str | Mapping[str, Any]) -> Fault:
+    if isinstance(given, Fault):
+        return given
+    return parse_fault(given) if isinstance(given, str) else fault_from(given)

@@ -9,118 +9,12 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from fdi_ros.monitor.output import time_index
-from fdi_ros.replay.episodes import DECLARED, NOTHING_HAPPENED, Story
-from fdi_ros.replay.outcomes import OutcomeKind
+from fdi_ros.replay.episodes import NOTHING_HAPPENED, Story
+from fdi_ros.replay.outcomes import UNCHECKED_STATES, Scores
 from fdi_ros.system import require
 
 if TYPE_CHECKING:
     import pandas
-
-UNCHECKED_STATES = ("STALE", "UNCHECKED")
-"""States of a channel that nothing checks, and that no fault was declared of."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one injected fault; times in s from the first message."""
-
-    channel: str
-    """As it was asked for: one name, or several separated by commas."""
-    channels: tuple[str, ...]
-    """Names of the channels that it is injected into."""
-    kind: str
-    size: float | None
-    """In the unit of the kind's option; None: the kind has no size."""
-    start_s: float
-    stop_s: float | None
-    """None: it lasts to the end."""
-    detected_at_s: float | None = None
-    """Of the first declaration that names one of its channels."""
-    delay_s: float | None = None
-    """From its start to its detection, s."""
-    detected_as: str | None = None
-    """State that the first declaration brought."""
-    isolated: bool = False
-    """All its channels were declared, each by itself."""
-    isolated_at_s: float | None = None
-    isolation_delay_s: float | None = None
-    declared_channels: tuple[str, ...] = ()
-    """Named by its first declaration, and those of its channels that were named by themselves later."""
-    declared_before: bool = False
-    """All its channels were declared already when it began: there is nothing left to be detected."""
-    outcome: str = OutcomeKind.MISSED.value
-    """As a sweep has it: one of `fdi_ros.replay.outcomes.OutcomeKind`."""
-
-    @property
-    def other_channels(self) -> list[str]:
-        """Channels that were named with the fault and that it is not injected into."""
-        return [name for name in self.declared_channels if name not in self.channels]
-
-
-@dataclass(frozen=True)
-class StateChange:
-    """A change of the state of a channel."""
-
-    channel: str
-    at_s: float
-    """s from the first message."""
-    state: str
-    """After the change."""
-    before: str
-    reason: str
-    group: tuple[str, ...]
-    """Channels of which one is faulty; the channel itself where it is declared by itself."""
-    error: float | None
-    """Estimated error of the channel, rad/s; None: the method gives none."""
-
-    @property
-    def declares(self) -> bool:
-        """Whether this is a declaration: the channel is faulty, or one of a set is."""
-        return self.state in DECLARED
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The channels that it is about: the one, or all of the set."""
-        return tuple(dict.fromkeys((self.channel, *self.group))) if self.state == "AMBIGUOUS" else (self.channel,)
-
-
-@dataclass(frozen=True)
-class FaultEffect:
-    """Root mean square of what the injected faults did to the fused rate, rad/s; None: no sample to take it of."""
-
-    before_detection: float | None = None
-    after_detection: float | None = None
-    without_monitor: float | None = None
-    """To the least-squares rate of all channels."""
-
-
-@dataclass(frozen=True)
-class Scores:
-    """What was injected against what was declared."""
-
-    samples: int
-    duration_s: float
-    faults: tuple[Outcome, ...]
-    declared: tuple[StateChange, ...]
-    """Declarations that no injected fault explains; all of them where none is injected."""
-    fault_effect_rad_s: FaultEffect
-    start_s: float
-    """Of the first sample, s from the first message."""
-    samples_judged: int
-    samples_with_rate: int
-    alarms: int
-    """Samples with an alarm."""
-    events: tuple[StateChange, ...]
-
-    @property
-    def detected(self) -> list[Outcome]:
-        """The faults that were detected."""
-        return [fault for fault in self.faults if fault.detected_at_s is not None]
-
-    @property
-    def isolated(self) -> int:
-        """Number of faults that were isolated."""
-        return sum(fault.isolated for fault in self.faults)
 
 
 @dataclass(frozen=True)
@@ -129,15 +23,11 @@ class ChannelResult:
 
     name: str
     state: str
-    since_s: float | None
-    """When it came into its state, s from the first message; None: it began in it."""
+    since_s: float | None  # When it came into its state, s from the first message; None: it began in it.
     reason: str
-    bias_followed: float
-    """Of its bias against the others, rad/s."""
-    noise: float | None
-    """Lately, over noise_std; None: not measured."""
-    unchecked: float
-    """Share of the samples in which nothing checked it."""
+    bias_followed: float  # Of its bias against the others, rad/s.
+    noise: float | None  # Lately, over noise_std; None: not measured.
+    unchecked: float  # Share of the samples in which nothing checked it.
     residual_rms_rad_s: float | None
     """Root mean square of what it differs by from the fused rate while OK; None: it never was."""
 
@@ -156,8 +46,7 @@ class BiasResult:
     """The biases at the end."""
 
     state: str
-    value: tuple[float, ...]
-    """Per channel, rad/s."""
+    value: tuple[float, ...]  # Per channel, rad/s.
     far: tuple[str, ...] = ()
     """Channels that began with more than four ``bias.turn_on_std``: learned, as a fault from before would be."""
 
@@ -176,8 +65,7 @@ class MonitorResult:
 
     channels: tuple[ChannelResult, ...]
     delays: tuple[DelayResult, ...]
-    degraded: tuple[str, ...]
-    """What is worse than it should be without being declared, in sentences."""
+    degraded: tuple[str, ...]  # What is worse than it should be without being declared, in sentences.
     bias: BiasResult
     note: str
     protection_level: ProtectionLevel
@@ -189,8 +77,7 @@ class SampleRate:
     """Samples per second, Hz."""
 
     configured_hz: float
-    recorded_hz: float | None
-    """None: too few samples to say."""
+    recorded_hz: float | None  # None: too few samples to say.
 
 
 @dataclass(frozen=True)
@@ -198,15 +85,11 @@ class StreamResult:
     """The recording itself."""
 
     sample_rate: SampleRate
-    origin_ns: int | None
-    """Stamp of the first message, from which all times count; None: there is none."""
-    messages: int
-    """Used."""
-    malformed: dict[str, int]
-    """By topic."""
+    origin_ns: int | None  # Stamp of the first message, from which all times count; None: there is none.
+    messages: int  # Used.
+    malformed: dict[str, int]  # By topic.
     disordered: int
-    alignment: dict[str, dict[str, int]]
-    """Counters by topic."""
+    alignment: dict[str, dict[str, int]]  # Counters by topic.
     damage: tuple[str, ...]
 
 
@@ -217,14 +100,12 @@ class Judgement:
     detector: str
     scores: Scores
     monitor: MonitorResult
-    story: Story = NOTHING_HAPPENED
-    """What happened."""
+    story: Story = NOTHING_HAPPENED  # What happened.
 
     @property
     def unchecked_channels(self) -> list[ChannelResult]:
         """Channels that end without being checked, but for those that a fault is injected into up to the end."""
-        end = self.scores.start_s + self.scores.duration_s
-        lasting = [fault for fault in self.scores.faults if fault.stop_s is None or fault.stop_s >= end]
+        lasting = [fault for fault in self.scores.faults if fault.stop_s is None or fault.stop_s >= self.scores.end_s]
         struck = {name for fault in lasting for name in fault.channels}
         return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
 
@@ -233,10 +114,8 @@ class Judgement:
 class AutopilotText:
     """What the autopilot of a flight log said of itself."""
 
-    at_s: float
-    """s from the first message."""
-    kind: str
-    """MSG, ERR (a lane switch of the EKF among them), STATUSTEXT, or the level of PX4."""
+    at_s: float  # s from the first message.
+    kind: str  # MSG, ERR (a lane switch of the EKF among them), STATUSTEXT, or the level of PX4.
     text: str
 
 
@@ -246,21 +125,14 @@ class Summary(Judgement):
 
     bag: str
     stream: StreamResult
-    seconds: float
-    """That the replay took."""
-    autopilot: tuple[AutopilotText, ...] = ()
-    """From the first sample to the last."""
+    seconds: float  # That the replay took.
+    autopilot: tuple[AutopilotText, ...] = ()  # From the first sample to the last.
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the changes of state as a table; needs pandas.
 
         Columns: ``channel``, ``before``, ``state``, ``reason``, ``group`` and ``error`` (rad/s), as of `StateChange`.
         The index is the time of each, as of `fdi_ros.monitor.output.time_index`.
-
-        Raises
-        ------
-        FdiError
-            If pandas is not installed.
         """
         require("Summary.to_pandas", ("pandas",))
         import pandas

@@ -27,9 +27,9 @@ from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.episodes import pieces
-from fdi_ros.replay.outcomes import Scored, score, standing
+from fdi_ros.replay.outcomes import STANDING, Scored, StateChange, score, standing
 from fdi_ros.replay.run import Judge, Kept, Walk
-from fdi_ros.replay.summary import Judgement, StateChange
+from fdi_ros.replay.summary import Judgement
 from fdi_ros.system.jobs import run_jobs
 
 DEFAULT_FAULTS = (
@@ -78,13 +78,8 @@ class Swept:
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
         """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
-        items: dict[str, object] = {
-            "channel": channel,
-            "kind": self.kind,
-            "start": start,
-            "seed": seed,
-            **dict(self.items),
-        }
+        items: dict[str, object] = {"channel": channel, "kind": self.kind, "start": start, "seed": seed}
+        items |= dict(self.items)
         if self.size is not None and FAULT_KINDS[self.kind].has_signed_size():
             items["size"] = sign * self.size
         return fault_from(items)
@@ -96,9 +91,8 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     `FaultError` if it is not of that form, or a number does not fit its kind.
     """
     items = key_values(text)
-    for name in items:
-        if name in ("channel", "start", "stop", "seed"):
-            raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
+    for name in items.keys() & {"channel", "start", "stop", "seed"}:
+        raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
     kind = items.pop("kind", "")
     if kind in FAULT_KINDS and FAULT_KINDS[kind].whole_unit:
         raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
@@ -163,20 +157,18 @@ def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
     """Judge a recording as it is; `BagError` if there is not a single sample."""
     if not len(block):
         raise BagError("its topics have no time in common: there is no sample of all channels")
-    kept = Kept(_what_counts)
+
+    def what_counts(output: Output) -> tuple[Mask, Mask, Array]:
+        doubtful = np.asarray(np.isin(output.state, STANDING).any(axis=1))
+        return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
+
+    kept = Kept(what_counts)
     judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
     judge.take(block)
     judged, doubtful, speed = kept.columns
     seconds = _seconds(block)
     begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
     return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
-
-
-def _what_counts(output: Output) -> tuple[Mask, Mask, Array]:
-    """Of each sample: whether it is judged, whether a channel stands declared or gives nothing, fused rate, rad/s."""
-    alone, among = standing(output)
-    doubtful = np.asarray((alone | among).any(axis=1))
-    return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
 
 
 def _seconds(block: Block) -> Array:
@@ -300,8 +292,8 @@ def sweep(
 ) -> Sequence[Subject]:
     """Try every monitor, all with the same channels, with every fault of the plan, at the same times; return them.
 
-    ``workers``: processes; 1: this one alone. ``progress`` is called with the share done. `FdiError` if no monitor
-    judges the recording for long enough.
+    ``workers``: processes; ``progress`` is called with the share done. `FdiError` if no monitor judges the recording
+    for long enough.
     """
     for one in subjects:
         _watch(one)
@@ -309,19 +301,17 @@ def sweep(
     if not baselines:
         raise FaultError(f"no fault can be tried: {subjects[0].refused}")
     times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
-    jobs: list[tuple[Config, Onset, int, Plan]] = []
-    owners: list[Subject] = []
+    owned: list[tuple[Subject, tuple[Config, Onset, int, Plan]]] = []
     for one, baseline in baselines:
         _take_times(one, baseline, times, plan.within)
-        jobs += _jobs_of(one, plan)
-        owners += [one] * (len(jobs) - len(owners))
+        owned += [(one, job) for job in _jobs_of(one, plan)]
     found: dict[int, list[Trial]] = {}
-    for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
-        found[job] = trials
+    for done, (k, trials) in enumerate(run_jobs(try_faults, [job for _, job in owned], workers, None), 1):
+        found[k] = trials
         if progress is not None:
-            progress(done / len(jobs))
-    for job, owner in enumerate(owners):
-        owner.trials += tuple(found[job])
+            progress(done / len(owned))
+    for k, (owner, _) in enumerate(owned):
+        owner.trials += tuple(found[k])
     return subjects
 
 
@@ -332,10 +322,9 @@ def _watch(one: Subject) -> None:
         pipeline = monitor_of(one.config)
         pipeline.restart()
         one.baseline = watch_baseline(pipeline, one.block)
+        one.refused = "" if one.baseline.judged else f"it judges nothing of this recording: {one.baseline.note}"
     except FdiError as error:
         one.refused = str(error)
-        return
-    one.refused = "" if one.baseline.judged else f"it judges nothing of this recording: {one.baseline.note}"
 
 
 def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[float]:
@@ -370,9 +359,9 @@ def _take_times(one: Subject, baseline: Baseline, times: Sequence[float], within
         doubted = baseline.doubtful[max(0, rows.start - 1) : rows.stop].any()
         if doubted or len(pieces(one.block.stamp[rows])) != 1:
             one.skipped += (at,)
-            continue
-        speed = baseline.speed[rows]
-        one.times, one.speeds = (*one.times, at), (*one.speeds, float(speed.max(initial=0.0, where=np.isfinite(speed))))
+        else:
+            one.times += (at,)
+            one.speeds += (float(np.nan_to_num(baseline.speed[rows]).max()),)
 
 
 def _jobs_of(one: Subject, plan: Plan) -> list[tuple[Config, Onset, int, Plan]]:

@@ -86,11 +86,11 @@ def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Lin
 
 def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
     """Quantiles of the delays of all trials; those without a delay in time are beyond all others."""
-    known = [delay for delay in delays if delay <= within]
-    every = np.sort([*known, *[math.inf] * (trials - len(known))])
     if not trials:
         return Delays(math.nan, math.nan)
-    return Delays(*(float(every[math.ceil(level * trials) - 1]) for level in (0.5, WANTED)))
+    known = sorted(delay for delay in delays if delay <= within)
+    every = [*known, *[math.inf] * (trials - len(known))]
+    return Delays(*(every[math.ceil(level * trials) - 1] for level in (0.5, WANTED)))
 
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
@@ -213,22 +213,16 @@ def sound_lines(tried: Subject) -> list[str]:
     baseline = tried.baseline
     if baseline is None or tried.refused:
         return [f"not tried: {tried.refused}"]
-    lines = []
-    if not baseline.declared:
-        words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
-        lines.append(f"{words}, from {baseline.begins:.1f} s on")
-    else:
-        told = baseline.judgement.story.declared
+    words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
+    lines = [f"{words}, from {baseline.begins:.1f} s on"]
+    if told := baseline.judgement.story.declared:
         more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
-        lines.append(
-            f"declared, with nothing injected: {episode_words(told[0])}{more}."
-            " Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
-        )
+        doubt = "Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
+        lines = [f"declared, with nothing injected: {episode_words(told[0])}{more}. {doubt}"]
     if tried.skipped:
         at = ", ".join(f"{time:.1f} s" for time in tried.skipped)
-        lines.append(
-            f"no fault was injected at {at}: something stands declared then without one, or a channel gives nothing"
-        )
+        why = "something stands declared then without one, or a channel gives nothing"
+        lines.append(f"no fault was injected at {at}: {why}")
     if not tried.times:
         lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
     lines += [f"as it is, {line}" for line in baseline.judgement.monitor.degraded]
@@ -239,18 +233,14 @@ def sound_lines(tried: Subject) -> list[str]:
 
 def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
     """Give the smallest size of each kind that is found."""
-    lines = lines_of(tried, plan)
     if not tried.trials:
         return []
-    words = [
-        f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}"
-        for family, own in _families(lines).items()
-    ]
-    words += [
-        f"{line.swept.words}: detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
-        for line in lines
-        if line.swept.size is None
-    ]
+    lines, words = lines_of(tried, plan), []
+    for family, own in _families(lines).items():
+        words.append(f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}")
+    for line in [line for line in lines if line.swept.size is None]:
+        shares = f"detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
+        words.append(f"{line.swept.words}: {shares}")
     false = sum(line.false for line in lines)
     words.append(f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults")
     return [*words, _motion(tried)]

@@ -1,15 +1,23 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay finds, in words: the verdict, the sentences below it, the tables for a terminal."""
+"""What a replay finds, in words: the verdict, the sentences below it, the tables for a terminal; and whether it passes.
+
+What it must show to pass is asked as in ``fdi replay --check 'delay<1 isolated false=0'``, or ``'imu_2.y faulty'``.
+"""
 
 from __future__ import annotations
 
+import math
+import operator
+import re
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 from fdi_ros.core.decision import Reason
+from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
@@ -19,22 +27,23 @@ from fdi_ros.replay.episodes import (
     Story,
     detail_words,
     episode_words,
-    story_lines,
     stretch_words,
 )
-from fdi_ros.replay.summary import UNCHECKED_STATES, ChannelResult, Judgement, Outcome, SampleRate, Scores, Summary
+from fdi_ros.replay.outcomes import UNCHECKED_STATES, Outcome, Scores
+from fdi_ros.replay.summary import ChannelResult, Judgement, SampleRate, Summary
 from fdi_ros.report.layout import (
     RADIANS,
     Columns,
     Section,
+    Severity,
     Unit,
+    Verdict,
     first_of,
     head_and_rows,
     milliseconds,
     number,
     section_text,
 )
-from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.system.text import shown
 
 MOSTLY_JUDGED = 0.5  # share of the samples that must have been judged for a replay to say something
@@ -77,20 +86,19 @@ def _without_state(one: Episode, unit: Unit) -> str:
 
 def _verdict_on_faults(summary: Summary) -> Verdict:
     """Say how many of the injected faults were detected."""
-    scores = summary.scores
-    detected, isolated = len(scores.detected), scores.isolated
-    plural = "fault" if len(scores.faults) == 1 else "faults"
-    words = f"{detected} of {len(scores.faults)} injected {plural} detected, {isolated} isolated."
+    faults, isolated = summary.scores.faults, summary.scores.isolated
+    detected = sum(fault.detected_at_s is not None for fault in faults)
+    plural = "fault" if len(faults) == 1 else "faults"
+    words = f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated."
     if _wrongly_named(summary) or any(not one.injected for one in summary.story.declared):
         return Verdict(Severity.BAD, words)
-    return Verdict(Severity.GOOD if isolated == len(scores.faults) else Severity.UNKNOWN, words)
+    return Verdict(Severity.GOOD if isolated == len(faults) else Severity.UNKNOWN, words)
 
 
 def _wrongly_named(summary: Summary) -> list[str]:
     """Return the channels that are declared faulty by themselves and that no injected fault strikes."""
-    struck = {name for fault in summary.scores.faults for name in fault.channels}
-    faulty = [one.channel for one in summary.scores.declared if one.state == "FAULTY"]
-    return list(dict.fromkeys(name for name in faulty if name not in struck))
+    faulty = dict.fromkeys(one.channel for one in summary.scores.declared if one.state == "FAULTY")
+    return [name for name in faulty if name not in summary.scores.struck]
 
 
 def _untold(summary: Summary) -> str:
@@ -100,8 +108,7 @@ def _untold(summary: Summary) -> str:
         return f"not one of {samples} samples was judged; bias {summary.monitor.bias.state}"
     if judged < MOSTLY_JUDGED * samples:
         return f"only {100 * judged / samples:.1f} % of {samples} samples were judged"
-    longest = unchecked_longest(summary)
-    if longest:
+    if longest := _unchecked_longest(summary):
         words = ", ".join(f"{name} for {seconds:.1f} s" for name, seconds in longest.items())
         return f"not checked without a break, of {summary.scores.duration_s:.1f} s: {words}"
     if far := summary.monitor.bias.far:
@@ -109,13 +116,13 @@ def _untold(summary: Summary) -> str:
     return ""
 
 
-def unchecked_longest(judgement: Judgement) -> dict[str, float]:
+def _unchecked_longest(summary: Summary) -> dict[str, float]:
     """Return the channels that were unchecked for too long without a break, and for how long, s."""
-    scores, found = judgement.scores, {}
-    for channel in judgement.monitor.channels:
+    scores, found = summary.scores, {}
+    for channel in summary.monitor.channels:
         changes = [one for one in scores.events if one.channel == channel.name]
         states = [changes[0].before if changes else channel.state, *(one.state for one in changes)]
-        edges = pairwise([scores.start_s, *(one.at_s for one in changes), scores.start_s + scores.duration_s])
+        edges = pairwise([scores.start_s, *(one.at_s for one in changes), scores.end_s])
         spans = [b - a for state, (a, b) in zip(states, edges, strict=True) if state in UNCHECKED_STATES]
         if max(spans, default=0.0) > LONGEST_UNCHECKED * scores.duration_s:
             found[channel.name] = max(spans)
@@ -123,34 +130,33 @@ def unchecked_longest(judgement: Judgement) -> dict[str, float]:
 
 
 def _healthy_words(summary: Summary) -> str:
-    checked = 1.0 - max((one.unchecked for one in summary.monitor.channels), default=0.0)
+    channels, end = summary.monitor.channels, _unchecked_at_the_end(summary)
+    checked = 1.0 - max((one.unchecked for one in channels), default=0.0)
     share = "all checked" if checked > 0.995 else f"each checked in {checked:.0%} of the samples or more"
-    channels, end = len(summary.monitor.channels), _unchecked_at_the_end(summary)
     more = f"; at the end not checked: {end}" if end else ""
-    return f"no fault declared in {summary.scores.duration_s:.1f} s; {channels} channels, {share}{more}"
+    return f"no fault declared in {summary.scores.duration_s:.1f} s; {len(channels)} channels, {share}{more}"
 
 
 def _unchecked_at_the_end(summary: Summary) -> str:
-    end = summary.scores.start_s + summary.scores.duration_s
-    return unchecked_words(
-        [one for one in summary.unchecked_channels if one.since_s is not None and end - one.since_s >= LASTING]
-    )
+    end, unchecked = summary.scores.end_s, summary.unchecked_channels
+    return _unchecked_words([one for one in unchecked if one.since_s is not None and end - one.since_s >= LASTING])
 
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
     """Return what stands below the verdict."""
-    return [*_fault_lines(summary.scores), *_episode_lines(summary, unit), *noisy_lines(summary, unit)]
+    faults = sorted(summary.scores.faults, key=lambda fault: fault.detected_at_s is None)
+    lines = [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in faults]
+    return [*lines, *_episode_lines(summary, unit), *noisy_lines(summary, unit)]
 
 
 def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
     """Tell of channels that are much noisier than the others."""
-    if judgement.story.declared:
-        # What is wrong already is said.
-        return []
-    rms = {one.name: one.residual_rms_rad_s for one in judgement.monitor.channels if one.residual_rms_rad_s}
+    # What is wrong already is said.
+    channels = () if judgement.story.declared else judgement.monitor.channels
+    rms = {one.name: one.residual_rms_rad_s for one in channels if one.residual_rms_rad_s}
     lines = []
     for name, size in rms.items():
-        others = statistics.median(value for other, value in rms.items() if other != name) if len(rms) > 1 else size
+        others = statistics.median([value for other, value in rms.items() if other != name] or [size])
         if size > NOISIER * others:
             theirs, own = (f"{value * unit.factor:.2g}" for value in (others, size))
             lines.append(
@@ -160,22 +166,18 @@ def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
     return lines
 
 
-def unchecked_words(channels: Sequence[ChannelResult]) -> str:
+def _unchecked_words(channels: Sequence[ChannelResult]) -> str:
     """Say which channels end how, from when on and why."""
     alike: dict[tuple[str, str], list[ChannelResult]] = {}
     for one in channels:
         alike.setdefault((one.state, one.reason), []).append(one)
-    return "; ".join(
-        f"{', '.join(one.name for one in group)} {state} {_since_words(group)}{f' ({reason})' if reason else ''}"
-        for (state, reason), group in alike.items()
-    )
-
-
-def _since_words(channels: Sequence[ChannelResult]) -> str:
-    since = sorted({0.0 if one.since_s is None else one.since_s for one in channels})
-    if not since[-1]:
-        return "from the start"
-    return f"from {since[0]:.3f} s on" if len(since) == 1 else f"from {since[0]:.3f} to {since[-1]:.3f} s on"
+    words = []
+    for (state, reason), group in alike.items():
+        since = sorted({one.since_s or 0.0 for one in group})
+        when = f"from {since[0]:.3f} to {since[-1]:.3f} s on" if len(since) > 1 else f"from {since[0]:.3f} s on"
+        when = when if since[-1] else "from the start"
+        words.append(f"{', '.join(one.name for one in group)} {state} {when}{f' ({reason})' if reason else ''}")
+    return "; ".join(words)
 
 
 def notes(summary: Summary) -> list[str]:
@@ -188,8 +190,7 @@ def notes(summary: Summary) -> list[str]:
     for topic, counters in stream.alignment.items():
         odd = ", ".join(f"{ODD.get(name, name)} ({n})" for name, n in counters.items() if n and name != "received")
         lines += [f"{topic}: {odd}"] if odd else []
-    missing = scores.samples - scores.samples_with_rate
-    if missing:
+    if missing := scores.samples - scores.samples_with_rate:
         lines.append(f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}")
     lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
@@ -203,11 +204,6 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
         f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has {rate.recorded_hz:.4g} Hz: the"
         " false-alarm rate is wrong by as much"
     ]
-
-
-def _fault_lines(scores: Scores) -> list[str]:
-    ordered = sorted(scores.faults, key=lambda fault: fault.detected_at_s is None)
-    return [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in ordered]
 
 
 def _detection_words(fault: Outcome) -> str:
@@ -235,13 +231,17 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
     if told:
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
         first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
-        return [f"{count} that no injected fault explains{first}:", *story_lines(story, told, unit)]
+        stretches = [f"stretch {one.stretch}: " if len(story.stretches) > 1 else "" for one in told[:MOST_TOLD]]
+        lines = [f"{where}{episode_words(one, unit)}." for where, one in zip(stretches, told, strict=False)]
+        if more := len(told[MOST_TOLD:]) + story.more:
+            lines.append(f"And {more} more episode{'s' if more > 1 else ''}.")
+        return [f"{count} that no injected fault explains{first}:", *lines]
     if wrong := _wrongly_named(summary):
         return [f"Declared faulty, and not struck by a fault: {', '.join(wrong)}."]
     if why := _untold(summary):
         return [f"Of the others it cannot be told: {why}."]
-    struck = {name for fault in scores.faults for name in fault.channels}
-    doubted = dict.fromkeys(name for fault in scores.faults for name in fault.other_channels if name not in struck)
+    doubted = dict.fromkeys(name for fault in scores.faults for name in fault.other_channels)
+    doubted = {name: None for name in doubted if name not in scores.struck}
     if doubted:
         return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
     return ["No other channel was declared faulty."]
@@ -304,9 +304,8 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
 
 
 def _detected(fault: Outcome) -> str:
-    if fault.detected_at_s is None:
-        return "declared before" if fault.declared_before else "no"
-    return number(fault.detected_at_s, unit=" s")
+    missed = "declared before" if fault.declared_before else "no"
+    return missed if fault.detected_at_s is None else number(fault.detected_at_s, unit=" s")
 
 
 def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
@@ -322,13 +321,167 @@ def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
 def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     """Tell of every episode: who, when and how much, and what is known of it beside."""
     told = story.episodes[:_MOST_TOLD]
-    if not told:
-        return ""
-    several = len(story.stretches) > 1
-    lines = ["\nwhat happened\n"]
+    lines = ["\nwhat happened\n"] if told else []
     for place, one in enumerate(told, 1):
-        where = f" (stretch {one.stretch})" if several else ""
+        where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
         lines += [f"       {title}: {words}\n" for title, words in detail_words(one, unit, scored)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
+
+
+# What it must show to pass --------------------------------------------------------------------------------------------
+
+
+_COMPARED: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    "=": operator.eq,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
+_OF_FAULTS = {"detected": ("",), "delay": ("<", "<="), "isolated": ("", "<", "<=")}
+"""Every injected fault is detected; it is, within so many seconds; it is isolated, or so within so many seconds."""
+_OF_ALL = {
+    "false": ("<", "<=", "="),  # number of declarations that no injected fault explains
+    "declared": ("<", "<=", "="),  # number of episodes in which a fault was declared, injected or not
+    "judged": (">", ">="),  # share of the samples that was judged
+    "unchecked": ("<", "<=", "="),  # number of channels that end STALE or UNCHECKED
+}
+_FORMS = _OF_FAULTS | _OF_ALL  # how each quantity may be compared with a number; empty: it may stand without one
+CHANNEL_STATES = ("faulty", "ambiguous", "stale", "ok")
+"""What a channel may be asked to have been: declared by itself, in a set, silent; or none of these."""
+_IMPLIED = (f"judged>={MOSTLY_JUDGED:g}", "unchecked=0")  # what must hold where nothing is said of it
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One condition, as it was written."""
+
+    text: str
+    name: str  # of a quantity, or of a state of channels
+    sign: str = ""
+    bound: float = math.nan
+    channels: tuple[str, ...] = ()  # that are asked for: one, or those of a unit; empty: it is about a quantity
+
+    def reasons(self, judgement: Judgement) -> list[str]:
+        """Return why it does not hold, one line per reason; empty: it does."""
+        if self.channels:
+            return [f"{name}: {why}" for name in self.channels if (why := self._of_channel(name, judgement))]
+        if self.name in _OF_ALL:
+            value, words = _measure(self.name, judgement)
+            return [] if self._holds(value) else [words]
+        if judgement.scores.faults:
+            return [why for fault in judgement.scores.faults if (why := self._of_fault(fault))]
+        told = judgement.story.declared
+        return [episode_words(one) for one in told if one.state != "FAULTY"] if told else ["nothing was declared"]
+
+    def _holds(self, value: float) -> bool:
+        return not self.sign or _COMPARED[self.sign](value, self.bound)
+
+    def _of_fault(self, fault: Outcome) -> str:
+        """Say why an injected fault does not fulfil it; empty: it does."""
+        named, when, done = f"{fault.kind} on {fault.channel}", fault.delay_s, "detected"
+        if when is None:
+            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
+            return f"{named}: {missed}"
+        if self.name == "isolated":
+            when, done = fault.isolation_delay_s, "isolated"
+        if when is None:
+            return f"{named}: detected, not isolated; declared: {', '.join(fault.declared_channels)}"
+        return "" if self._holds(when) else f"{named}: {done} after {when:.3f} s"
+
+    def _of_channel(self, channel: str, judgement: Judgement) -> str:
+        """Say what was declared of a channel where that is not what was asked for; otherwise nothing."""
+        episodes = judgement.story.episodes
+        told = {one.state: one for one in episodes if channel in one.channels}
+        if self.name == "ambiguous":
+            told |= {step.state: one for one in episodes for step in one.steps if channel in step.channels}
+        if not told if self.name == "ok" else self.name.upper() in told:
+            return ""
+        return "; ".join(dict.fromkeys(map(episode_words, told.values()))) or "nothing was declared of it"
+
+
+def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
+    """Return the value of a quantity of the whole recording, and how it is said."""
+    scores, story = judgement.scores, judgement.story
+    if name == "judged":
+        share = scores.samples_judged / max(1, scores.samples)
+        return share, f"{scores.samples_judged} of {scores.samples} samples were judged, {share:.4f}"
+    if name == "unchecked":
+        lost, total = judgement.unchecked_channels, len(judgement.monitor.channels)
+        return len(lost), f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{_unchecked_words(lost)}"
+    if name == "declared":
+        count, told = len(story.declared) + story.more, "; ".join(map(episode_words, story.declared[:MOST_TOLD]))
+        which = f"episode{'s' if count != 1 else ''}"
+    else:
+        count, first = len(scores.declared), scores.declared[:MOST_TOLD]
+        told = "; ".join(f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in first)
+        which = "declarations that no injected fault explains" if scores.faults else "declarations, of channels"
+    return count, f"{count} {which}{f': {told}' if told else ''}"
+
+
+def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
+    """Return why what a monitor made of a recording does not pass, one line per reason; empty: it passes.
+
+    What was mostly not judged does not pass unless the conditions say what is enough, nor do channels that end
+    unchecked unless they say how many may.
+    """
+    named = {one.name for one in required}
+    implied = [one for one in map(_on_quantity, _IMPLIED) if required and one.name not in named]
+    return [f"{one.text}: {why}" for one in (*required, *implied) for why in one.reasons(judgement)]
+
+
+def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condition]:
+    """Read conditions separated by blanks or commas, ``delay<1 isolated false=0``; all must hold.
+
+    ``faults``: how many are injected. ``names``: of the channels, which may be asked for, as may their units.
+    `ConfigError` names the part that is wrong and what is allowed.
+    """
+    parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
+    if not parts:
+        raise ConfigError(f"--check is empty, expected conditions on: {', '.join(_FORMS)}")
+    found: list[Condition] = []
+    while parts:
+        part = parts.pop(0)
+        if parts and parts[0].lower() in CHANNEL_STATES:
+            text = f"{part} {parts[0].lower()}"
+            meant = tuple(name for name in names if name == part or name.startswith(f"{part}."))
+            if not meant:
+                raise ConfigError(f"--check: {text!r} names no channel, expected one of: {', '.join(names)}")
+            found.append(Condition(text, parts.pop(0).lower(), channels=meant))
+            continue
+        condition = _on_quantity(part)
+        if not faults and condition.name in _OF_FAULTS and part != "isolated":
+            raise ConfigError(
+                f"--check: {part!r} is about injected faults, and none is given by --fault; of a recording as it is ask"
+                " declared=0, isolated, or CHANNEL faulty"
+            )
+        found.append(condition)
+    return found
+
+
+def _on_quantity(part: str) -> Condition:
+    match = _TERM.fullmatch(part)
+    assert match is not None
+    name, sign, number = match[1], match[2] or "", match[3]
+    if name not in _FORMS:
+        raise ConfigError(f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(_FORMS)}")
+    if sign not in _FORMS[name]:
+        expected = " or ".join(f"{name}{form}NUMBER" if form else name for form in _FORMS[name])
+        what = f"is compared by {sign!r}" if sign else "has no bound"
+        raise ConfigError(f"--check: {part!r} {what}, expected {expected}")
+    if not sign:
+        return Condition(part, name)
+    try:
+        bound = float(number)
+    except ValueError:
+        bound = math.nan
+    if not 0 <= bound < math.inf:
+        raise ConfigError(f"--check: {part!r} has the bound {number!r}, expected a number from 0 on")
+    # No quantity is below 0, no share above 1, no count a fraction.
+    most = 1.0 if name == "judged" else math.inf
+    if (sign, bound) in (("<", 0.0), (">", most)) or bound > most or (sign == "=" and bound % 1 != 0):
+        raise ConfigError(f"--check: {part!r} can never hold")
+    return Condition(part, name, sign, bound)

@@ -24,19 +24,49 @@ import base64
 import html
 import json
 import math
+import os
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.samples import Array
-from fdi_ros.report.verdict import Severity
 from fdi_ros.system.text import LINE, WORD, date_of, shown, visible
+
+
+class Severity(Enum):
+    """How bad a verdict is; the value is its class on a page."""
+
+    GOOD = "good"  # nothing to do
+    UNKNOWN = "unknown"  # the data do not tell, or not enough
+    BAD = "bad"  # somebody must act
+
+    @property
+    def exit_code(self) -> int:
+        """Of a verb that ends with such a verdict; 1 is an unmet ``--check``, 2 a request that is wrong."""
+        return {Severity.GOOD: 0, Severity.UNKNOWN: 4, Severity.BAD: 3}[self]
+
+
+class Verdict(NamedTuple):
+    """One line, and how bad it is."""
+
+    severity: Severity
+    words: str  # begins with the word of the verdict in capitals: ``HEALTHY: ...``
+
+
+def with_first_line_coloured(text: str, severity: Severity, stream: TextIO) -> str:
+    """Return a text whose first line has the colour of its severity, where the stream is a terminal that wants it."""
+    if not stream.isatty() or os.environ.get("NO_COLOR"):
+        return text
+    colour = {Severity.GOOD: 32, Severity.UNKNOWN: 33, Severity.BAD: 31}[severity]
+    first, end, rest = text.partition("\n")
+    return f"\x1b[1;{colour}m{first}\x1b[0m{end}{rest}"
 
 
 class Unit(NamedTuple):
@@ -63,8 +93,7 @@ def unit_of(degrees: bool) -> Unit:
     return DEGREES if degrees else RADIANS
 
 
-Rows = tuple[Sequence[str], Sequence[Sequence[str]]]
-"""Head and rows of a table, as `table` and `html_table` take them."""
+Rows = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows of a table, as `table` and `html_table` take them
 Columns = Mapping[str, Callable[[Any], str]]
 """Columns of a table by their heads: what each says of that which a row is about."""
 
@@ -112,33 +141,16 @@ def _cells(column: Column) -> Iterator[list[str]]:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:
-    """Lay out rows of words in columns as wide as their widest entries.
+    """Lay out lines of words in columns as wide as their widest entries; what a terminal would obey is escaped.
 
-    Parameters
-    ----------
-    head
-        Names of the columns.
-    rows
-        Texts that may come from a file: what a terminal would obey is escaped.
-    figures
-        The columns after the first hold figures, which end below each other. Else all hold words, which begin below
-        each other; long ones are shortened.
-
-    Returns
-    -------
-    The lines.
+    ``figures``: the columns after the first hold figures, which end below each other. Else all hold words, which begin
+    below each other; long ones are shortened.
     """
     most = LINE if figures else WORD
     lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
-    width = [max(len(line[k]) for line in lines) for k in range(len(head))]
-    right = [figures and k > 0 for k in range(len(head))]
-    return [
-        "  ".join(
-            cell.rjust(wide) if to_right else cell.ljust(wide)
-            for cell, wide, to_right in zip(line, width, right, strict=True)
-        ).rstrip()
-        for line in lines
-    ]
+    width = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    form = "  ".join(f"{{:{'>' if figures and k else '<'}{wide}}}" for k, wide in enumerate(width))
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def indented(lines: Iterable[str]) -> str:
@@ -163,18 +175,12 @@ def milliseconds(seconds: float | None) -> str:
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
 """Colours that differ for colour-blind people too (after Okabe and Ito)."""
-CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
-"""As many as there may be channels."""
-LONG = 24
-"""Characters from which on the text of a cell may go on in a second line."""
-TERMINAL = 110
-"""Characters in a line of sentences."""
-PAPER_ROWS = 60
-"""Of a table, as page.css has it."""
-FEWEST_LINKED = 4
-"""Sections from which on a page has a table of contents."""
+CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")  # as many as there may be channels
+LONG = 24  # characters from which on the text of a cell may go on in a second line
+TERMINAL = 110  # characters in a line of sentences
+PAPER_ROWS = 60  # of a table, as page.css has it
+FEWEST_LINKED = 4  # sections from which on a page has a table of contents
 TIME_AXIS = "s from the first sample"
-_KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "table.js", "page.js")
 
 
@@ -268,6 +274,8 @@ def page(
     origin
         UTC that times count from, ns; None: not known.
     """
+    # The first sentence has the colour of its severity.
+    looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
     for section in (_speaking(section, store) for section in sections):
@@ -275,7 +283,7 @@ def page(
         figures += section.figures
     parts = {
         "TITLE": escape(title),
-        "VERDICT": _verdict(summary, severity),
+        "VERDICT": "".join(f"<li{look}>{escape(line)}</li>" for look, line in zip(looks, summary, strict=False)),
         "CONTENTS": _contents(sections),
         "BODY": "\n".join(part for part in body if part),
         "STYLE": _resource("page.css"),
@@ -292,12 +300,6 @@ def page(
     return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
 
 
-def _verdict(summary: Sequence[str], severity: Severity | None) -> str:
-    """Lay out what stands at the top; the first sentence in the colour of its severity."""
-    looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
-    return "".join(f"<li{look}>{escape(line)}</li>" for look, line in zip(looks, summary, strict=False))
-
-
 def _contents(sections: Sequence[Section]) -> str:
     """Lay out links to the sections."""
     links = (f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
@@ -311,9 +313,7 @@ def _anchor(section: Section) -> str:
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
     """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
-    figures = [
-        figure for figure in map(_checked, section.figures) if any(_draws(trace, store) for trace in figure["data"])
-    ]
+    figures = [figure for figure in section.figures if any(_draws(trace, store) for trace in figure["data"])]
     if len(figures) == len(section.figures):
         return section
     words = "" if figures else "Nothing to draw: there are no values."
@@ -333,17 +333,12 @@ def _section(section: Section, number: int) -> list[str]:
     head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
     if not section.figures:
         return [f'<section id="{_anchor(section)}">{head}{html_of(section.content)}</section>']
-    places = [
-        f'<figure data-figure="{number + k}"><div class="stage" tabindex="0"></div></figure>'
-        for k in range(len(section.figures))
-    ]
+    numbers = range(number, number + len(section.figures))
+    places = [f'<figure data-figure="{k}"><div class="stage" tabindex="0"></div></figure>' for k in numbers]
     # On paper the head stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    return [
-        f'<section id="{_anchor(section)}" class="plots">{first}',
-        *places[1:],
-        f"{html_of(section.content)}</section>",
-    ]
+    begin, end = f'<section id="{_anchor(section)}" class="plots">{first}', f"{html_of(section.content)}</section>"
+    return [begin, *places[1:], end]
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
@@ -360,13 +355,6 @@ def colour_of(channel: int) -> str:
 def drawn(value: float | None) -> float | None:
     """Return a value as a figure has it: to four digits, None where it is not known, or not finite."""
     return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None
-
-
-def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
-    unknown = {trace["type"] for trace in figure["data"]} - _KINDS
-    if unknown:
-        raise ValueError(f"unknown type of plot: {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
-    return figure
 
 
 def _safe_json(data: Any) -> str:
@@ -390,8 +378,7 @@ def _resource(name: str) -> str:
 # Series of any length, made small: few bytes per value, and no more values than a page may have ----------------------
 
 
-BYTES = 600_000
-"""Text that the series of a page may take."""
+BYTES = 600_000  # text that the series of a page may take
 FINE, SMALL = "f4", "f2"
 """Kinds of a series: 24 bits, for values that are looked at against each other; 11 bits, 0.05 % of the value."""
 LARGEST_HALF = 65504.0
@@ -399,81 +386,48 @@ _TEXT = 4 / 3  # characters of base64 per byte
 
 
 class PageStore:
-    """Series over one time, of which a page keeps all samples, or the extremes of spans of samples.
-
-    Parameters
-    ----------
-    kinds
-        Name and kind of each series.
-    """
-
-    def __init__(self, kinds: Mapping[str, str]) -> None:
-        self.kinds = dict(kinds)
-        size = 8 + sum(int(kind[1]) for kind in kinds.values())
-        self._envelope = Envelope(len(kinds), max(200, int(BYTES / _TEXT / size)))
-
-    @property
-    def width(self) -> int:
-        """Samples in one span."""
-        return self._envelope.width
-
-    def add(self, time: Array, columns: Sequence[Array]) -> None:
-        """Take in the next samples: time (N,) s, and columns (N, any) that together hold every series in order."""
-        values = np.column_stack(columns)
-        self._envelope.add(time, np.where(np.isfinite(values), values, np.nan))
-
-    def shows(self, name: str) -> bool:
-        """Whether a series has any value."""
-        column = list(self.kinds).index(name)
-        return bool(np.isfinite(self._envelope.spans()[1][:, column]).any())
-
-    def data(self) -> dict[str, Any]:
-        """Return what the page's script reads."""
-        time, low, high = self._envelope.spans()
-        series = {}
-        for k, (name, kind) in enumerate(self.kinds.items()):
-            columns = [low[:, k], high[:, k]] if self.width > 1 else [low[:, k]]
-            series[name] = (kind, _packed(np.column_stack(columns), kind))
-        return {"time": _packed(time, "f8"), "width": self.width, "series": series}
-
-
-class Envelope:
-    """Minimum and maximum of c series over spans of samples; memory does not grow.
+    """Series over one time, of which a page keeps all samples, or the extremes of spans of samples; memory is bounded.
 
     When there are too many spans, neighbours are put together and the next spans are twice as long.
 
     Parameters
     ----------
-    columns
-        Number of series c.
+    kinds
+        Name and kind of each of c series.
     most
         Spans kept at most, 2 or more; half of them once samples are put together: a span of several samples is two
-        values, of one it is one.
+        values, of one it is one. None: as many as a page may hold.
     """
 
-    def __init__(self, columns: int, most: int) -> None:
-        self.most = most
-        self.width = 1
-        """Samples in a new span."""
+    def __init__(self, kinds: Mapping[str, str], most: int | None = None) -> None:
+        self.kinds = dict(kinds)
+        size = 8 + sum(int(kind[1]) for kind in kinds.values())
+        self._most = most or max(200, int(BYTES / _TEXT / size))
+        self.width = 1  # samples in a new span
         self._time = np.empty(0)
-        self._low = np.empty((0, columns))
-        self._high = np.empty((0, columns))
-        self._waiting = (np.empty(0), np.empty((0, columns)))
+        self._low = self._high = np.empty((0, len(kinds)))
+        self._waiting = (np.empty(0), np.empty((0, len(kinds))))
 
     def add(self, time: Array, values: Array) -> None:
-        """Take in the next samples: time (N,) s, values (N, c); NaN is nothing."""
-        time, values = np.concatenate([self._waiting[0], time]), np.vstack([self._waiting[1], values])
+        """Take in the next samples: time (N,) s, values (N, c) of every series in order."""
+        values = np.vstack([self._waiting[1], np.where(np.isfinite(values), values, np.nan)])
+        time = np.concatenate([self._waiting[0], time])
         whole = len(time) // self.width * self.width
         self._waiting = time[whole:], values[whole:]
         if whole:
             self._store(time[: whole : self.width], values[:whole], values[:whole], self.width)
-        while len(self._time) > (self.most if self.width == 1 else self.most // 2):
+        while len(self._time) > (self._most if self.width == 1 else self._most // 2):
             time, low, high = self._time, self._low, self._high
             self._time, self._low, self._high = time[:0], low[:0], high[:0]
             even = len(time) // 2 * 2
             self._store(time[:even:2], low[:even], high[:even], 2)
             self._store(time[even:], low[even:], high[even:], 1)
             self.width *= 2
+
+    def _store(self, time: Array, low: Array, high: Array, together: int) -> None:
+        low, high = _extremes(low, high, together)
+        self._time = np.concatenate([self._time, time])
+        self._low, self._high = np.vstack([self._low, low]), np.vstack([self._high, high])
 
     def spans(self) -> tuple[Array, Array, Array]:
         """Return what there is: time of the first sample (k,), smallest and largest values (k, c)."""
@@ -483,10 +437,19 @@ class Envelope:
         low, high = _extremes(values, values, len(time))
         return np.append(self._time, time[:1]), np.vstack([self._low, low]), np.vstack([self._high, high])
 
-    def _store(self, time: Array, low: Array, high: Array, together: int) -> None:
-        low, high = _extremes(low, high, together)
-        self._time = np.concatenate([self._time, time])
-        self._low, self._high = np.vstack([self._low, low]), np.vstack([self._high, high])
+    def shows(self, name: str) -> bool:
+        """Whether a series has any value."""
+        return bool(np.isfinite(self.spans()[1][:, list(self.kinds).index(name)]).any())
+
+    def data(self) -> dict[str, Any]:
+        """Return what the page's script reads."""
+        time, *extremes = self.spans()
+        kept = extremes if self.width > 1 else extremes[:1]
+        series = {
+            name: (kind, _packed(np.column_stack([values[:, k] for values in kept]), kind))
+            for k, (name, kind) in enumerate(self.kinds.items())
+        }
+        return {"time": _packed(time, "f8"), "width": self.width, "series": series}
 
 
 def _packed(values: Array, kind: str) -> str:

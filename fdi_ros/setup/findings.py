@@ -26,8 +26,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
-from fdi_ros.report.layout import RADIANS, Unit, first_of
-from fdi_ros.report.verdict import Severity, Verdict
+from fdi_ros.report.layout import RADIANS, Severity, Unit, Verdict, first_of
 from fdi_ros.setup.agreement import LEAST_ROTATION
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH

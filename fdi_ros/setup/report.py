@@ -17,6 +17,7 @@ from fdi_ros.report.layout import (
     RADIANS,
     Column,
     Section,
+    Severity,
     Unit,
     colour_of,
     drawn,
@@ -27,7 +28,6 @@ from fdi_ros.report.layout import (
     time_layout,
     told,
 )
-from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.findings import Finding, Role, copy_words, findings_figures, lines_of, topic_findings, verdict_of
 from fdi_ros.setup.inspect import topic_columns

@@ -32,7 +32,7 @@ from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
 from fdi_ros.experiments.montecarlo import load_study
 from fdi_ros.faults.fault import load_scenario
-from fdi_ros.replay.run import Request, replay
+from fdi_ros.replay.run import replay
 from fdi_ros.setup.inspect import inspect
 from fdi_ros.system.text import shown
 
@@ -150,7 +150,7 @@ def test_of_a_damaged_recording_nothing_is_lost_without_a_word(make, tmp_path):
 def outcome(path):
     """The error, or what is said of a partial result; empty if something is missing and nothing is said."""
     try:
-        summary = replay(Request(path, CONFIG))
+        summary = replay(path, CONFIG)
     except BagError as error:
         return str(error)
     counts = [item for counts in summary.stream.alignment.values() for item in counts.items()]
@@ -164,7 +164,7 @@ def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unp
     data = path.read_bytes()
     at = data.index(b"\x04\x00\x00\x00zstd")
     path.write_bytes(data[: at - 12] + struct.pack("<Q", 1 << 40) + data[at - 4 :])
-    summary = replay(Request(path, CONFIG))
+    summary = replay(path, CONFIG)
     assert 0 < summary.scores.samples < SAMPLES
     assert "claims 1099511627776 bytes, expected at most" in summary.stream.damage[0]
     size = struct.unpack_from("<Q", data, at + 8)[0]
@@ -172,7 +172,7 @@ def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unp
     bomb = bomb + bytes(size - len(bomb)) if len(bomb) < size else bomb[:size]
     path.write_bytes(data[: at + 16] + bomb + data[at + 16 + size :])
     with bounded(growth=200_000):
-        assert replay(Request(path, CONFIG)).stream.damage
+        assert replay(path, CONFIG).stream.damage
 
 
 def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(tmp_path):
@@ -180,7 +180,7 @@ def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(t
 
     def said():
         with bounded(5):
-            summary = replay(Request(path, CONFIG))
+            summary = replay(path, CONFIG)
         assert summary.scores.samples == 20
         return summary.stream.damage
 

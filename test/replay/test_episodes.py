@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from monitor.streams import output_of
+from monitor.streams import output_of, parallel
 
 from fdi_ros.core.decision import ChannelState, Reason
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
-from fdi_ros.replay.episodes import GAP, Stretches, detail_words, episode_words, pieces, size_words, stretch_words
-from fdi_ros.replay.recorder import Recorder
-from fdi_ros.replay.size import Batches, Size
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.episodes import GAP, Size, detail_words, episode_words, pieces, size_words, stretch_words
+from fdi_ros.replay.recorder import Batches, Recorder
+from fdi_ros.replay.run import Sink, Walk
 
 S = ChannelState
 THREE = Geometry.from_triads([np.eye(3)] * 3)
@@ -230,12 +231,16 @@ def test_a_new_stretch_is_told_of_for_itself():
 
 @given(st.lists(st.floats(0.001, 30.0), min_size=1, max_size=60), st.integers(1, 20))
 def test_stretches_are_cut_at_gaps_and_nowhere_else(steps, count):
-    stamp = np.cumsum(np.round(np.array(steps) * 1e9)).astype(np.int64)
-    stretches, found = Stretches(), [[]]
+    found: list[list[int]] = [[]]
+
+    class Parts(Sink):
+        def begin_stretch(self):
+            found.append([])
+
+    stamp, walk = np.cumsum(np.round(np.array(steps) * 1e9)).astype(np.int64), Walk(Pipeline(parallel(2)), [Parts()])
     for part in np.array_split(stamp, count):
-        for anew, block in stretches.cut(Block(part, np.zeros((len(part), 1)))):
-            found += [[]] * (anew and found != [[]])
-            found[-1] = found[-1] + block.stamp.tolist()
+        for block in walk.pieces(Block(part, np.zeros((len(part), 6)))):
+            found[-1] += block.stamp.tolist()
     assert found == [stamp[rows].tolist() for rows in pieces(stamp, GAP)]
     assert [at for part in found for at in part] == stamp.tolist()
 

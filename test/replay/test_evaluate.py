@@ -16,10 +16,9 @@ from fdi_ros.core.decision import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event
-from fdi_ros.replay.evaluate import Evaluation
-from fdi_ros.replay.outcomes import score
+from fdi_ros.replay.outcomes import Evaluation, score
 from fdi_ros.replay.words import fault_sections, sentences, verdict
-from fdi_ros.report.verdict import Severity
+from fdi_ros.report.layout import Severity
 
 S = ChannelState
 GEOMETRY = Geometry.two_triad_cone()

@@ -17,8 +17,8 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, OutputBag
-from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.outputs import OutputBag
+from fdi_ros.replay.run import Sink, replay
 
 ROOT = Path(__file__).parents[2]
 NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
@@ -38,10 +38,10 @@ def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("written") / "out"
     config = Config.from_file(ROOT / "config" / "two_imus.yaml")
     fault = parse_fault("channel=imu_1.y kind=bias size=0.2 start=20")
-    request = Request(ROOT / "bags" / "cone_flight", config, (fault,), period=DIAGNOSTICS_PERIOD)
+    request = (ROOT / "bags" / "cone_flight", config, (fault,))
     keep = Keep()
     with OutputBag(path, config, 6) as bag:
-        summary = replay(request, [bag, keep])
+        summary = replay(*request, sinks=[bag, keep])
     events = [event for output in keep.outputs for event in output.events]
     output = Output(np.concatenate([output.rows for output in keep.outputs]), 6, events)
     integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])
@@ -66,7 +66,7 @@ def read_by(path, rosbags):
 
 def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
     """So does rclpy: these are the bytes of its own serialiser, test/sources/test_messages.py."""
-    path, output, integrity, _, request = written
+    path, output, integrity, _, (bag, config, _) = written
     messages = read_by(path, False)[0]
     assert read_by(path, True)[0] == messages
     rows = np.flatnonzero(output.valid)
@@ -80,11 +80,11 @@ def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
         assert message.header.frame_id == "base_link"
     values = [STORE.deserialize_cdr(data, ARRAY).data for _, data in messages["/fdi_node/integrity"]]
     np.testing.assert_array_equal(values, integrity)
-    with Recording(request.bag) as recording:
+    with Recording(bag) as recording:
         originals = defaultdict(list)
-        for batch in recording.batches(request.config.topics):
+        for batch in recording.batches(config.topics):
             for k in range(len(batch)):
-                topic = f"/{request.config.topics[batch.topic[k]].lstrip('/')}"
+                topic = f"/{config.topics[batch.topic[k]].lstrip('/')}"
                 originals[topic].append((int(batch.log_time[k]), batch.message(k)))
     assert {topic: messages[topic] for topic in originals} == originals
 
@@ -135,7 +135,7 @@ def test_schemas_and_type_hashes_are_those_of_jazzy(written):
 
 def test_the_output_is_a_recording_that_replays_to_the_same(written):
     path, _, _, summary, request = written
-    again = replay(Request(path, request.config, request.faults))
+    again = replay(path, *request[1:])
     assert again.scores.events == summary.scores.events
     effects = (astuple(one.scores.fault_effect_rad_s) for one in (again, summary))
     assert next(effects) == pytest.approx(next(effects), rel=1e-9)

@@ -21,11 +21,10 @@ from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import build_geometry
-from fdi_ros.replay.check import failures, parse_check
-from fdi_ros.replay.evaluate import GRACE
-from fdi_ros.replay.run import Request, Sink, replay
-from fdi_ros.replay.words import noisy_lines, sentences, verdict
-from fdi_ros.report.verdict import Severity
+from fdi_ros.replay.outcomes import GRACE
+from fdi_ros.replay.run import Sink, replay
+from fdi_ros.replay.words import failures, noisy_lines, parse_check, sentences, verdict
+from fdi_ros.report.layout import Severity
 
 FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0
 """In this part of the bundled flight every channel moves."""
@@ -61,7 +60,7 @@ def cone(root, **changes):
 @pytest.fixture(scope="module")
 def sound(root, flight):
     keep = Keep()
-    replay(Request(flight, cone(root, **UNCALIBRATED), start=FIRST, end=END), [keep])
+    replay(flight, cone(root, **UNCALIBRATED), start=FIRST, end=END, sinks=[keep])
     return keep
 
 
@@ -70,7 +69,7 @@ def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound
     """Times count from the first message, whatever part is replayed."""
     fault = examples("g5", "g4,g5,g6", BEGIN, STOP)[kind]
     config, faulty = cone(root, **UNCALIBRATED), Keep()
-    summary = replay(Request(flight, config, (fault,), start=FIRST, end=END), [faulty])
+    summary = replay(flight, config, (fault,), start=FIRST, end=END, sinks=[faulty])
     stamp = faulty.stacked("stamp")
     truth = Injector([fault], build_geometry(config).channel_names, int(stamp[0]) - round(FIRST * 1e9))
     np.testing.assert_array_equal(faulty.z[~truth.struck(stamp)], sound.z[~truth.struck(stamp)])
@@ -98,11 +97,11 @@ def test_every_detector_is_scored_on_every_kind(root, flight):
     assert {fault.kind.name for fault in faults} == set(FAULT_KINDS)
     assert max(fault.stop for fault in faults) < 60.0, "the flight ends before"
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
-    requests = {name: Request(flight, config.replaced({"detector.name": name}), faults) for name in DETECTORS}
+    configs = {name: config.replaced({"detector.name": name}) for name in DETECTORS}
     with pytest.raises(FdiError, match="determinant has 6 channels, expected 5"):
-        replay(requests.pop("determinant"))
-    for name, request in requests.items():
-        scores = replay(request).scores
+        replay(flight, configs.pop("determinant"), faults)
+    for name, one in configs.items():
+        scores = replay(flight, one, faults).scores
         assert scores.samples == 6001
         for found, fault in zip(scores.faults, faults, strict=True):
             assert (found.channel, found.kind, found.start_s) == (fault.channel, fault.kind.name, fault.start)
@@ -121,7 +120,7 @@ BIAS = "kind=bias size=0.2 start=20"
 @pytest.fixture(scope="module")
 def told(root, flight):
     """The flight with a bias on one channel."""
-    return replay(Request(flight, cone(root), (parse_fault(f"channel=g2 {BIAS}"),)))
+    return replay(flight, cone(root), (parse_fault(f"channel=g2 {BIAS}"),))
 
 
 def written(folder, z, gone=10**9, apart=1000):
@@ -144,7 +143,7 @@ def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
     z[20:30, [0, 3]] = 2.0
     config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
     fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
-    effect = replay(Request(written(tmp_path, z, apart=0), config, (fault,))).scores.fault_effect_rad_s
+    effect = replay(written(tmp_path, z, apart=0), config, (fault,)).scores.fault_effect_rad_s
     column = build_geometry(config).least_squares[:, :2].sum(axis=1)
     assert effect.without_monitor == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
     assert max(value or 0.0 for value in astuple(effect)) < 0.2
@@ -156,7 +155,7 @@ def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monk
     for together in (50, 777, 16384):
         monkeypatch.setattr(samples_module, "_TOGETHER", together)
         keep = Keep()
-        scores = replay(Request(flight, config, load_scenario(SCENARIO)), [keep]).scores
+        scores = replay(flight, config, load_scenario(SCENARIO), sinks=[keep]).scores
         results.append((scores.events, scores.faults, scores.declared, keep.stacked("rate").tobytes()))
     assert results[0] == results[1] == results[2]
 
@@ -165,20 +164,20 @@ def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monk
 def test_the_six_gyros_as_one_array_and_as_two_imus_say_the_same(file, channel, told, root, flight):
     """Sound, no declaration; of a fault the same one at the same sample."""
     config = Config.from_file(root / "config" / file)
-    summary = replay(Request(flight, config))
+    summary = replay(flight, config)
     assert summary.scores.declared == ()
     severity, words = verdict(summary)
     assert severity is Severity.GOOD
     assert re.fullmatch(r"HEALTHY: no fault declared in 60.0 s; 6 channels, each checked in 9\d% .* or more\.", words)
     assert sentences(summary) == []
-    (fault,) = replay(Request(flight, config, (parse_fault(f"channel={channel} {BIAS}"),))).scores.faults
+    (fault,) = replay(flight, config, (parse_fault(f"channel={channel} {BIAS}"),)).scores.faults
     assert fault.declared_channels == (channel,)
     assert fault.delay_s == pytest.approx(told.scores.faults[0].delay_s, abs=0.0101)
 
 
 def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     z, keep = recordings.flight(600)[1], Keep()
-    summary = replay(Request(written(tmp_path, z, gone=400), CALM), [keep])
+    summary = replay(written(tmp_path, z, gone=400), CALM, sinks=[keep])
     assert keep.stacked("valid")[-1]
     assert summary.stream.alignment[TOPICS[1]]["missing"] == 200
     assert summary.scores.samples_judged > 0.5 * summary.scores.samples
@@ -198,13 +197,13 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     whole = written(tmp_path, z)
     for stop, expected in ((" stop=5.5", 0), ("", 0)):
         fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
-        assert len(failures(parse_check("false=0", 1), replay(Request(whole, CALM, (fault,))))) == expected
+        assert len(failures(parse_check("false=0", 1), replay(whole, CALM, (fault,)))) == expected
 
 
 def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
     """A unit whose delay is taken off lacks the last samples: so the recording ends, and no channel is at fault."""
     config = CALM.replaced({"imus.delays": [0.0, 0.07]})
-    summary = replay(Request(written(tmp_path, recordings.flight(600)[1]), config))
+    summary = replay(written(tmp_path, recordings.flight(600)[1]), config)
     assert summary.scores.events[-1].state == "UNCHECKED"
     assert {one.state for one in summary.monitor.channels} == {"OK"}
     assert failures(parse_check("declared=0", 0), summary) == []
@@ -216,14 +215,14 @@ def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
 def test_channels_much_noisier_than_the_others_are_told_of(tmp_path, noise, channels):
     z = recordings.flight(2000)[1]
     z[:, 4] += np.random.default_rng(3).normal(0, noise, len(z))
-    lines = noisy_lines(replay(Request(written(tmp_path, z), CALM)))
+    lines = noisy_lines(replay(written(tmp_path, z), CALM))
     assert [line.partition(" is much noisier than the others")[0] for line in lines] == channels
 
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 1.0}
     config = Config.from_parameters({**PARAMETERS, **learning})
-    summary = replay(Request(written(tmp_path, recordings.flight(200)[1]), config))
+    summary = replay(written(tmp_path, recordings.flight(200)[1]), config)
     assert summary.scores.samples_judged == 0
     severity, words = verdict(summary)
     assert severity is Severity.UNKNOWN
@@ -236,7 +235,7 @@ def test_faults_in_a_recording_of_real_units_are_found(root, recording):
     """Without one nothing is declared: test_recording.py."""
     config = Config.from_file(root / "config" / "three_imus.yaml")
     faults = load_scenario(root / "config" / "scenarios" / "imu_lost_then_bias.yaml")
-    summary = replay(Request(recording, config, faults, end=180.0))
+    summary = replay(recording, config, faults, end=180.0)
     assert [fault.isolated for fault in summary.scores.faults] == [True, True]
     assert summary.scores.declared == ()
     assert summary.stream.messages == 3 * summary.scores.samples

@@ -17,11 +17,10 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.replay.check import failures, parse_check
-from fdi_ros.replay.run import Request, replay
+from fdi_ros.replay.run import replay
 from fdi_ros.replay.summary import as_json
 from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep
-from fdi_ros.replay.words import summary_text, verdict
+from fdi_ros.replay.words import failures, parse_check, summary_text, verdict
 
 JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
 """Words that only an injected fault makes true."""
@@ -70,7 +69,7 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
 @pytest.fixture(scope="module")
 def told(faulty, root):
     """The summary of its replay."""
-    return replay(Request(faulty, Config.from_file(root / "config" / "three_imus.yaml")))
+    return replay(faulty, Config.from_file(root / "config" / "three_imus.yaml"))
 
 
 def visible(path):
@@ -89,7 +88,7 @@ def visible(path):
     ],
 )
 def test_a_check_works_without_an_injected_fault(check, unmet, told):
-    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), told)
+    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3).channel_names), told)
     assert found[0].startswith(unmet) if unmet else found == [], found
 
 
@@ -111,7 +110,7 @@ def armings(tmp_path, fdi):
 
 
 def test_two_armings_are_judged_and_counted_each_for_itself(armings):
-    summary = replay(Request(*armings))
+    summary = replay(*armings)
     text = summary_text(summary)
     assert not re.search(r"\bor  |one of [\w.]+ is", text), text
     assert "stamps far ahead of all others, refused (1)" in text
@@ -124,12 +123,12 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     assert [round(one["start_s"]) for one in as_json(summary)["stretches"]] == [0, 100]
     # What stood at the end of the first is no evidence in the second.
     early = parse_fault("channel=imu_0.x kind=bias size=0.1 start=20 stop=50")
-    first, second = replay(Request(*armings, (early,))).story.episodes
+    first, second = replay(*armings, (early,)).story.episodes
     assert (first.stretch, first.channels, first.injected) == (1, ("imu_0.x",), ("bias on imu_0.x",))
     assert (second.stretch, second.channels, second.injected) == (2, ("imu_2.y",), ())
     late = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
     with pytest.raises(FaultError, match=r"starts at 60 s, expected at most 29\.99 s or at least"):
-        replay(Request(*armings, (late,)))
+        replay(*armings, (late,))
 
 
 def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
@@ -157,6 +156,6 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
     assert (flight["error"], flight["episodes"], one["channels"]) == ("", 1, ["imu_2.y"])
     assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
     assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)
-    summary = replay(Request(folder / "log.bin", Config.from_file(flight["config"])))
+    summary = replay(folder / "log.bin", Config.from_file(flight["config"]))
     assert [episode.words for episode in summary.story.episodes] == [one["words"]]
     assert flight["why"] == [verdict(summary).words]

@@ -9,15 +9,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.report.layout import Envelope
+from fdi_ros.report.layout import FINE, PageStore
 
 
 def fed(time, values, most, cuts):
-    envelope = Envelope(values.shape[1], most)
+    store = PageStore(dict.fromkeys("abc"[: values.shape[1]], FINE), most)
     edges = sorted({0, len(time), *(min(cut, len(time)) for cut in cuts)})
     for first, last in itertools.pairwise(edges):
-        envelope.add(time[first:last], values[first:last])
-    return envelope
+        store.add(time[first:last], values[first:last])
+    return store
 
 
 @given(
