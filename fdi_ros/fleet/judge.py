@@ -88,26 +88,25 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
 
 def _is_recording(path: Path, unread: list[str]) -> bool:
     """Whether a file is a recording; what is only called so is noted."""
-    name = path.name.lower()
+    name, suffix = path.name.lower(), path.suffix.lower()
     if not name.endswith((*SUFFIXES, *LOG_SUFFIXES)) or not path.is_file():
         return False
     if not name.endswith(LOG_SUFFIXES):
         return True
     # Firmware and much else is called .bin, too, and any table .csv.
-    magic = MAGIC if path.suffix.lower() == ".bag" else LOGS[path.suffix.lower()].magic
+    magic = MAGIC if suffix == ".bag" else LOGS[suffix].magic
     try:
         with open_regular(path) as file:
+            if suffix == ".csv":
+                return has_gyros(file)
             begin = file.read(len(LFS))
-            table = path.suffix.lower() == ".csv" and has_gyros(file)
     except OSError:
         # Reading it says what is wrong.
         return True
-    if path.suffix.lower() == ".csv":
-        return table
     # An empty log is a log that was lost; so is one that git has put elsewhere.
-    if begin and not begin.startswith((magic, LFS)):
-        unread.append(f"{path} is no flight log")
-    return not begin or begin.startswith((magic, LFS))
+    known = not begin or begin.startswith((magic, LFS))
+    unread += [] if known else [f"{path} is no flight log"]
+    return known
 
 
 # Judged ---------------------------------------------------------------------------------------------------------------
@@ -196,9 +195,9 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
     summary = replay(path, config, sinks=[seen])
     if seen.first is None:
         raise BagError("its topics have no time in common: there is no sample of all channels")
-    row = _row(replace(flight, date=_date(seen.first), noise=seen.noise), summary)
     looks |= {f"{second} gives the values of {first}: one sensor" for first, second in seen.copies}
-    row = replace(row, why=(*sorted(looks), *row.why))
+    noise = tuple(seen.segments.noise().quiet.tolist())
+    row = _row(replace(flight, date=_date(seen.first), noise=noise, why=tuple(sorted(looks))), summary)
     origin = seen.first - round(summary.scores.start_s * 1e9)
     return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
@@ -217,7 +216,7 @@ class _Seen(Sink):
 
     def __init__(self, rate: float) -> None:
         self.first: int | None = None  # ns
-        self._rate, self._segments = rate, NoiseSegments(0)
+        self._rate, self.segments = rate, NoiseSegments(0)
         self.copies: set[tuple[str, str]] = set()
         """Units, with their topics, of which the second gives the values of the first."""
 
@@ -225,15 +224,10 @@ class _Seen(Sink):
         if not len(block):
             return
         if self.first is None:
-            self.first, self._segments = int(block.stamp[0]), NoiseSegments(block.z.shape[1])
+            self.first, self.segments = int(block.stamp[0]), NoiseSegments(block.z.shape[1])
         whole = np.isfinite(block.z).all(axis=1)
-        self._segments.add(block.z[whole], block.stamp[whole], self._rate)
+        self.segments.add(block.z[whole], block.stamp[whole], self._rate)
         self.copies |= {*pipeline.status().copies}
-
-    @property
-    def noise(self) -> tuple[float, ...]:
-        """Of each channel at the quietest, rad/s."""
-        return tuple(self._segments.noise().quiet.tolist())
 
 
 def _row(known: Flight, summary: Summary) -> Flight:
@@ -245,7 +239,7 @@ def _row(known: Flight, summary: Summary) -> Flight:
     why = [found.words] if found.severity is not Severity.GOOD else []
     return replace(
         known,
-        why=(*why, *sample_rate_notes(stream.sample_rate)),
+        why=(*known.why, *why, *sample_rate_notes(stream.sample_rate)),
         duration=summary.scores.duration_s,
         damage=stream.damage,
         watched=math.fsum(one.watched_s for one in summary.story.stretches),
@@ -261,8 +255,8 @@ def _row(known: Flight, summary: Summary) -> Flight:
 
 def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
     """Return the row of an episode; `origin`: what its times count from, ns."""
-    sizes = [one.apart.size] if one.apart is not None else [each.size for each in one.candidates]
-    largest = max((size for size in sizes if size is not None), key=lambda size: abs(size.rad_s), default=None)
+    sizes = [each.size for each in ([one.apart] if one.apart is not None else one.candidates) if each.size is not None]
+    largest = max(sizes, key=lambda size: abs(size.rad_s), default=None)
     return FlightEpisode(
         path=flight.path,
         vehicle=flight.vehicle,

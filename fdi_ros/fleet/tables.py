@@ -170,10 +170,9 @@ class Tables:
         types |= {f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()}
         # As annotated: of what may be unknown, None too.
         kinds = [(one, types[str(one.type).replace(" | None", "")]) for one in fields(columns)]
-        schema = arrow.schema(
-            [arrow.field(one.name, kind, metadata=dict(one.metadata)) for one, kind in kinds],
-            metadata={"fdi_ros": __version__, "columns": str(VERSION), "settings": self._settings},
-        )
+        described = [arrow.field(one.name, kind, metadata=dict(one.metadata)) for one, kind in kinds]
+        about = {"fdi_ros": __version__, "columns": str(VERSION), "settings": self._settings}
+        schema = arrow.schema(described, metadata=about)
         with whole(self._folder / f"{name}.parquet") as scratch, scratch.open("wb") as file:
             parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), file)
 
@@ -214,30 +213,27 @@ class Fleet:
     def verdict(self) -> Verdict:
         """How many flights need a look."""
         count = _count(len(self.flights), "flight")
-        faulty = sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks)
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
+        faulty = sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks)
         failed = sum(bool(row["error"]) for row in self.looks)
         reasons = {"faulty": faulty, "not judged": failed, "cannot be told": len(self.looks) - faulty - failed}
         words = ", ".join(f"{number} {reason}" for reason, number in reasons.items() if number)
-        severity = Severity.BAD if faulty else Severity.UNKNOWN
-        return Verdict(severity, f"LOOK AT {len(self.looks)} of {count}: {words}.")
+        return Verdict(Severity.BAD if faulty else Severity.UNKNOWN, f"LOOK AT {len(self.looks)} of {count}: {words}.")
 
     def lines(self) -> list[str]:
         """Say it all in sentences, the verdict first."""
-        own = self.figures()
-        declaring = sum(row["declared"] > 0 for row in self.judged)
-        lines = [
-            self.verdict.words,
+        own, declaring = self.figures(), sum(row["declared"] > 0 for row in self.judged)
+        counts = (
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
-            f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared.",
-        ]
+            f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared."
+        )
         assumed = (
             f"Of {_count(own['not_measured'], 'flight')} the mounts and axes are what fdi inspect assumes, not"
             " measured: what is declared there may be wrong (--config, --calibrate)."
         )
-        return [*lines, assumed] if own["not_measured"] else lines
+        return [self.verdict.words, counts, *([assumed] if own["not_measured"] else [])]
 
     def text(self) -> str:
         """Return the sentences, and the first flights that need a person, for a terminal."""
@@ -262,9 +258,8 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
     def column(name: str, head: str, say: Any) -> Column:
         return Column(name, [row[name] for row in flights], (head,), say)
 
-    to_see = "fdi replay {} --config {} --report flight.html"
-    quoted = [(shlex.quote(row["path"]), shlex.quote(row["config"])) for row in flights]
-    commands = ["" if row["error"] else to_see.format(*own) for row, own in zip(flights, quoted, strict=True)]
+    words = [("fdi", "replay", row["path"], "--config", row["config"], "--report", "flight.html") for row in flights]
+    commands = ["" if row["error"] else shlex.join(command) for row, command in zip(flights, words, strict=True)]
     return [
         column("path", "flight", lambda path: shown(path.rpartition("/")[2])),
         column("why", "why", lambda why: shown("; ".join(why), WHY) or "-"),

@@ -68,21 +68,17 @@ def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: f
     ``since`` (N,) s from the start of the fault. It is isolated, or in a group, if it is so ``within`` so many s; a
     false isolation counts at any time.
     """
-    if channel is None:
-        isolated = detected = np.inf
-        own = np.zeros(len(since), dtype=bool)
-    else:
-        own = among[:, channel]
-        isolated, detected = _first(alone[:, channel], since), _first(alone[:, channel] | own, since)
-    soon = since <= within
-    others = alone if channel is None else np.delete(alone, channel, axis=1)
+    own = [] if channel is None else [channel]
+    others, soon = np.delete(alone, own, axis=1), since <= within
+    isolated, detected = _first(alone[:, own], since), _first(alone[:, own] | among[:, own], since)
     found = isolated <= within and isolated < np.inf
-    outcome = outcome_of(bool(others.any()), found, bool(own[soon].any()), bool(among[soon].any()))
+    outcome = outcome_of(bool(others.any()), found, bool(among[:, own][soon].any()), bool(among[soon].any()))
     return Scored(outcome, isolated, detected)
 
 
 def _first(declared: Mask, since: Array) -> float:
-    return float(since[declared.argmax()]) if declared.any() else np.inf
+    rows = np.flatnonzero(declared.any(axis=1))
+    return float(since[rows[0]]) if len(rows) else np.inf
 
 
 # Changes of state, and what they make of each fault ------------------------------------------------------------------
@@ -193,10 +189,9 @@ class Followed:
     """One injected fault, the numbers of the channels that it is injected into, and what has become of it so far."""
 
     def __init__(self, fault: Fault, channels: Sequence[int], names: Sequence[str]) -> None:
-        self.fault, self.channels = fault, channels
+        self.fault, self.channels, self.begun = fault, channels, False
         struck = tuple(names[i] for i in channels)
         self.outcome = Outcome(fault.channel, struck, fault.kind.name, fault.size, fault.start, finite(fault.stop))
-        self.begun = False
         self.detected_stamp: int | None = None  # of the first declaration that names one of its channels, ns
         self._declared: dict[str, bool] = {}  # channels that were declared, and whether by themselves
         self._false: set[str] = set()  # states in which healthy channels were declared while it lasted
@@ -233,8 +228,7 @@ class Followed:
             self._conclude()
 
     def _conclude(self) -> None:
-        own, false = self.outcome, self._false
-        found = self.detected_stamp is not None
+        own, false, found = self.outcome, self._false, self.detected_stamp is not None
         kind = outcome_of("FAULTY" in false, own.isolated, found, "AMBIGUOUS" in false)
         self.outcome = replace(own, outcome=kind.value)
 

@@ -27,7 +27,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import resources
@@ -127,17 +127,12 @@ def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
 
 def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
     """Lay out a row for each item, for people, with this unit in the heads."""
-    shown_ones = [column for column in columns if column.heads]
-    cells = [cell for column in shown_ones for cell in _cells(column)]
+    shown_ones, cells = [column for column in columns if column.heads], []
+    for column in shown_ones:
+        say = column.say if callable(column.say) else f"{{:{column.say}}}".format
+        for values in zip(*column.values, strict=True) if len(column.heads) > 1 else [column.values]:
+            cells += [[say(value if column.factor == 1.0 else value * column.factor) for value in values]]
     return tuple(unit.named(head) for column in shown_ones for head in column.heads), list(zip(*cells, strict=True))
-
-
-def _cells(column: Column) -> Iterator[list[str]]:
-    """Words of a column, for each of its heads."""
-    say = column.say if callable(column.say) else f"{{:{column.say}}}".format
-    parts = zip(*column.values, strict=True) if len(column.heads) > 1 else [column.values]
-    for values in parts:
-        yield [say(value if column.factor == 1.0 else value * column.factor) for value in values]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:

@@ -22,7 +22,7 @@ pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
 from bag import logs
-from bag.recordings import PARAMETERS, START, STEP, TOPICS, flight, imu_messages, write_bag, write_config, write_mcap
+from bag.recordings import START, STEP, TOPICS, flight, imu_messages, write_bag, write_config, write_mcap
 
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
@@ -167,12 +167,6 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     dies, _ = rows(tmp_path / "o")
     assert re.fullmatch(r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", dies["why"][0])
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
-
-
-def test_settings_that_do_not_fit_need_a_person(fleet, tmp_path):
-    other = write_config(tmp_path / "other.yaml", {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]})
-    (row,) = rows(run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", other, codes=(2,)))
-    assert "sample_rate is 300 Hz in the config, the recording has 100 Hz" in row["error"]
 
 
 def test_one_sensor_on_two_topics_needs_a_look(tmp_path):

@@ -57,11 +57,6 @@ def test_the_error_counts_as_undetected_up_to_the_sample_of_the_declaration():
         assert value == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in seconds])))
 
 
-def test_an_error_that_no_method_can_give_is_not_there():
-    odd = Event(12 * 10**9, 1, S.OK, S.FAULTY, Reason.DISAGREES, (1,), float("nan"))
-    assert scored([FAULT], odd).events[0].error is None
-
-
 PAIR = [event(12, i, S.AMBIGUOUS, (1, 3)) for i in (1, 3)]
 NAMED = event(18, 1, S.FAULTY, before=S.AMBIGUOUS)
 UNSEEN = (None, None, ())

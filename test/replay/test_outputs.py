@@ -89,20 +89,6 @@ def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
     assert {topic: messages[topic] for topic in originals} == originals
 
 
-def test_rclpy_reads_the_same_diagnostics(written):
-    messages = pytest.importorskip("diagnostic_msgs.msg", reason="rclpy is not installed (extra: ros)")
-    from rclpy.serialization import deserialize_message
-
-    def values(array):
-        return [[kv.value for kv in status.values] for status in array.status]
-
-    for _, data in read_by(written[0], False)[0]["/diagnostics"]:
-        ours = STORE.deserialize_cdr(data, NAMES["/diagnostics"])
-        theirs = deserialize_message(data, messages.DiagnosticArray)
-        assert [(s.name, s.level) for s in theirs.status] == [(s.name, bytes([s.level])) for s in ours.status]
-        assert values(theirs) == values(ours)
-
-
 def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
     path, output, _, summary, _ = written
     messages = read_by(path, True)[0]["/diagnostics"]

@@ -78,11 +78,9 @@ def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector):
         ({0: 1.0}, {}, "named", 1.0, 1.0),
         ({0: 1.5}, {0: 0.5, 1: 0.5}, "named", 1.5, 0.5),
         ({0: 4.0}, {0: 0.5, 1: 0.5}, "in a set", 4.0, 0.5),
-        ({0: 4.0}, {}, "silent", 4.0, 4.0),
         ({}, {1: 1.0, 2: 1.0}, "false set", np.inf, np.inf),
         ({}, {1: 4.0, 2: 4.0}, "silent", np.inf, np.inf),
         ({0: 1.0, 2: 4.5}, {}, "wrong", 1.0, 1.0),
-        ({}, {}, "silent", np.inf, np.inf),
     ],
 )
 def test_outcome_of_a_fault(alone, among, words, named, found):
@@ -189,12 +187,8 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--fault", "kind=bias"], "fault bias needs size in rad/s"),
-        (["--fault", "kind=bias size=0.1,x"], "size is 'x', expected a number"),
         (["--fault", "kind=bias size=-0.1"], "size is -0.1, expected more than 0: signs are drawn"),
         (["--fault", "kind=bias size=0.1 start=3"], "start is chosen by the sweep"),
-        (["--fault", "bias"], "'bias' is not of the form key=value"),
-        (["--fault", "kind=bang"], "unknown fault kind 'bang'"),
         (["--fault", "kind=triad_loss"], "strikes a whole unit"),
         (["--times", "0"], "--times is 0, expected 1 to 1000"),
         (["--within", "nan"], "--within is nan s, expected more than 0"),
