@@ -9,7 +9,6 @@ operator does between two flights. Biases stay: the sensors are the same, and a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -232,19 +231,16 @@ def _about(one: Episode, unit: Unit) -> str:
 
 
 def _before(one: Episode) -> str:
-    """Say what it was before it came to what it is: the first step and the last."""
+    """Say what it was before it came to what it is, which is called `it`: the first step and the last."""
     # A channel that was the only one left, and not yet surely it, is the one that it came to.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
-    told = [*earlier[:1], *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS)]
-    return ", ".join(f"{_one_of(step.channels, step.who, one)} from {step.at_s:.3f} s" for step in told)
-
-
-def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
-    """Call the channel that was declared in the end `it` where few others were in question."""
-    others = [name for name in channels if name not in one.channels]
-    if one.state == "FAULTY" and len(one.channels) == 1 and len(others) <= FEW_CHANNELS and len(others) < len(channels):
-        return f"it or {' or '.join(others)}"
-    return who
+    words, alone = [], one.state == "FAULTY" and len(one.channels) == 1
+    for step in [*earlier[:1], *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS)]:
+        others = [name for name in step.channels if name not in one.channels]
+        few = alone and len(others) <= FEW_CHANNELS and len(others) < len(step.channels)
+        who = f"it or {' or '.join(others)}" if few else step.who
+        words.append(f"{who} from {step.at_s:.3f} s")
+    return ", ".join(words)
 
 
 def detail_words(one: Episode, unit: Unit = RADIANS, scored: bool = False) -> list[tuple[str, str]]:

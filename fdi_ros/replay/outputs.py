@@ -65,45 +65,6 @@ def _text(value: float) -> str:
 # The bag --------------------------------------------------------------------------------------------------------------
 
 
-class InputWatch:
-    """Describes the inputs of a recording by the clock of the recorder."""
-
-    def __init__(self, config: Config) -> None:
-        self._source = source_of(config)
-        self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
-
-    def statuses(self, samples: Samples) -> list[InputStatus]:
-        """Describe each topic after the messages read so far."""
-        now = max(topic.log_time for topic in samples.newest)
-        return [self._status(k, samples, now) for k in range(len(samples.topics))]
-
-    def _status(self, k: int, samples: Samples, now: int) -> InputStatus:
-        source, newest, topic = self._source, samples.newest[k], samples.topics[k]
-        counts = {"malformed": samples.malformed[topic]}
-        if source.stamped:
-            counts |= samples.alignment.counters[k]
-            del counts["received"]
-        before, counted = self._before[k]
-        self._before[k] = newest, counts
-        silent = (now - newest.log_time) * 1e-9 if newest.received else None
-        spent = (newest.log_time - before.log_time) * 1e-9
-        return InputStatus(
-            name=source.names[k],
-            topic=topic,
-            received=newest.received,
-            rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
-            silent=silent,
-            live=silent is not None
-            and silent <= source.timeout
-            and (not source.stamped or samples.alignment.is_live(k)),
-            lag=samples.alignment.lag[k] * 1e-9 if source.stamped else 0.0,
-            max_lag=source.max_lag,
-            offset=(newest.log_time - newest.stamp) * 1e-9 if source.stamped and newest.received else None,
-            counts=counts,
-            recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
-        )
-
-
 NODE = "/fdi_node"  # what ``~`` stands for: the node as it is called by default, in no namespace
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -118,20 +79,19 @@ class OutputBag(Sink):
     period = 1_000_000_000  # of the regular diagnostics, ns
 
     def __init__(self, path: Path, config: Config, channels: int) -> None:
-        self._config = config
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # By this it may be replaced later: what anything else has recorded never is.
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
         self._encoder = Encoder(config.body_frame, channels)
-        self._watch = InputWatch(config)
+        self._source = source_of(config)
+        self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
         self._shift = 0  # stamp of a sample minus that of its message, ns
         self._later = 0  # time of recording minus stamp, ns: what is written stands beside the message that brought it
 
     def __enter__(self) -> OutputBag:
         self._writer.open()
-        source = source_of(self._config)
-        names = [name if name.startswith("/") else f"/{name}" for name in source.topics]
-        self._inputs = [self._topic(name, source.type) for name in names]
+        names = [name if name.startswith("/") else f"/{name}" for name in self._source.topics]
+        self._inputs = [self._topic(name, self._source.type) for name in names]
         self._outputs = {
             topic: self._topic(_full_name(topic.name), topic.type)
             for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
@@ -164,7 +124,34 @@ class OutputBag(Sink):
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Write the regular diagnostics: once a second of the recording."""
         now = max(topic.log_time for topic in samples.newest)
-        self._diagnose(pipeline, now, self._watch.statuses(samples))
+        self._diagnose(pipeline, now, [self._input_status(k, samples, now) for k in range(len(samples.topics))])
+
+    def _input_status(self, k: int, samples: Samples, now: int) -> InputStatus:
+        """Describe a topic after the messages read so far, by the clock of the recorder."""
+        source, newest, topic = self._source, samples.newest[k], samples.topics[k]
+        counts = {"malformed": samples.malformed[topic]}
+        if source.stamped:
+            counts |= samples.alignment.counters[k]
+            del counts["received"]
+        before, counted = self._before[k]
+        self._before[k] = newest, counts
+        silent = (now - newest.log_time) * 1e-9 if newest.received else None
+        spent = (newest.log_time - before.log_time) * 1e-9
+        return InputStatus(
+            name=source.names[k],
+            topic=topic,
+            received=newest.received,
+            rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
+            silent=silent,
+            live=silent is not None
+            and silent <= source.timeout
+            and (not source.stamped or samples.alignment.is_live(k)),
+            lag=samples.alignment.lag[k] * 1e-9 if source.stamped else 0.0,
+            max_lag=source.max_lag,
+            offset=(newest.log_time - newest.stamp) * 1e-9 if source.stamped and newest.received else None,
+            counts=counts,
+            recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
+        )
 
     def _time(self, stamp: int) -> int:
         """Time of recording for a sample, ns; stamps of messages may lie anywhere, times of recording may not."""

@@ -150,10 +150,7 @@ class Walk:
 
 
 class Judge(Walk):
-    """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults.
-
-    The injector has the stamp that times count from.
-    """
+    """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults."""
 
     def __init__(self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
         super().__init__(pipeline, sinks)

@@ -21,7 +21,6 @@ from fdi_ros.report.layout import (
     PALETTE,
     Columns,
     Figure,
-    Rows,
     Section,
     head_and_rows,
     number,
@@ -192,8 +191,8 @@ def smallest_hint(plan: Plan) -> str:
     )
 
 
-def figures_table(tried: Subject, plan: Plan) -> Rows:
-    """One row per kind and size."""
+def figures_section(tried: Subject, plan: Plan) -> Section:
+    """Lay out one row per kind and size."""
     columns: Columns = {
         "fault": lambda line: line.swept.words,
         "faults": lambda line: str(line.trials),
@@ -205,7 +204,9 @@ def figures_table(tried: Subject, plan: Plan) -> Rows:
         "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
         "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
     }
-    return head_and_rows(columns, lines_of(tried, plan))
+    at = ", ".join(f"{time:.1f}" for time in tried.times)
+    title = f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels"
+    return Section(title, "", head_and_rows(columns, lines_of(tried, plan)))
 
 
 def sound_lines(tried: Subject) -> list[str]:
@@ -243,16 +244,11 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         words.append(f"{line.swept.words}: {shares}")
     false = sum(line.false for line in lines)
     words.append(f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults")
-    return [*words, _motion(tried)]
-
-
-def _motion(tried: Subject) -> str:
-    """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
+    # At rest small faults are found that are lost in flight.
     moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
-    words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
-    if 2 * moving >= times:
-        return words
-    return f"{words}: these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
+    motion = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
+    rest = ": these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
+    return [*words, motion if 2 * moving >= times else motion + rest]
 
 
 def _from(lines: Sequence[Line], named: bool) -> str:
@@ -265,14 +261,6 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     return f"from {size} {of}" if found else f"from a larger size on than {size} {of}"
 
 
-def side_by_side(results: Sequence[Subject], plan: Plan) -> Rows:
-    """Table of all monitors: share isolated, share detected, median delay until detected."""
-    tried = [one for one in results if one.trials]
-    columns = [lines_of(one, plan) for one in tried]
-    rows = [(swept.words, *(_in_short(lines[k]) for lines in columns)) for k, swept in enumerate(plan.faults)]
-    return ("fault", *(one.name for one in tried)), rows
-
-
 SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: faults with a false name or set"
 
 
@@ -281,12 +269,12 @@ def _in_short(line: Line) -> str:
     return f"{words} !{line.false}" if line.false else words
 
 
-HINTS = (
+HINTS = [
     "isolated: the faulty channel was declared by itself; detected: that, or one of a set with others",
     "delays are until it was detected, of all faults: a dash where fewer than half, or than 95 %, were detected",
     "a stuck value or a scale factor shows only while the vehicle turns, noise mostly as a warning",
     "this is of one recording: another flight, with other vibration, may need larger faults",
-)
+]
 
 
 def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
@@ -294,10 +282,10 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
     tried = [one for one in results if one.trials]
     count = sum(len(one.trials) for one in tried)
     sections = _as_they_are(results, plan)
-    sections += [_figures(one, plan) for one in tried if len(results) == 1]
+    sections += [figures_section(one, plan) for one in tried if len(results) == 1]
     hint = smallest_hint(plan)
     sections += [Section(f"{one.name}, smallest faults", hint, verdict_lines(one, plan)) for one in tried]
-    sections.append(Section("Notes", "", list(HINTS)))
+    sections.append(Section("Notes", "", HINTS))
     head = f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s\n"
     return "\n".join([head, *map(section_text, sections)])
 
@@ -305,15 +293,11 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
 def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
     """Tell of each monitor without a fault, and of all side by side with faults."""
     sections = [Section(f"{one.name}, nothing injected", "", sound_lines(one)) for one in results]
-    if sum(bool(one.trials) for one in results) > 1:
-        sections.append(Section("Side by side", SHORT_HINT, side_by_side(results, plan)))
+    lines = {one.name: lines_of(one, plan) for one in results if one.trials}
+    if len(lines) > 1:
+        rows = [(swept.words, *(_in_short(own[k]) for own in lines.values())) for k, swept in enumerate(plan.faults)]
+        sections.append(Section("Side by side", SHORT_HINT, (("fault", *lines), rows)))
     return sections
-
-
-def _figures(one: Subject, plan: Plan) -> Section:
-    at = ", ".join(f"{time:.1f}" for time in one.times)
-    title = f"{one.name}, faults from {at} s on each of {len(one.used)} channels"
-    return Section(title, "", figures_table(one, plan))
 
 
 # The page ------------------------------------------------------------------------------------------------------------
@@ -328,8 +312,8 @@ def sweep_page(results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[
     tried = [one for one in results if one.trials]
     sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
     for one in tried:
-        sections += [_map(one, plan), _figures(one, plan)]
-    sections += [Section("Notes", "", list(HINTS)), Section("What was run", "", about)]
+        sections += [_map(one, plan), figures_section(one, plan)]
+    sections += [Section("Notes", "", HINTS), Section("What was run", "", about)]
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 

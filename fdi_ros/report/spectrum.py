@@ -76,9 +76,8 @@ class Spectrum:
             "yaxis": {"type": "log", "title": {"text": f"residual, {unit.name} per sqrt(Hz)"}},
         }
         hint = "Of each channel's residual: what it differs by from the fused rate."
-        return Section(
-            "Spectrum of the differences", f"{hint} {self._words(density)}", "", [{"data": data, "layout": layout}]
-        )
+        figure = {"data": data, "layout": layout}
+        return Section("Spectrum of the differences", f"{hint} {self._words(density)}", "", [figure])
 
     def _words(self, density: Array) -> str:
         """Say where lines stand out (the density is without that at 0 Hz), and what of it may be folded."""
