@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -28,8 +29,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 
-MOST_ROWS = 512
-"""Sets of channels for which constants are kept at most."""
+MOST_ROWS = 512  # sets of channels for which constants are kept at most
 
 
 class Verdict(NamedTuple):
@@ -101,7 +101,6 @@ class Detector(ABC):
         self._fewer: dict[int, Detector | None] = {}
         self.refusals: dict[int, str] = {}
         """Why the method cannot run on a set of channels, by its bits."""
-        self._rows: _Rows | None = None
 
     @classmethod
     def refuses(cls, n: int) -> str:
@@ -115,25 +114,24 @@ class Detector(ABC):
 
     def reset(self) -> None:
         """Forget all samples seen; only methods with a memory of their own have something to forget."""
-        if self._rows is not None:
-            self._rows.states[:] = 0
+        self.states[:] = 0
 
     def clear(self, declared: int = 0) -> None:
         """Forget all suspicion of channels, some of which were declared; what a method has learned of others stays."""
         self.reset()
 
+    @cached_property
+    def _rows(self) -> _Rows:
+        return _Rows(self)
+
     @property
     def bank(self) -> NDArray[Any]:
         """Where compiled code finds constants and memory for each set of channels, (1,)."""
-        if self._rows is None:
-            self._rows = _Rows(self)
         return self._rows.bank
 
     @property
     def states(self) -> NDArray[Any]:
         """Memories of the method, one row for each set of channels prepared; row 0 is that of all channels."""
-        _ = self.bank
-        assert self._rows is not None
         return self._rows.states
 
     @property
@@ -144,7 +142,6 @@ class Detector(ABC):
     def prepare(self, mask: int) -> None:
         """Prepare the constants for the channels whose bits are set, unless that was done before."""
         if not self.takes_any and self.bank["row"][0, mask] == UNPREPARED:
-            assert self._rows is not None
             self._rows.add(mask, self.fewer(mask))
 
     def fewer(self, mask: int) -> Detector | None:

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The case that evidence opens: whether the sums stand against the noise of their own time, and who is faulty.
+"""Evidence at four time scales, and the case that it opens: whether it stands against the noise of its own time.
 
-There are sums at four time scales (`fdi_ros.detectors.evidence`). As a case is opened, the states go back to before the
-onset (`predict_from`), and the mean since then is to be explained (`fdi_ros.detectors.naming`) against all that is not
-known of the sensors.
+Evidence is Shiryaev-Roberts sums over channels, signs and sizes of a fault. A large sum is looked back at: since when
+its channel is off, and how far beyond the scatter of that same time. As a case is opened, the states go back to before
+the onset (`predict_from`), and the mean since then is to be explained (`fdi_ros.detectors.naming`) against all that is
+not known of the sensors.
 """
 
 from __future__ import annotations
@@ -13,28 +14,26 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import Channels, Flag, Mask, Real, Whole, compiled, record
-from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
-from fdi_ros.detectors.evidence import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
-from fdi_ros.detectors.naming import MISFIT, Inference, explain
+from fdi_ros.compiling.compiled import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, compiled, record
+from fdi_ros.detectors.naming import MISFIT, Inference, checks, explain, moved_by, set_mean
 from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
-from fdi_ros.estimator.error_states import ErrorStates, copy_states, fill_signals, project, subtract_errors
+from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
     LEAST_SHARE,
     LONG_TIME,
     SNAPSHOT_TIME,
     Constants,
     Estimator,
-    Total,
-    total_before,
     update_weights,
 )
 from fdi_ros.estimator.noise import (
     BLOCK,
     BURST,
-    MOTION,
+    FAR,
+    LONG,
     SAMPLE,
     SCALES,
     update_block_noise,
@@ -45,29 +44,53 @@ from fdi_ros.estimator.noise import (
 from fdi_ros.estimator.shared_noise import update_shared
 from fdi_ros.model.samples import Array
 
+SIZES, KEPT = 6, 64  # of a fault; values of each time scale that are looked back at
 PER_BLOCK = (0, 1, 6, 48)  # blocks in a value of each time scale; 0: samples
+SMALLEST = 0.2
+"""Smallest size of a fault, in standard deviations at its time scale; each next one is twice as large, up to 6.4. From
+one to the next at most 11 % of the delay are lost, and smaller faults are found at a longer time scale."""
+FIRST_LONG = 2  # sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
+STEP_LIMIT = 7.0  # a value counts as this many standard deviations at most (Huber 1965): beyond the largest size
+CEILING = 1e6  # sums stay below so many times the threshold: what has passed is forgotten
 STANDS = 0.6
-"""Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case."""
-ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends, once it is old enough to tell
-RENAME = 16  # channels are named again when the time since the onset has grown by this part
+"""Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case: less
+than the sums need, as what is not known is counted here in full."""
+ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
+RENAME = 16  # channels are named again when the time since the onset has grown by this part: little is new before
 SETTLED, SETTLED_AMONG_FEW, SETTLED_TOGETHER = 0.2, 0.5, 1.0
-"""s that a name must stand, of one channel, where few check it, and of two: several faults look like one at first."""
-FEW_CHECKS = 3  # channels beyond three so few that three faults explain anything
+"""s that a name must stand, of one channel, where at most `FEW_CHECKS` check it, and of two: several faults look like
+one at first, and with so few checks three faults explain anything."""
+FEW_CHECKS = 3
 CLEAR = 5000.0
 """Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
-OTHERS = 6.0
-"""Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
+OTHERS, TURNED = 6.0, 0.3
+"""What is left of other channels in a block, if only those named are faulty: within so many standard deviations, that
+noise does not reach in a flight, and so much of the others' error, as axes are learned while they are watched."""
 LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
 """A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
 LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biases by some 5 mrad/s, and no more
-FASTEST = 2.5  # and so many times as fast as that for a moment
-RUINED = math.e * LARGEST_MOVE
-"""After a move that was none, as if they had moved so far: for `WARMS` no other is believed."""
-UNEXPLAINED_SHARE = 0.2  # so it is where the best hypothesis of a fault leaves at least this share of the chi-square
-TURNED = 0.3  # and beyond it so much of theirs: what is known of the sensors changes while they are watched
+FASTEST = 2.5  # and so many times as fast as that for a moment: warming is quickest at first
+Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
+Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
+Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]
+
+
+@record
+class Scale:
+    """Evidence of one time scale."""
+
+    filled: Whole  # blocks in the value being filled
+    values: Channels  # sum of their A y, s/rad
+    information: Channels  # sum of their A_ii, s^2/rad^2
+    newest: Whole  # place of the last value
+    kept: Whole  # values that may be looked back at
+    series: Series  # values, in standard deviations
+    first: Firsts  # number of the first sample in each
+    sums: Sums
+    total: Real  # of all sums
 
 
 @record
@@ -88,7 +111,6 @@ class Case:
     moved_since: Whole  # number of the first sample that showed it
     reference: Channels  # biases before, rad/s
     inference: Inference
-    total: Total
 
 
 @record
@@ -103,6 +125,88 @@ class State:
     estimator: Estimator
     scales: Annotated[list[Scale], SCALES]
     case: Case
+
+
+# The sums -------------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def add_evidence(params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int) -> None:
+    """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
+    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
+    scale.first[scale.newest] = first_sample
+    scale.kept = min(scale.kept + 1, KEPT)
+    scale.total = 0.0
+    for i in range(params.sensors.n):
+        if not kf.judged >> i & 1:
+            continue
+        y, cap = scale.series[scale.newest, i], kf.noise.cap[at, i]
+        for side in range(2):
+            sums, total, size = scale.sums[side, i], 0.0, SMALLEST
+            factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
+            for k in range(SIZES):
+                if k >= first:
+                    sums[k] = min((1.0 + sums[k]) * min(factor * math.exp(-0.5 * size * size), cap), ceiling)
+                    total += sums[k]
+                factor *= factor
+                size *= 2.0
+            scale.total += total
+
+
+@compiled
+def value_at(scale: Scale, back: int, i: int) -> float:
+    """Return the value of channel i so many before the last one."""
+    return scale.series[(scale.newest - back + KEPT) % KEPT, i]
+
+
+@compiled
+def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> float:
+    """Variance of a mean of the last values times their number: of single ones, or of batches if that is more."""
+    worst, size = 0.0, 1
+    while count // size >= 4 or size == 1:
+        batches, squares = count // size, 0.0
+        for b in range(batches):
+            total = 0.0
+            for k in range(b * size, (b + 1) * size):
+                total += sign * value_at(scale, k, i) - mean
+            squares += total * total
+        worst = max(worst, squares / size / max(batches - 1.0, 1.0))
+        size *= 2
+    return worst
+
+
+@compiled
+def look_back(params: Constants, kf: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
+    """Find since when channel i is off, and the evidence for it against the noise of that same time.
+
+    Returns
+    -------
+    Values since the onset, and the logarithm of the likelihood ratio: Student's, with the degrees of freedom that the
+    learned noise counts for and those of the values themselves.
+    """
+    best, since, total = 0.0, 0, 0.0
+    for k in range(scale.kept):
+        total += sign * value_at(scale, k, i)
+        t = total / math.sqrt(k + 1.0)
+        if t > best:
+            best, since = t, k + 1
+    if since < 2:
+        return since, 0.0
+    mean, trust = best / math.sqrt(since), kf.noise.degrees[i]
+    squares, count = 0.0, 0
+    for j in range(params.sensors.n):
+        if kf.judged >> j & 1:
+            count += 1
+            for k in range(since - 1):
+                step = value_at(scale, k, j) - value_at(scale, k + 1, j)
+                squares += min(0.5 * step * step, FAR)
+    # Of so many channels three fewer differ from what a rate explains.
+    checks = max(count - 3.0, 1.0)
+    pooled = (trust + squares / max(count, 1) * checks) / (trust + checks * (since - 1.0))
+    degrees = trust + since - 1.0
+    scatter = scatter_of(scale, i, sign, since, mean)
+    variance = max((trust + (since - 1.0) * scatter) / degrees, pooled)
+    return since, 0.5 * (degrees + 1.0) * math.log(1.0 + mean * mean * since / variance / degrees)
 
 
 @compiled
@@ -193,6 +297,9 @@ def forget_evidence(params: Constants, state: State) -> None:
                 scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
 
 
+# The case -------------------------------------------------------------------------------------------------------------
+
+
 @compiled
 def look_for_case(params: Constants, state: State) -> None:
     """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
@@ -243,9 +350,7 @@ def look_for_drift(params: Constants, state: State) -> None:
 def look_for_change_in_hole(params: Constants, state: State) -> None:
     """Open a case where a bias is another than before a hole in the stream, by more than it may have moved meanwhile.
 
-    At first after a hole slow noise is unknown, and the states follow what the sums do not see. What they have learned
-    of the biases since has the covariance that is lost, D = P0 - P: ``(A (x - x0))_i^2 / (A D A)_ii`` is the square of
-    a normal value. A leaves out what a rate explains: that part of the biases is not learned in motion.
+    At first after a hole slow noise is unknown, and the states follow what the sums do not see.
     """
     kf, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
     information = kf.parity.information
@@ -286,73 +391,6 @@ def open_case(params: Constants, state: State) -> None:
         kf.excluded_from_rate = 0
         update_weights(params, kf)
         case.retry = kf.samples + 1 + (kf.samples - case.onset) // 4
-
-
-@compiled
-def set_mean(params: Constants, state: State, size: int) -> None:
-    """Set the mean of the last so many samples to be explained, and its covariance."""
-    kf, case, n, layout = state.estimator, state.case, params.sensors.n, params.layout
-    total, inference, noise = case.total, case.inference, kf.noise
-    total_before(kf, kf.samples - size + 1, total, n)
-    size = kf.samples - total.sample
-    inference.mask = 0
-    for i in range(n):
-        count = kf.total.count[i] - total.count[i]
-        if kf.mask >> i & 1 and count > 0.9 * size:
-            inference.mask |= 1 << i
-            inference.y[i] = (kf.total.values[i] - total.values[i]) / count
-    inference.judged = inference.mask & kf.judged
-    speed = 0.0
-    # At rest what passes for a rate is the fault itself, and no motion.
-    moves = 1.0 if noise.regime == MOTION else 0.0
-    for a in range(3):
-        inference.rate[a] = moves * (kf.total.rate[a] - total.rate[a]) / size
-        speed += inference.rate[a] * inference.rate[a]
-    # A turn that ends as it began leaves no trace of a delay in the mean.
-    part = min(1.0, 3.0 * params.length / size)
-    for i in range(n):
-        change = 0.0
-        for a in range(3):
-            change += params.sensors.axes[i, a] * (kf.rate[a] - total.instant[a])
-        inference.angular_acceleration[i] = moves * change / (size * params.period)
-    signals = kf.block_at.signals
-    fill_signals(layout, inference.rate, inference.angular_acceleration, signals)
-    subtract_errors(layout, kf.states, signals, inference.y, inference.y)
-    project(layout, kf.states, kf.block_at)
-    for i in range(n):
-        for j in range(n):
-            inference.covariance[i, j] = kf.block_at.covariance[i, j]
-        v, over = noise.now.sample[i], noise.longest[i]
-        if size >= params.length:
-            v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
-        else:
-            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / params.length)
-        inference.covariance[i, i] += (
-            v / size + kf.peak_extra[i] * part + params.nonlinearity * params.nonlinearity * speed
-        )
-        place = layout.delays[params.unit[i]]
-        if place >= 0:
-            swing = moves * kf.peak_turn[i] * part
-            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
-    add_line(kf, inference, n, size, size >= params.length)
-
-
-@compiled
-def add_line(kf: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
-    """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
-    for i in range(n):
-        for j in range(n):
-            slow = math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
-            inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
-
-
-@compiled
-def infer(params: Constants, inference: Inference) -> None:
-    """Explain the mean."""
-    n = params.sensors.n
-    compute_joint_weights(inference.parity, n, inference.mask, inference.covariance)
-    eliminate_rate(inference.parity, n, params.sensors.axes, UNKNOWN_RATE)
-    explain(inference, n, params.sensors.axes, params.members, params.units, params.confidence)
 
 
 @compiled
@@ -406,13 +444,13 @@ def name_channels(params: Constants, state: State) -> None:
     if size * params.period > LONG_TIME:
         # A drift is largest at last.
         size = size // 2 + 1
-    set_mean(params, state, size)
-    infer(params, inference)
+    set_mean(params, kf, inference, size)
+    explain(params, inference)
     # By so much of the error found the model may be wrong.
+    misfit = MISFIT * inference.largest
     for i in range(n):
-        misfit = MISFIT * inference.largest
         inference.covariance[i, i] += misfit * misfit
-    infer(params, inference)
+    explain(params, inference)
     std = 0.0 if case.isolated else moved_by(inference, n)
     if std > 0.0 and let_biases_move(params, state, std):
         return
@@ -422,35 +460,16 @@ def name_channels(params: Constants, state: State) -> None:
     case.suspects = inference.union
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, kf.samples
-    single, free = inference.common & (inference.common - 1) == 0, -3
-    for i in range(n):
-        free += inference.mask >> i & 1
-    settled = (SETTLED if free > FEW_CHECKS else SETTLED_AMONG_FEW) if single else SETTLED_TOGETHER
-    if single and inference.log_odds >= CLEAR:
+    settled = SETTLED if checks(inference.mask, n) > FEW_CHECKS else SETTLED_AMONG_FEW
+    if inference.common & (inference.common - 1):
+        settled = SETTLED_TOGETHER
+    elif inference.log_odds >= CLEAR:
         settled = 0.0
     if inference.common and (kf.samples - case.since) * params.period >= settled:
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0
     leave_aside(params, state)
-
-
-@compiled
-def moved_by(inference: Inference, n: int) -> float:
-    """By how much all biases have moved, standard deviation, if that is what the mean shows; 0: it is not.
-
-    So it is where no hypothesis of a few channels leaves noise, and the best of them much of what is to be explained.
-    """
-    residual = 2.0 * (inference.total - inference.fit_of_best)
-    if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:
-        return 0.0
-    trace, free = 0.0, -3.0
-    for i in range(n):
-        if inference.mask >> i & 1:
-            trace += inference.parity.information[i, i]
-            free += 1.0
-    square = max(2.0 * inference.total - free, 0.0) / max(trace, 1e-12)
-    return math.sqrt(square)
 
 
 @compiled
@@ -461,20 +480,14 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
     if lately > LARGEST_MOVE or std > LARGEST_STEP:
         return False
     case.moved, case.moved_at, case.moved_since = lately, kf.seconds, case.onset
-    copy_biases(kf.states, n, case.reference)
+    for i in range(n):
+        case.reference[i] = kf.states.x[i]
     move_biases(params, kf, std, 0.5 * LARGEST_MOVE / WARMS)
     kf.noise.lived[kf.noise.regime] = 0.0
     update_unknown(kf.noise, n, 0.0)
     forget_evidence(params, state)
     update_weights(params, kf)
     return True
-
-
-@compiled
-def copy_biases(states: ErrorStates, n: int, out: Array) -> None:
-    """Copy the biases (n,), rad/s."""
-    for i in range(n):
-        out[i] = states.x[i]
 
 
 @compiled
@@ -492,8 +505,9 @@ def goes_too_far(params: Constants, state: State) -> bool:
 
 @compiled
 def undo_move(params: Constants, state: State) -> None:
-    """Open a case where all biases seemed to move; for a while no move is believed."""
-    state.case.onset, state.case.moved, state.case.moved_at = state.case.moved_since, RUINED, state.estimator.seconds
+    """Open a case where all biases seemed to move; for `WARMS` no move is believed, as if they had moved too far."""
+    case = state.case
+    case.onset, case.moved, case.moved_at = case.moved_since, math.e * LARGEST_MOVE, state.estimator.seconds
     open_case(params, state)
 
 

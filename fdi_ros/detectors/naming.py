@@ -4,21 +4,8 @@
 """Which channels explain a mean: the odds of every hypothesis, and the smallest set that holds the culprit.
 
 The mean y (n,) of the values over some time, less what is known of their errors, is ``H w + D f + e`` with e normal of
-covariance M, and D (n, k) the directions of the hypothesis:
-
-- a channel, or a pair of channels, is off: their unit vectors;
-- a unit as a whole is off: the unit vectors of its channels;
-- a unit as a whole measures too much or too little: ``h_i w`` on its channels;
-- a unit as a whole is late or early: ``h_i`` times the angular acceleration on its channels.
-
-The rate w is unknown altogether, and drops out (`fdi_ros.core.subsets`): with ``u = A y``, an amplitude f ~ N(0, t I)
-makes the data more likely than no fault by
-
-    log L = u_D' (A_DD + I / t)^-1 u_D / 2 - log det(I + t A_DD) / 2,     u_D = D' u,  A_DD = D' A D.
-
-The determinant is the price of a hypothesis that could explain more (Occam's factor; MacKay 1992). t is taken at the
-size of the estimate itself; for sizes that may be anything over four decades that is too kind by `SPREAD` for each. A
-name needs more than the best of all hypotheses: what it leaves must be noise (`FIT`).
+covariance M, f the errors and D (n, k) the directions of a hypothesis: a channel, a pair, a unit as a whole, its gain,
+its delay. docs/methods.md#naming has the mathematics, in the same symbols.
 """
 
 from __future__ import annotations
@@ -43,9 +30,11 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import Matrix, Parity
-from fdi_ros.core.subsets import invert
+from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate, invert
+from fdi_ros.estimator.error_states import fill_signals, project, subtract_errors
+from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
+from fdi_ros.estimator.noise import BLOCK, BURST, MOTION
 from fdi_ros.model.geometry import ROUNDING
-from fdi_ros.model.samples import Array
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""
@@ -55,14 +44,19 @@ is large for what it stands for: of three parallel gyros, two with the same faul
 opposite one, and only the odds of such a coincidence keep a healthy gyro from being named."""
 TWO_CHECKS = 0.05
 """Of the odds of pairs where there are two checks: two of five explain anything, and no fault would ever be named."""
-GAIN_STD, DELAY_STD = 0.1, 0.01  # of a unit that is wrong as a whole: gain, and delay in s
-SPREAD = 1.3  # logarithm that each amplitude costs, see above
+GAIN_STD, DELAY_STD = 0.1, 0.01
+"""Of a unit that is wrong as a whole: gain, as by a wrong range, and delay in s, as of a clock that was set."""
+SPREAD = 1.3  # logarithm that each amplitude costs, for sizes that may be anything over four decades
 MISFIT = 0.004  # share of the largest error by which the model may be wrong: axes and scale factors
 FIT, FIT_PER_CHECK = 6.0, 2.5
-"""Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom."""
+"""Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom. Noise alone exceeds
+it once in 240 at most."""
 SET_MARGIN = 5.0
 """A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
 that it holds none of them is far less likely."""
+UNEXPLAINED_SHARE = 0.2
+"""All biases have moved where the best hypothesis of a fault leaves this share of the chi-square: a fault of one or two
+channels leaves hardly any, were it ever so large."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -78,6 +72,7 @@ class Inference:
 
     mask: Mask  # channels that it is of
     judged: Mask  # of these, those whose fault shows
+    before: Total  # sums of all samples before it
     y: Channels  # values less what is known of their errors, rad/s
     covariance: Square  # M, (rad/s)^2
     rate: Vector  # mean body rate, rad/s
@@ -110,29 +105,91 @@ class Inference:
 
 
 @compiled
+def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
+    """Set the mean of the last so many samples to be explained, and its covariance."""
+    n, layout, before, noise = params.sensors.n, params.layout, inference.before, kf.noise
+    total_before(kf, kf.samples - size + 1, before, n)
+    size = kf.samples - before.sample
+    inference.mask = 0
+    for i in range(n):
+        count = kf.total.count[i] - before.count[i]
+        if kf.mask >> i & 1 and count > 0.9 * size:
+            inference.mask |= 1 << i
+            inference.y[i] = (kf.total.values[i] - before.values[i]) / count
+    inference.judged = inference.mask & kf.judged
+    speed = 0.0
+    # At rest what passes for a rate is the fault itself, and no motion.
+    moves = 1.0 if noise.regime == MOTION else 0.0
+    for a in range(3):
+        inference.rate[a] = moves * (kf.total.rate[a] - before.rate[a]) / size
+        speed += inference.rate[a] * inference.rate[a]
+    # A turn that ends as it began leaves no trace of a delay in the mean.
+    part = min(1.0, 3.0 * params.length / size)
+    for i in range(n):
+        change = 0.0
+        for a in range(3):
+            change += params.sensors.axes[i, a] * (kf.rate[a] - before.instant[a])
+        inference.angular_acceleration[i] = moves * change / (size * params.period)
+    signals = kf.block_at.signals
+    fill_signals(layout, inference.rate, inference.angular_acceleration, signals)
+    subtract_errors(layout, kf.states, signals, inference.y, inference.y)
+    project(layout, kf.states, kf.block_at)
+    lasts = size >= params.length
+    for i in range(n):
+        for j in range(n):
+            inference.covariance[i, j] = kf.block_at.covariance[i, j]
+        v, over = noise.now.sample[i], noise.longest[i]
+        if lasts:
+            v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
+        else:
+            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / params.length)
+        bent = params.nonlinearity * params.nonlinearity * speed
+        inference.covariance[i, i] += v / size + kf.peak_extra[i] * part + bent
+        place = layout.delays[params.unit[i]]
+        if place >= 0:
+            swing = moves * kf.peak_turn[i] * part
+            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
+    add_line(kf, inference, n, size, lasts)
+
+
+@compiled
+def add_line(kf: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
+    """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
+    for i in range(n):
+        for j in range(n):
+            slow = math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
+            inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
+
+
+@compiled
+def checks(mask: int, n: int) -> int:
+    """Return how many more channels a set has than the three that a rate takes."""
+    count = -3
+    for i in range(n):
+        count += mask >> i & 1
+    return count
+
+
+@compiled
 def reduce(inference: Inference, n: int, k: int) -> None:
     """Work out D' u and D' A D for the first k directions."""
+    direction, information = inference.direction, inference.parity.information
     for p in range(k):
         inference.along[p] = 0.0
         for i in range(n):
-            inference.along[p] += inference.direction[p, i] * inference.u[i]
+            inference.along[p] += direction[p, i] * inference.u[i]
         for q in range(p + 1):
             total = 0.0
             for i in range(n):
-                if inference.direction[p, i] != 0.0:
+                if direction[p, i] != 0.0:
                     for j in range(n):
-                        total += (
-                            inference.direction[p, i] * inference.parity.information[i, j] * inference.direction[q, j]
-                        )
+                        total += direction[p, i] * information[i, j] * direction[q, j]
             inference.matrix[p, q] = inference.matrix[q, p] = total
 
 
 @compiled
 def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
-    """Log likelihood ratio of errors along the first k of ``inference.direction`` against none.
-
-    ``given``: variance of the amplitudes, or 0: as large as they are estimated.
-    """
+    """Log likelihood ratio of errors along the first k directions; given: their variance, 0: as they are estimated."""
     reduce(inference, n, k)
     for p in range(k):
         # Channels that look alike have no matrix that can be inverted.
@@ -180,9 +237,7 @@ def set_direction(inference: Inference, n: int, k: int, channel: int) -> None:
 @compiled
 def add_channels(inference: Inference, n: int) -> None:
     """Add each channel, and each pair of them where there are checks for it."""
-    free = -3
-    for i in range(n):
-        free += inference.mask >> i & 1
+    free, information = checks(inference.mask, n), inference.parity.information
     for i in range(n):
         inference.error[i] = 0.0
         if inference.judged >> i & 1:
@@ -196,11 +251,7 @@ def add_channels(inference: Inference, n: int) -> None:
     for i in range(n):
         for j in range(i):
             if inference.judged >> i & 1 and inference.judged >> j & 1:
-                aii, ajj, aij = (
-                    inference.parity.information[i, i],
-                    inference.parity.information[j, j],
-                    inference.parity.information[i, j],
-                )
+                aii, ajj, aij = information[i, i], information[j, j], information[i, j]
                 # Of two that cannot be told apart one is enough.
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
                     set_direction(inference, n, 0, i)
@@ -209,11 +260,12 @@ def add_channels(inference: Inference, n: int) -> None:
 
 
 @compiled
-def add_units(inference: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int) -> None:
+def add_units(params: Constants, inference: Inference) -> None:
     """Add each unit as a whole: any errors of its channels, its gain, its delay."""
-    prior = math.log(COINCIDENCE / max(units, 1))
-    for unit in range(units):
-        inside = members[unit] & inference.mask
+    n, axes, rate = params.sensors.n, params.sensors.axes, inference.rate
+    prior = math.log(COINCIDENCE / max(params.units, 1))
+    for unit in range(params.units):
+        inside = params.members[unit] & inference.mask
         count = 0
         for i in range(n):
             if inside >> i & 1 and count < 3:
@@ -228,9 +280,7 @@ def add_units(inference: Inference, n: int, axes: Array, members: NDArray[np.int
             for i in range(n):
                 along = inference.angular_acceleration[i]
                 if way == 0:
-                    along = (
-                        axes[i, 0] * inference.rate[0] + axes[i, 1] * inference.rate[1] + axes[i, 2] * inference.rate[2]
-                    )
+                    along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
                 inference.direction[0, i] = along if inside >> i & 1 else 0.0
             odds = log_ratio(inference, n, 1, std * std)
             if odds > NO_LOG:
@@ -264,16 +314,11 @@ def largest_of(inference: Inference) -> int:
 @compiled
 def update_best(inference: Inference, n: int) -> None:
     """Note the likeliest hypothesis, and whether what it leaves is noise."""
-    best, free = largest_of(inference), -3
-    for i in range(n):
-        free += inference.mask >> i & 1
-        free -= inference.members[best] >> i & 1
-    inference.log_odds, inference.likeliest, inference.fit_of_best = (
-        inference.odds[best],
-        inference.members[best],
-        inference.fits[best],
-    )
-    inference.fitted = 2.0 * (inference.total - inference.fits[best]) <= FIT + FIT_PER_CHECK * max(free, 0)
+    best = largest_of(inference)
+    inference.log_odds, inference.likeliest = inference.odds[best], inference.members[best]
+    inference.fit_of_best = inference.fits[best]
+    free = checks(inference.mask & ~inference.likeliest, n)
+    inference.fitted = 2.0 * (inference.total - inference.fit_of_best) <= FIT + FIT_PER_CHECK * max(free, 0)
     inference.largest = 0.0
     for i in range(n):
         if inference.likeliest >> i & 1:
@@ -314,13 +359,11 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
 
 
 @compiled
-def explain(
-    inference: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float
-) -> None:
-    """Find the smallest set of hypotheses that holds the truth with the confidence.
-
-    ``inference.parity`` is that of the mean.
-    """
+def explain(params: Constants, inference: Inference) -> None:
+    """Explain a mean: find the smallest set of hypotheses that holds the truth with the confidence."""
+    n = params.sensors.n
+    compute_joint_weights(inference.parity, n, inference.mask, inference.covariance)
+    eliminate_rate(inference.parity, n, params.sensors.axes, UNKNOWN_RATE)
     inference.total = 0.0
     for i in range(n):
         inference.u[i] = 0.0
@@ -331,5 +374,22 @@ def explain(
             inference.total += 0.5 * inference.u[i] * inference.y[i]
     inference.count = 0
     add_channels(inference, n)
-    add_units(inference, n, axes, members, units)
-    choose(inference, n, confidence)
+    add_units(params, inference)
+    choose(inference, n, params.confidence)
+
+
+@compiled
+def moved_by(inference: Inference, n: int) -> float:
+    """By how much all biases have moved, standard deviation, if that is what the mean shows; 0: it is not.
+
+    So it is where no hypothesis of a few channels leaves noise, and the best of them much of what is to be explained.
+    """
+    residual = 2.0 * (inference.total - inference.fit_of_best)
+    if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:
+        return 0.0
+    trace = 0.0
+    for i in range(n):
+        if inference.mask >> i & 1:
+            trace += inference.parity.information[i, i]
+    square = max(2.0 * inference.total - checks(inference.mask, n), 0.0) / max(trace, 1e-12)
+    return math.sqrt(square)

@@ -1,14 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sequential evidence: Shiryaev-Roberts sums over channels, signs and sizes of a fault, at four time scales.
+"""The detector that flies: the path of a sample through the estimator, the sums, and the case that they open.
 
-The sums are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of variance one, if what is
-known of the sensors holds. Once the mean of the sums reaches the run length asked for, it is tested whether the
-evidence stands against the scatter of that same time (`look_for_case`). If it does, the states go back to what they
-were before the onset, and the mean since then is to be explained (`fdi_ros.detectors.naming`): only if a hypothesis
-stands against all that is not known of the sensors is there a case. It lasts until the evidence has gone, or until its
-channels are left out.
+The sums (`fdi_ros.detectors.case`) are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of
+variance one, if what is known of the sensors holds. A case lasts until its evidence has gone, or its channels are left
+out.
 """
 
 from __future__ import annotations
@@ -82,14 +79,15 @@ from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
 
-LEAST_TIME = 0.02  # s; that a fault lasts before it is declared
+LEAST_TIME = 0.02  # s that a fault lasts before it is declared: two samples at 100 Hz, as one value decides nothing
 OUTLIER, ALIKE = 5.5, 0.95
-"""A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
-HOLE, SLOW = 1.5 * BLOCK_TIME, 2.5  # a block begins anew after so many s, and so many periods, without a sample
+"""A value so many standard deviations off, as noise makes one in 2e7, is left out of the fused rate of its sample; so
+are those nearly as far off, of which each may be the culprit."""
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
-"""Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
+"""Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any,
+calibrated or not."""
 SHORT = 1.0 - 1e-9  # what is shown of the threshold where the sums have reached it, and there is no alarm
 
 
@@ -210,7 +208,8 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     kf = state.estimator
     for i in range(params.sensors.n):
         sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
-    if kf.seconds - kf.used_at > max(HOLE, SLOW * params.period):
+    # Without a sample for so long a block begins anew.
+    if kf.seconds - kf.used_at > max(1.5 * BLOCK_TIME, 2.5 * params.period):
         drop_block(kf, params.sensors.n)
     kf.used_at = kf.seconds
     kf.samples += 1
@@ -322,20 +321,12 @@ class Sequential(Detector):
     r"""Shiryaev-Roberts sums of the innovations of an error-state estimator; channels named by the odds since onset.
 
     The estimator knows bias, scale error, misalignment and delay of the channels, each with its uncertainty, and the
-    noise of the moment; its innovations y are white and of variance one while the model holds. For each channel, sign
-    and size s, six from 0.2 to 6.4 standard deviations, at samples, blocks of 40 ms, 0.25 s and 2 s:
-
-        R <- (1 + R) exp(s y - s^2 / 2),    and the same for -y.
-
-    While no channel is faulty, R less the number of samples does not drift upward (Shiryaev 1963, Roberts 1966, Pollak
-    1987), and so neither does the mean of all R. Where that mean reaches `run_length`, the largest sum has to hold
-    against the scatter within the time since its onset, as a Student ratio; and then an explanation of the mean since
-    the onset against everything that is not known of the sensors, whose states go back to before the onset for it.
-    While the alarm stands, channels, pairs, units as a whole, their gain and their delay explain the mean with certain
-    odds, and the smallest set of these that holds the truth with `confidence` is named; `isolated` if all of it have a
-    channel in common and the best of it leaves no more than noise. `Verdict.statistic` is the logarithm of one plus the
-    mean of all sums: below the threshold without an alarm, never below it with one, and 0 while evidence is void.
-    docs/methods.md has the rest, and what it is good and bad at.
+    noise of the moment. Sums over channels, signs, sizes and time scales of a fault tell where its innovations are not
+    white: where their mean reaches `run_length`, a hypothesis that explains the values since the onset has to stand
+    against everything that is not known of the sensors. While the alarm stands, the smallest set of hypotheses that
+    holds the truth with `confidence` is named; `isolated` if all of it have a channel in common and the best of it
+    leaves no more than noise. `Verdict.statistic` is the logarithm of one plus the mean of all sums: below the
+    threshold without an alarm, never below it with one, and 0 while evidence is void. docs/methods.md has the rest.
 
     Parameters
     ----------
@@ -355,11 +346,6 @@ class Sequential(Detector):
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
     delay_std
         How late the stamps of one unit may be against another's, standard deviation, s.
-
-    Raises
-    ------
-    ConfigError
-        If an option is out of its range, or the run length is given twice.
     """
 
     name = "sequential"

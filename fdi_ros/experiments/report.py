@@ -109,9 +109,9 @@ def _both(at: Figures) -> str:
     return f"{_of('right')(at)} ({_of('declared')(at)})"
 
 
-def _firsts(cell: Figures) -> dict[str, Figures]:
-    """Figures by method at the first false-alarm rate."""
-    return {name: at[0] for name, at in cell["methods"].items()}
+def _at(cell: Figures, k: int = 0) -> dict[str, Figures]:
+    """Figures by method at one of the false-alarm rates."""
+    return {name: at[k] for name, at in cell["methods"].items()}
 
 
 def _plot(
@@ -146,29 +146,29 @@ def _plot(
 def _snapshot(group: Group) -> list[Section]:
     if group.settings["faults"] == 2:
         return [_double(group, cell) for cell in group.faults]
-    if len(group.settings["false_alarms"]) > 1:
-        return [_rates(group, cell) for cell in group.faults]
+    alarms = group.settings["false_alarms"]
+    if len(alarms) > 1:
+        return [
+            _table(
+                _rates_title(group, cell),
+                "Percent declared, by false-alarm rate.",
+                [(f"{alarm:g}", _at(cell, k), _of("declared")) for k, alarm in enumerate(alarms)],
+            )
+            for cell in group.faults
+        ]
     healthy, *faults = group.cells
-    columns: list[ByDetector] = [("healthy", _firsts(healthy), _of("declared"))]
-    columns += [(f"{cell['size']:g}", _firsts(cell), _both) for cell in faults]
+    columns: list[ByDetector] = [("healthy", _at(healthy), _of("declared"))]
+    columns += [(f"{cell['size']:g}", _at(cell), _both) for cell in faults]
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
     found = [_table(f"One fault, {group.mounting}", hint, columns)]
-    ranking = [name for name, at in _firsts(faults[0]).items() if "identified" in at]
-    if ranking:
-        columns = []
-        for cell in faults:
-            named = {name: at for name, at in _firsts(cell).items() if name in ranking}
-            columns.append((f"{cell['size']:g}", named, _of("identified")))
+    columns = []
+    for cell in faults:
+        ranking = {name: at for name, at in _at(cell).items() if "identified" in at}
+        columns += [(f"{cell['size']:g}", ranking, _of("identified"))] if ranking else []
+    if columns:
         title = f"Largest residual is the right one, {group.mounting}"
         found.append(_table(title, "Percent, alarm or not.", columns))
     return found
-
-
-def _rates(group: Group, cell: Figures) -> Section:
-    columns: list[ByDetector] = []
-    for k, alarm in enumerate(group.settings["false_alarms"]):
-        columns.append((f"{alarm:g}", {name: at[k] for name, at in cell["methods"].items()}, _of("declared")))
-    return _table(_rates_title(group, cell), "Percent declared, by false-alarm rate.", columns)
 
 
 def _rates_title(group: Group, cell: Figures) -> str:
@@ -187,25 +187,22 @@ def _double(group: Group, cell: Figures) -> Section:
         "suspects, mean": mean,
     }
     title = f"Two faults of {cell['size']:g} standard deviations, {group.mounting}"
-    columns = [(head, _firsts(cell), say) for head, say in words.items()]
-    return _table(title, "Percent; coverage of what was declared.", columns)
+    return _table(title, "Percent; coverage of what was declared.", [(head, _at(cell), words[head]) for head in words])
 
 
 def _snapshot_curves(group: Group) -> list[Section]:
+    alarms, faults = group.settings["false_alarms"], group.faults
     if group.settings["faults"] != 1:
         return []
-    if len(group.settings["false_alarms"]) > 1:
-        return [_rate_curves(group, cell) for cell in group.faults]
-    faults = group.faults
-    sizes = [cell["size"] for cell in faults]
-    curves = {name: (sizes, [_firsts(cell)[name]["right"] for cell in faults]) for name in _firsts(faults[0])}
-    return [_plot(f"Right declarations, {group.mounting}", curves, SIZE, "declared, right channel named")]
-
-
-def _rate_curves(group: Group, cell: Figures) -> Section:
-    alarms = group.settings["false_alarms"]
-    curves = {name: (alarms, [at["declared"] for at in points]) for name, points in cell["methods"].items()}
-    return _plot(_rates_title(group, cell), curves, "false alarms per sample", "declared", log="xaxis")
+    if len(alarms) == 1:
+        sizes = [cell["size"] for cell in faults]
+        curves = {name: (sizes, [_at(cell)[name]["right"] for cell in faults]) for name in _at(faults[0])}
+        return [_plot(f"Right declarations, {group.mounting}", curves, SIZE, "declared, right channel named")]
+    found = []
+    for cell in faults:
+        curves = {name: (alarms, [at["declared"] for at in points]) for name, points in cell["methods"].items()}
+        found.append(_plot(_rates_title(group, cell), curves, "false alarms per sample", "declared", log="xaxis"))
+    return found
 
 
 # Streams
@@ -262,21 +259,20 @@ def _flight(group: Group) -> list[Section]:
 
 
 def _search(group: Group) -> list[Section]:
-    return [_outcomes(cell, group.settings) for cell in group.cells]
-
-
-def _outcomes(cell: Figures, settings: Mapping[str, Any]) -> Section:
-    """Shares of one selection: of the searches with the paper's tolerance, then of all methods at each rate."""
-    rows = [(name, "tolerance (8)", shares) for name, shares in cell["paper_tolerance"].items()]
-    words = list(rows[0][2])
-    for k, alarm in enumerate(settings["false_alarms"]):
-        rows += [(name, f"{alarm:g}", points[k]) for name, points in cell["methods"].items()]
-    title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
-    ratio = settings["sigma_ratio"]
-    hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
-    head = ("detector", "false alarms", *(word.replace("_", ", ") for word in words))
-    said = [(name, alarm, *(_of(word)(shares) for word in words)) for name, alarm, shares in rows]
-    return _alike_together(title, hint, head, said)
+    """Shares of each selection: of the searches with the paper's tolerance, then of all methods at each rate."""
+    found, settings = [], group.settings
+    for cell in group.cells:
+        rows = [(name, "tolerance (8)", shares) for name, shares in cell["paper_tolerance"].items()]
+        for k, alarm in enumerate(settings["false_alarms"]):
+            rows += [(name, f"{alarm:g}", shares) for name, shares in _at(cell, k).items()]
+        words = [word for word in rows[0][2] if word != "false_alarm"] if rows else []
+        title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
+        ratio = settings["sigma_ratio"]
+        hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
+        head = ("detector", "false alarms", *(word.replace("_", ", ") for word in words))
+        said = [(name, alarm, *(_of(word)(shares) for word in words)) for name, alarm, shares in rows]
+        found.append(_alike_together(title, hint, head, said))
+    return found
 
 
 _TABLES: Mapping[str, Shows] = {

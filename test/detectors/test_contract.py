@@ -370,25 +370,20 @@ def last_verdicts(name, geometry, **options):
         yield channel, Verdict(*(field[-1] for field in verdict))
 
 
-@pytest.mark.parametrize("name", ANY_NUMBER)
-@pytest.mark.parametrize(
-    ("geometry", "alike"),
-    [(Geometry.from_triads([np.eye(3)] * 2), [[0, 3], [1, 4], [2, 5]] * 2), (Geometry.cone(4), [[0, 1, 2, 3]] * 4)],
-    ids=["two parallel triads", "four channels"],
-)
-def test_such_channels_are_suspects_together_and_none_is_isolated(name, geometry, alike):
-    for channel, last in last_verdicts(name, geometry):
+TRIADS, PAIR = Geometry.from_triads([np.eye(3)] * 2), [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]]
+ALIKE = [
+    *((name, {}, TRIADS, [[0, 3], [1, 4], [2, 5]] * 2) for name in ANY_NUMBER),
+    *((name, {}, Geometry.cone(4), [[0, 1, 2, 3]] * 4) for name in ANY_NUMBER),
+    *(("determinant", {"criterion": one}, Geometry(PAIR), [[0, 1]] * 2) for one in ("determinant", "condition_number")),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "geometry", "alike"), ALIKE)
+def test_channels_that_look_alike_are_suspects_together_and_none_is_isolated(name, options, geometry, alike):
+    for suspects, (_, last) in zip(alike, last_verdicts(name, geometry, **options), strict=False):
         assert last.alarm
         assert not last.isolated
-        assert np.flatnonzero(last.suspects).tolist() == alike[channel]
-
-
-@pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
-def test_two_of_five_channels_along_one_axis(criterion):
-    geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]])
-    for _, last in list(last_verdicts("determinant", geometry, criterion=criterion))[:2]:
-        assert not last.isolated
-        assert np.flatnonzero(last.suspects).tolist() == [0, 1]
+        assert np.flatnonzero(last.suspects).tolist() == suspects
 
 
 @pytest.mark.parametrize("name", ANY_NUMBER)

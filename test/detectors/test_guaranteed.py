@@ -194,7 +194,6 @@ SIX = Geometry.two_triad_cone()
         (lambda: guaranteed(Geometry.cone(5), max_faults=2), "max_faults is 2 with 5 channels, expected at most 1"),
         (lambda: guaranteed(Geometry.cone(4), max_faults=1), "max_faults is 1 with 4 channels, expected at most 0"),
         (lambda: guaranteed(Geometry.cone(10)), "guaranteed runs on 4 to 9 channels, got 10"),
-        (lambda: guaranteed(SIX).error_bounds(np.zeros((2, 5))), "z has shape (2, 5), expected (N, 6)"),
         (lambda: guaranteed(SIX).culprits(np.zeros(6)), "z has shape (6,), expected (N, 6)"),
     ],
 )

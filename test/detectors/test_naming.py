@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from fdi_ros import Geometry
-from fdi_ros.compiling.compiled import MAX_UNITS, allocate
-from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate, mask_of
+from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros.compiling.compiled import allocate
+from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
     COINCIDENCE,
     DELAY_STD,
@@ -28,44 +28,28 @@ from fdi_ros.detectors.naming import (
     explain,
 )
 
-CONE = Geometry(Geometry.two_triad_cone().axes)
-PARALLEL = Geometry.from_triads([np.eye(3)] * 3)
-
 
 class Mean:
     """A mean to be explained, its covariance, and the motion it is of."""
 
     def __init__(self, geometry, y, covariance):
-        self.geometry, self.n = geometry, geometry.n
-        self.y, self.covariance = y, np.eye(self.n) * covariance if np.isscalar(covariance) else covariance
-        self.members = np.zeros(MAX_UNITS, dtype=np.int64)
-        self.members[: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
+        self.geometry, self.n, self.y, self.covariance = geometry, geometry.n, y, covariance
+        self.params = create_detector("sequential", geometry, NoiseModel(1.0)).constants
         self.rows = allocate(Inference)
         own = self.own = self.rows[0]
         own["mask"] = own["judged"] = (1 << self.n) - 1
-        own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, self.covariance
-        compute_joint_weights(own["parity"], self.n, int(own["mask"]), own["covariance"])
-        eliminate_rate(own["parity"], self.n, self.axes, UNKNOWN_RATE)
-
-    @property
-    def axes(self):
-        return self.geometry.axes.copy()
+        own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, covariance
 
     def moving(self, rate, acceleration):
         self.own["rate"], self.own["angular_acceleration"][: self.n] = rate, self.geometry.axes @ acceleration
         return self
 
-    def explained(self, confidence=0.999):
-        """Channels that are faulty, and those of which one is."""
-        explain(self.own, self.n, self.axes, self.members, len(self.geometry.units), confidence)
-        return channels_of(int(self.own["common"])), channels_of(int(self.own["union"]))
-
     def hypotheses(self):
         """Channels, logarithm of the odds and kind of each."""
-        explain(self.own, self.n, self.axes, self.members, len(self.geometry.units), 0.999)
+        explain(self.params[0], self.own)
         self.own["count"] = 0
         add_channels(self.own, self.n)
-        add_units(self.own, self.n, self.axes, self.members, len(self.geometry.units))
+        add_units(self.params[0], self.own)
         count = int(self.own["count"])
         return list(zip(*(self.own[name][:count].tolist() for name in ("members", "odds", "whole")), strict=True))
 
@@ -158,10 +142,10 @@ def test_what_no_hypothesis_explains_blames_all(seed, n):
     """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""
     mean = random_mean(seed, n)
     root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
-    faulty, among = mean.explained()
+    explain(mean.params[0], mean.own)
     best = sorted(channels_of(int(mean.own["likeliest"])))
     columns = root @ np.hstack([mean.geometry.axes, np.eye(n)[:, best]])
     left = root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
     limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)
     if left @ left > 1.01 * limit:
-        assert (faulty, among) == (set(), set(range(n)))
+        assert (mean.own["common"], mean.own["union"]) == (0, (1 << n) - 1)

@@ -52,11 +52,6 @@ def fault(channel, size, geometry=CONE):
     return size / geometry.sensitivity[channel] * np.eye(geometry.n)[channel]
 
 
-def named(verdict):
-    """Channels that were ever isolated."""
-    return set(np.flatnonzero(verdict.suspects[verdict.isolated].any(axis=0)).tolist())
-
-
 @cache
 def noisy():
     fresh().detect(white(99, 4000))
@@ -124,19 +119,6 @@ def test_what_has_passed_is_forgotten():
     after = detector.detect(white(8, 40_000))
     assert after.alarm[0]
     assert not after.alarm[-1]
-
-
-@pytest.mark.parametrize("geometry", [CONE, Geometry.cone(8), Geometry.from_triads([np.eye(3)] * 3)])
-def test_one_fault_is_named_with_its_size(geometry):
-    detector = sequential(geometry)
-    for channel in range(geometry.n):
-        detector.reset()
-        z = white(channel, 1200, geometry.n)
-        z[1000:, channel] -= 12.0
-        verdict = detector.detect(z)
-        assert named(verdict) == {channel}
-        assert verdict.isolated[-1]
-        assert verdict.error[-1, channel] == pytest.approx(-12.0, abs=1.0)
 
 
 @settings(max_examples=40)

@@ -23,7 +23,6 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
 from fdi_ros.experiments.contenders import cusum_run_length, moustakides_delay
-from fdi_ros.experiments.flight import Flight
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
@@ -155,17 +154,6 @@ def test_workers_end_when_their_parent_is_killed(tmp_path, lost):
 def test_workers_that_always_die_end_the_study_with_one_line():
     with pytest.raises(StudyError, match="a job was given up: the worker process that ran it died 3 times"):
         list(jobs.run_jobs(os._exit, [(1,), (1,)], 2, None))
-
-
-def test_workers_that_die_together_once_cost_no_more_than_their_blocks(tmp_path):
-    def once(k):
-        mark = tmp_path / str(k)
-        if not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return k
-
-    assert sorted(jobs.run_jobs(once, [(k,) for k in range(6)], 6, None)) == [(k, k) for k in range(6)]
 
 
 def check_that_one_is_lost(folder, cluster):
@@ -351,31 +339,14 @@ def test_the_least_delay_lies_below_a_cusum_that_watches_both_sides_and_near_the
 
 def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not(tmp_path):
     monitor = {"noise.noise_std": 0.003, "noise.scale_std": 0.002, "noise.timing_std": 0.0003}
-    what = {"detectors": ["likelihood_ratio"], "kinds": ["none", "bias", "dropout"], "monitor": monitor | LEARNING}
+    monitor |= {"bias.startup_bias_duration": 2.0}
+    what = {"detectors": ["likelihood_ratio"], "kinds": ["none", "bias", "dropout"], "monitor": monitor}
     section = run(tmp_path, "flight", 13, **what, trials=8)
     cells = {cell["fault"]: cell["methods"]["likelihood_ratio"] for cell in section["cells"]}
     assert cells["none"]["wrong"]["value"] == 0
     assert cells["bias"]["right"]["value"] == cells["dropout"]["right"]["value"] == 1
     assert cells["dropout"]["delay_s"]["p50"] == pytest.approx(0.1, abs=0.021)
     assert cells["bias"]["rms_after"] < 2 * cells["none"]["rms_after"]
-
-
-LEARNING = {"bias.startup_bias_duration": 2.0}
-
-
-@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
-def test_a_flight_leaves_nothing_behind_for_the_next(name):
-    settings = {field: known.default for field, known in Flight.schema.items()}
-    flight = Flight(settings | {"kinds": ["bias"], "detectors": [name], "monitor": LEARNING})
-    first, second = (flight._flight("bias", np.random.default_rng(seed))[0] for seed in (4, 3))
-    used, fresh = (flight._monitor(name) for _ in range(2))
-    used.process(first)
-    used.restart()
-    after, alone = used.process(second), fresh.process(second)
-    assert list(after.events) == list(alone.events) != []
-    for field in after.rows.dtype.names:
-        np.testing.assert_array_equal(after.rows[field], alone.rows[field])
-    assert used.status() == fresh.status()
 
 
 def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):

@@ -100,11 +100,6 @@ class Projector(SingleFaultDetector):
         ``l2`` or ``l1``.
     rate
         `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
-
-    Raises
-    ------
-    ConfigError
-        If an option is out of its range.
     """
 
     name = "projector"
@@ -228,15 +223,8 @@ class Recursive(SingleFaultDetector):
 
     Parameters
     ----------
-    geometry, noise
-        As of every `Detector`.
-    rate
-        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
-
-    Raises
-    ------
-    ConfigError
-        If an option is out of its range.
+    geometry, noise, rate
+        As of `Projector`.
     """
 
     name = "recursive"
@@ -284,11 +272,9 @@ Four = tuple[float, float, float, float]
 
 CHANNELS = 5
 CRITERIA = ("determinant", "condition_number")
-MOST_STEPS = 40  # Newton steps for a root; five are usual
 NO_POWER = 1e-200
 """Added to every term, so that a sample of zeros divides nothing by zero; a condition number above its inverse is
 infinite."""
-OFF_THE_POLE = 1 + 1e-15
 
 
 @record
@@ -348,8 +334,9 @@ def largest_root(powers: Four, poles: Four) -> float:
     x = 0.0
     for k in range(4):
         x = max(x, poles[k] + (powers[k] + NO_POWER))
-    x *= OFF_THE_POLE
-    for _ in range(MOST_STEPS):
+    # Off the pole by rounding; then five steps are usual.
+    x *= 1 + 1e-15
+    for _ in range(40):
         value, slope = 0.0, 0.0
         for k in range(4):
             inverse = 1.0 / (x - poles[k])
@@ -378,20 +365,11 @@ class Determinant(SingleFaultDetector):
     Parameters
     ----------
     geometry
-        Sensitivity axes, five.
-    noise
-        Error model of a healthy channel.
+        Sensitivity axes, five (else `DetectorError`).
     criterion
         ``determinant`` or ``condition_number``.
-    rate
-        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
-
-    Raises
-    ------
-    DetectorError
-        If there are not five channels.
-    ConfigError
-        If an option is out of its range.
+    noise, rate
+        As of `Projector`.
     """
 
     name = "determinant"

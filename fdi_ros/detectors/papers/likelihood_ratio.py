@@ -3,19 +3,11 @@
 
 """Generalised likelihood ratio for one faulty channel, then for two; and which channels explain a sample with a fault.
 
-A hypothesis "these channels L are arbitrary, all others healthy" leaves L out. The others give the weighted
-least-squares rate, and with it
-
-- the error of each channel left out, ``z_i - h_i omega_L``: linear in z_i with slope one, whatever the noise;
-- the remaining chi-square, the weighted squares of the others' residuals, n - 3 - |L| degrees of freedom.
-
-With S the residual matrix of all channels and ``r = S z``, leaving L out changes r to ``r - S[:, L] S_LL^-1 r_L``, and
-``S_LL^-1 r_L`` are the errors: no hypothesis needs a matrix of its own.
-
-With noise that depends on the rate, the variances under a hypothesis are those at the rate which the channels
-*kept* give (least squares, all weights equal), and the weighted solution is a correction to it. So neither figure's
-weights depend on the channels left out, and a fault of channel i moves the statistic of hypothesis {i} in proportion:
-a larger fault is never less visible, however large its share in the rate estimate of all channels is.
+A hypothesis "these channels L are arbitrary, all others healthy" leaves L out. With S the residual matrix of all
+channels and ``r = S z``, that changes r to ``r - S[:, L] S_LL^-1 r_L``, and ``S_LL^-1 r_L`` are the errors: no
+hypothesis needs a matrix of its own. With noise that depends on the rate the variances under a hypothesis are those at
+the least-squares rate of the channels *kept*, and the weighted solution is a correction to it. So no weight depends on
+the channels left out: a larger fault of channel i is never less visible in the statistic of {i}.
 """
 
 from __future__ import annotations
@@ -49,7 +41,6 @@ from fdi_ros.model.samples import Array
 MAX_RATIO = 1e6
 """Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,
 and weights further apart would leave no correct digit in the normal equations."""
-NONE = -1  # no channel
 SAME_FIT = 1e-6  # chi-squares this close are equal but for rounding
 
 
@@ -141,7 +132,7 @@ def fill_scratch(params: Hypotheses, sensors: Sensors, sample: SampleInput, room
 
 @compiled
 def leave_out(params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int) -> None:
-    """Residuals without channels a, b, c (b and c may be `NONE`) in `kept`, and in their own places their errors."""
+    """Residuals without channels a, b, c (b and c may be -1: none) in `kept`, and in their own places their errors."""
     S, r = params.residual, room.residual
     e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
     if c >= 0:
@@ -246,8 +237,8 @@ def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
         return 0.0
     if params.fixed:
         return room.residual[i] / math.sqrt(params.residual[i, i])
-    leave_out(params, sensors.n, room, i, NONE, NONE)
-    correct_rate(sensors, sample, room, i, NONE, NONE)
+    leave_out(params, sensors.n, room, i, -1, -1)
+    correct_rate(sensors, sample, room, i, -1, -1)
     h, s = sensors.axes[i], room.inverse
     own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (s[3] * h[1] + 2 * s[4] * h[2])
     spread = room.variance[i] + own_part + h[2] * s[5] * h[2]
@@ -258,25 +249,13 @@ def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
 def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
     """Name the channels that explain a sample taken by `fill_scratch`: suspects, whether isolated, their errors.
 
-    With c(k) the chi-square with k degrees of freedom that a true hypothesis stays below with the confidence asked
-    for, and m = n - 3:
-
-    1. A single channel explains the sample when what is left without it is at most c(m - 1). The best one is
-       named together with every rival whose fit is not worse by ``2 ln(confidence / (1 - confidence))``, that is
-       with odds below confidence : (1 - confidence). One without rivals is isolated. Two faults that together look
-       like one of a third channel are taken for it: one fault is more likely than two.
-    2. Where no single channel explains the sample, every pair is possible whose chi-square is at most c(m - 2);
-       suspects are their union, isolated when it is one pair alone (then both are faulty: neither explains
-       the sample by itself). With five channels a pair explains anything: all are suspect.
-    3. Where no pair does either, a whole unit of three channels may (one chip, one cable): named, all three as
-       faulty, when it is the only unit that leaves at most c(m - 3).
-    4. Where nothing explains the sample, all detectable channels are suspect.
+    A single channel and its rivals, else pairs, else a whole unit, else all: docs/methods.md#likelihood_ratio.
     """
     n, best = sensors.n, math.inf
     for i in range(n):
         room.remaining[i] = math.inf
         if sensors.detectable[i]:
-            room.remaining[i] = fit(params, sensors, sample, room, i, NONE, NONE)
+            room.remaining[i] = fit(params, sensors, sample, room, i, -1, -1)
             verdict.error[i] = room.estimate[0]
             best = min(best, room.remaining[i])
     if best <= params.single_limit:
@@ -309,7 +288,7 @@ def explain_by_pairs(
         for j in range(i + 1, n):
             # Two that cannot be told apart explain no more together than one of them.
             if sensors.detectable[i] and sensors.detectable[j] and not sensors.alike[i, j]:
-                residual = fit(params, sensors, sample, room, i, j, NONE)
+                residual = fit(params, sensors, sample, room, i, j, -1)
                 if residual <= params.pair_limit:
                     possible += 1
                     add_suspect(room, verdict, i, residual, room.estimate[0])
@@ -338,7 +317,7 @@ def explain_by_units(
     params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
 ) -> bool:
     """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
-    found, possible = NONE, 0
+    found, possible = -1, 0
     for k in range(params.units):
         unit = params.unit[k]
         if fit(params, sensors, sample, room, unit[0], unit[1], unit[2]) <= params.unit_limit:

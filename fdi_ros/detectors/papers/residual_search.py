@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -104,10 +105,7 @@ class MeanSquareResidual(ResidualSearch):
     criterion_squares = True
 
     def _forms(self, geometry: Geometry) -> Array:
-        terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
-        for i, forms, _ in _left_out(geometry):
-            terms[:, i] = _square_root(forms / math.sqrt(len(forms)), len(terms))
-        return terms
+        return _squares(geometry, lambda forms, gain: forms / math.sqrt(len(forms)))
 
 
 class RateDeviation(ResidualSearch):
@@ -117,12 +115,10 @@ class RateDeviation(ResidualSearch):
     criterion_squares = True
 
     def _forms(self, geometry: Geometry) -> Array:
-        terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
-        for i, forms, gain in _left_out(geometry):
-            # Leaving out j changes the rate by G_i[:, j] (z_j - z_jp).
-            weighted = forms * np.linalg.norm(gain, axis=0)[:, None] / math.sqrt(3 * len(forms))
-            terms[:, i] = _square_root(weighted, len(terms))
-        return terms
+        # Leaving out j changes the rate by G_i[:, j] (z_j - z_jp).
+        return _squares(
+            geometry, lambda forms, gain: forms * np.linalg.norm(gain, axis=0)[:, None] / math.sqrt(3 * len(forms))
+        )
 
 
 class MaxResidual(ResidualSearch):
@@ -149,9 +145,10 @@ def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:
     return found
 
 
-def _square_root(forms: Array, terms: int) -> Array:
-    """Forms (terms, n) with the same sum of squares as forms (k, n), whose rank is at most `terms`."""
-    _, singular, rows = np.linalg.svd(forms, full_matrices=False)
-    root = np.zeros((terms, forms.shape[1]))
-    root[: len(singular)] = (singular[:, None] * rows)[:terms]
-    return root
+def _squares(geometry: Geometry, weighted: Callable[[Array, Array], Array]) -> Array:
+    """Forms (n - 4, n, n): for each channel left out as many as its weighted forms have rank, of the same squares."""
+    terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
+    for i, forms, gain in _left_out(geometry):
+        _, singular, rows = np.linalg.svd(weighted(forms, gain), full_matrices=False)
+        terms[: len(singular), i] = (singular[:, None] * rows)[: len(terms)]
+    return terms

@@ -74,9 +74,9 @@ def value_of(form: Array, z: Array, n: int) -> float:
     return total
 
 
-TRIAL_FAULT = 50.0  # size of the faults tried, in noise_std of their channel
-TRIAL_NOISE = 1.5  # the noise of the trials, in noise_std
-TRIALS = 200  # trials per channel
+TRIALS, TRIAL_FAULT, TRIAL_NOISE = 200, 50.0, 1.5
+"""Trials per channel, size of the faults tried and noise in them, in noise_std: the fault is by far the larger part;
+more noise than assumed finds rivals rather than misses them."""
 
 
 @record
@@ -152,7 +152,7 @@ class SingleFaultDetector(Detector):
         params = self.constants[0]
         params["suspects"][:n, :n], params["names"][:n] = suspects, names
         # Constants that are already in use are copied anew.
-        self._rows = None
+        vars(self).pop("_rows", None)
 
     def _try_faults(self) -> None:
         """Find out which channels are named for a fault of `TRIAL_FAULT`: row i of the suspects, if i is named.
