@@ -125,39 +125,6 @@ class Contenders(NamedTuple):
     refused: dict[str, str]
 
 
-def build_contenders(
-    names: Sequence[str],
-    geometry: Geometry,
-    noise: NoiseModel,
-    alarm_probability: float,
-    own: Mapping[str, Mapping[str, Any]],
-    streams: bool = False,
-) -> Contenders:
-    """Build methods of `METHODS` for channels, with loose thresholds of a probability of alarm per sample.
-
-    ``own``: options of a method by name; they win. ``streams``: also the methods that need a stream.
-    """
-    running, refused, streaming = {}, {}, {}
-    for name in names:
-        options = loose_options(name, geometry.n, alarm_probability) | dict(own.get(name, {}))
-        try:
-            chi_square = name == ChiSquare.name
-            method = (
-                ChiSquare(geometry, noise, **options)
-                if chi_square
-                else create_detector(name, geometry, noise, **options)
-            )
-        except FdiError as error:
-            refused[name] = str(error)
-            continue
-        contender = Contender(method)
-        if contender.has_memory and not streams:
-            streaming[name] = "judges a stream, not one sample"
-        else:
-            running[name] = contender
-    return Contenders(running, refused | streaming)
-
-
 def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
     """Options of a method with a threshold of a given false-alarm probability per sample, or a loose one."""
     accepted = accepted_options(METHODS[name])
@@ -197,6 +164,8 @@ class CommonRate(TrialProtocol[Cell]):
     asked for.
     """
 
+    streams: ClassVar[bool] = False
+    """Trials are streams, which all methods can judge."""
     schema: ClassVar[Schema] = {
         "geometries": Field("geometries", ["two_triad_cone"]),
         "detectors": Field("detectors", "all", choices=tuple(METHODS)),
@@ -249,8 +218,29 @@ class CommonRate(TrialProtocol[Cell]):
         """Draw values of trials, rad/s, and which channels are off."""
 
     @abstractmethod
+    def loose(self) -> tuple[NoiseModel, float]:
+        """Error model of a channel, and the false-alarm probability per sample of the loose thresholds."""
+
     def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
-        """Build methods at their loose thresholds for a geometry, by its number; ``own``: options by method."""
+        """Build methods of `METHODS` at their loose thresholds for a geometry; ``own``: options by name, which win."""
+        geometry, (noise, probability) = self.geometries[g], self.loose()
+        running, refused, streaming = {}, {}, {}
+        for name in names:
+            options = loose_options(name, geometry.n, probability) | dict(own.get(name, {}))
+            try:
+                if name == ChiSquare.name:
+                    method: Method = ChiSquare(geometry, noise, **options)
+                else:
+                    method = create_detector(name, geometry, noise, **options)
+            except FdiError as error:
+                refused[name] = str(error)
+                continue
+            contender = Contender(method)
+            if contender.has_memory and not self.streams:
+                streaming[name] = "judges a stream, not one sample"
+            else:
+                running[name] = contender
+        return Contenders(running, refused | streaming)
 
 
 def factors_of(blocks: Sequence[Counts], false_alarms: Sequence[float]) -> dict[str, list[float]]:

@@ -184,7 +184,6 @@ class Flight(TrialProtocol[str]):
     is a kind of fault.
     """
 
-    kind = "flight"
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),

@@ -53,7 +53,6 @@ class TrialProtocol(ABC, Generic[Cell]):
     block's result depends on its settings, its seed and the first stage alone.
     """
 
-    kind: ClassVar[str]
     schema: ClassVar[Schema]
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -73,7 +72,7 @@ class TrialProtocol(ABC, Generic[Cell]):
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Run one block of the first stage, where there is one."""
-        raise NotImplementedError(f"{self.kind} has no cells to prepare")
+        return {}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Work out from the blocks of each cell of the first stage what the second needs."""
@@ -292,8 +291,8 @@ def run_study(
         """Run all blocks of a stage, and return them for every cell of every section."""
         blocks = [block for s, protocol in enumerate(protocols) for block in _blocks(s, protocol, stage)]
         texts = [
-            (protocol.kind, json.dumps(protocol.settings), json.dumps(preparation))
-            for protocol, preparation in zip(protocols, preparations, strict=True)
+            (one.kind, json.dumps(one.settings), json.dumps(preparation))
+            for one, preparation in zip(study.sections, preparations, strict=True)
         ]
         jobs = [(*texts[block.section], study.seed, block) for block in blocks]
         counts: dict[int, Counts] = {}
@@ -308,11 +307,11 @@ def run_study(
 
     found = run(PREPARING, [{} for _ in protocols])
     prepared = [protocol.conclude(own) for protocol, own in zip(protocols, found, strict=True)]
-    sections = []
-    for protocol, preparation, counts in zip(protocols, prepared, run(TRIALS, prepared), strict=True):
+    sections, trials = [], run(TRIALS, prepared)
+    for one, protocol, preparation, counts in zip(study.sections, protocols, prepared, trials, strict=True):
         cells = zip(protocol.trial_cells(), counts, strict=True)
         figures = [protocol.summary(cell, reduce(added, blocks), preparation) for cell, blocks in cells]
-        sections.append(SectionResult(protocol.kind, protocol.settings, preparation, protocol.refusals(), figures))
+        sections.append(SectionResult(one.kind, one.settings, preparation, protocol.refusals(), figures))
     return StudyResult(FORMAT, __version__, study.name, study.title, study.seed, sections)
 
 

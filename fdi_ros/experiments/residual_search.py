@@ -13,7 +13,7 @@ out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
-from fdi_ros.experiments.contenders import BOUND, Cell, CommonRate, Contenders, build_contenders
+from fdi_ros.experiments.contenders import BOUND, Cell, CommonRate
 from fdi_ros.experiments.montecarlo import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
@@ -44,7 +44,6 @@ class ResidualSearch(CommonRate):
     cell is a selection of trials, or healthy channels.
     """
 
-    kind = "residual_search"
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
@@ -105,24 +104,20 @@ class ResidualSearch(CommonRate):
             },
         }
 
-    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
-        """Build methods that name a channel nearly always."""
-        return build_contenders(names, self.geometries[g], self._noise, LOOSE_FALSE_ALARM, own)
+    def loose(self) -> tuple[NoiseModel, float]:
+        """Errors of the protocol, and thresholds at which methods name a channel nearly always."""
+        zero, scale = self._zero_std, self.settings["scale_std"]
+        return NoiseModel(zero, scale, bound=BOUND * (zero + scale * self.settings["max_rate"])), LOOSE_FALSE_ALARM
 
     @property
     def _zero_std(self) -> float:
         settings = self.settings
         return settings["sigma_ratio"] * settings["scale_std"] * settings["max_rate"]
 
-    @property
-    def _noise(self) -> NoiseModel:
-        scale = self.settings["scale_std"]
-        return NoiseModel(self._zero_std, scale, bound=BOUND * (self._zero_std + scale * self.settings["max_rate"]))
-
     @cached_property
     def _paper(self) -> dict[str, Detector]:
         return {
-            name: create_detector(name, self.geometries[0], self._noise, tolerance="paper")
+            name: create_detector(name, self.geometries[0], self.loose()[0], tolerance="paper")
             for name in self.contenders[0].running
             if "tolerance" in accepted_options(detector_class(name))
         }

@@ -18,9 +18,7 @@ from fdi_ros.experiments.contenders import (
     Cell,
     CommonRate,
     Contender,
-    Contenders,
     Evaluation,
-    build_contenders,
     factors_of,
     moustakides_delay,
 )
@@ -39,7 +37,6 @@ FALSE_ALARM_MARGIN = 4.0  # the loose thresholds have this many times the false-
 class Snapshot(CommonRate):
     """Detection, right isolation and suspects by size of fault: none, one or two channels off by some noise_std."""
 
-    kind = "snapshot"
     schema: ClassVar[Schema] = {
         **CommonRate.schema,
         "faults": Field("int", 1, 1, 2),
@@ -95,11 +92,10 @@ class Snapshot(CommonRate):
             },
         }
 
-    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
-        """Build methods with more false alarms than asked for."""
+    def loose(self) -> tuple[NoiseModel, float]:
+        """White noise, and more false alarms than asked for."""
         margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
-        probability = min(margin * max(self.settings["false_alarms"]), 0.9)
-        return build_contenders(names, self.geometries[g], _noise(self.settings["noise_std"]), probability, own)
+        return _noise(self.settings["noise_std"]), min(margin * max(self.settings["false_alarms"]), 0.9)
 
     def _at_rates(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Contender, float]]]:
         """Each method with the factor of each false-alarm rate; those that depend on their threshold built anew."""
@@ -188,7 +184,7 @@ class Delay(CommonRate):
     are filled; streams with an alarm among them are counted and left out.
     """
 
-    kind = "delay"
+    streams = True
     schema: ClassVar[Schema] = {
         **CommonRate.schema,
         "sizes": Field("numbers", [1.0, 2.0, 3.0, 4.0, 6.0], 0.01, 1e4),
@@ -258,10 +254,9 @@ class Delay(CommonRate):
             z[np.arange(count), lead:, channel] += (cell.size * sigma * sign)[:, None]
         return z, None
 
-    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
-        """Build methods with a run length somewhat shorter than the one asked for."""
-        alarm, noise = RUN_LENGTH_MARGIN / self.settings["run_length"], _noise(self.settings["noise_std"])
-        return build_contenders(names, self.geometries[g], noise, alarm, own, streams=True)
+    def loose(self) -> tuple[NoiseModel, float]:
+        """White noise, and a run length somewhat shorter than the one asked for."""
+        return _noise(self.settings["noise_std"]), RUN_LENGTH_MARGIN / self.settings["run_length"]
 
 
 def _ratios(contender: Contender, z: Array) -> Array:
