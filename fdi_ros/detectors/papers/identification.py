@@ -23,7 +23,7 @@ from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
     SingleFault,
     SingleFaultDetector,
-    SumsOfForms,
+    WithForms,
     chosen,
     conclude,
     conclude_by_error,
@@ -103,7 +103,7 @@ class Projector(SingleFaultDetector):
     """
 
     name = "projector"
-    Constants = SumsOfForms
+    Constants = WithForms
     judge = judge_sums
 
     def __init__(
@@ -184,22 +184,15 @@ Index = NDArray[np.intp]
 NOTHING = 1e-20  # k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero.
 
 
-@record
-class Innovations(SingleFault):
-    """Constants of the recursion: [k, i] is innovation k of the permutation with channel i last."""
-
-    innovations: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 3, MAX_CHANNELS, MAX_CHANNELS)]
-
-
-@callback(Innovations, NoState, SampleInput, SampleVerdict)
-def judge_innovations(params: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Judge one sample by the largest k_s of all equations and permutations."""
+@callback(WithForms, NoState, SampleInput, SampleVerdict)
+def judge_innovations(params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the largest k_s of all equations and permutations; form [k, i] as `innovations` has it."""
     n, largest = params.sensors.n, 0.0
     fill_variances(params, sample, verdict)
     for i in range(n):
         before, last = 0.0, 0.0
         for k in range(n - 3):
-            form = params.innovations[k, i]
+            form = params.forms[k, i]
             innovation = value_of(form, sample.z, n) / std_of(params, form, 1.0, verdict)
             before, last = last, innovation * innovation
             largest = max(largest, last)
@@ -228,14 +221,14 @@ class Recursive(SingleFaultDetector):
     """
 
     name = "recursive"
-    Constants = Innovations
+    Constants = WithForms
     judge = judge_innovations
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, **rate: Any) -> None:
         n = geometry.n
         super().__init__(geometry, noise, {}, largest=True, scored=n > 4, **rate)
         params, forms = self.constants[0], innovations(geometry.axes, self.noise.noise_std)
-        params["innovations"][: n - 3, :n, :n] = forms
+        set_forms(params, forms)
         params["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
 
 
@@ -278,10 +271,9 @@ infinite."""
 
 
 @record
-class Struck(SingleFault):
-    """Constants of the comparison: [j] is [H z] without row j."""
+class Struck(WithForms):
+    """Constants of the comparison: [j] is [H z] without row j, its determinant the one form of score j."""
 
-    determinants: Annotated[NDArray[np.float64], "f8", (CHANNELS, CHANNELS)]  # as forms of z
     determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]  # their standard deviations at rest, rad/s
     by_condition: Flag  # the criterion is the condition number
     complement: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]  # U' of H, as forms of z
@@ -294,10 +286,10 @@ def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verd
     statistic = 0.0
     fill_variances(params, sample, verdict)
     for j in range(CHANNELS):
-        size = abs(value_of(params.determinants[j], sample.z, CHANNELS))
+        size = abs(value_of(params.forms[0, j], sample.z, CHANNELS))
         # A determinant that is always zero has no deviation.
         if size > 0:
-            std = std_of(params, params.determinants[j], params.determinants_resting[j], verdict)
+            std = std_of(params, params.forms[0, j], params.determinants_resting[j], verdict)
             statistic = max(statistic, size / std)
         verdict.scores[j] = condition_without(params, j, sample) if params.by_condition else size
     conclude(params, worst(params, verdict), statistic, params.limit, sample, verdict)
@@ -381,7 +373,8 @@ class Determinant(SingleFaultDetector):
         super().__init__(geometry, noise, {"criterion": criterion}, largest=by_condition, **rate)
         forms = determinant_forms(geometry.axes)
         params = self.constants[0]
-        params["determinants"], params["determinants_resting"] = forms, resting_std(forms, self.noise)
+        set_forms(params, forms[None])
+        params["determinants_resting"] = resting_std(forms, self.noise)
         params["by_condition"] = by_condition
         params["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
         for j in range(CHANNELS):

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.detectors.papers.single_fault import (
     SingleFaultDetector,
-    SumsOfForms,
+    WithForms,
     chosen,
     judge_sums,
     largest_form_threshold,
@@ -60,7 +60,7 @@ class ResidualSearch(SingleFaultDetector):
         If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
     """
 
-    Constants = SumsOfForms
+    Constants = WithForms
     judge = judge_sums
     criterion_squares: ClassVar[bool] = False  # the criterion sums squares, not absolute values
     criterion_largest: ClassVar[bool] = False  # the worst channel has the largest figure, not the least

@@ -240,8 +240,8 @@ def conclude(
 
 
 @record
-class SumsOfForms(SingleFault):
-    """For scores that are sums of absolute values or of squares of linear forms of z."""
+class WithForms(SingleFault):
+    """For scores that are made of linear forms of z."""
 
     terms: Whole  # forms per score
     squares: Flag  # sum squares, not absolute values
@@ -249,15 +249,15 @@ class SumsOfForms(SingleFault):
     paper: Flag  # the tolerance of a residual search is that of its paper
 
 
-def set_forms(params: Any, forms: Array, squares: bool) -> None:
+def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
     """Fill in forms (t, n, n)."""
     terms, n, _ = forms.shape
     params["terms"], params["squares"], params["forms"][:terms, :n, :n] = terms, squares, forms
 
 
-@callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
-def judge_sums(params: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Judge one sample by the error of the channel that the sums name."""
+@callback(WithForms, NoState, SampleInput, SampleVerdict)
+def judge_sums(params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the error of the channel that the sums of absolute or squared forms name."""
     for i in range(params.sensors.n):
         for t in range(params.terms):
             value = value_of(params.forms[t, i], sample.z, params.sensors.n)
