@@ -289,9 +289,6 @@ STATES = {
     "EXCLUDED": ("#7a5c99", "lines"),
 }
 """Colour and pattern of each state."""
-MARKS_HINT = "✕ an episode begins, ◆ its channel is isolated."
-GAPS_HINT = "Grey: gaps; each stretch between them is judged for itself."
-SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
 def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more: Mapping[str, Any]) -> Figure:
@@ -387,6 +384,8 @@ def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
 
 def _marks_hint(summary: Summary) -> str:
     """Say what the marks and shades are."""
-    hint = SCORED_HINT if summary.scores.faults else MARKS_HINT
+    hint = "✕ an episode begins, ◆ its channel is isolated."
+    if summary.scores.faults:
+        hint = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
     hint += " □ the autopilot said something." if summary.autopilot else ""
-    return f"{hint} {GAPS_HINT}" if summary.story.gaps else hint
+    return hint + (" Grey: gaps; each stretch between them is judged for itself." if summary.story.gaps else "")

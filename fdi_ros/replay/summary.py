@@ -145,18 +145,15 @@ class Summary(Judgement):
 
 def as_json(summary: Summary) -> dict[str, Any]:
     """Return the figures under the names of the fields, those of the parts of a summary side by side."""
-    parts = (summary.scores, summary.monitor, summary.stream)
-    figures = {name: value for part in parts for name, value in asdict(part).items()}
-    story = {
-        "stretches": [asdict(one) for one in summary.story.stretches],
-        "episodes": [{**asdict(one), "duration_s": one.duration_s} for one in summary.story.episodes],
-        "more_episodes": summary.story.more,
-    }
     return {
         "bag": summary.bag,
         "detector": summary.detector,
-        **figures,
-        **story,
+        **asdict(summary.scores),
+        **asdict(summary.monitor),
+        **asdict(summary.stream),
+        "stretches": [asdict(one) for one in summary.story.stretches],
+        "episodes": [{**asdict(one), "duration_s": one.duration_s} for one in summary.story.episodes],
+        "more_episodes": summary.story.more,
         "autopilot": list(map(asdict, summary.autopilot)),
         "seconds": summary.seconds,
     }

@@ -56,12 +56,6 @@ class Swept:
         return next((float(value) for name, value in self.items if name == "size"), None)
 
     @property
-    def words(self) -> str:
-        """As a title: kind, size and unit, other numbers."""
-        size = [] if self.size is None else [f"{self.size:g} {self.unit}".strip()]
-        return " ".join([self.kind, *size, *self._others])
-
-    @property
     def unit(self) -> str:
         """Of its size."""
         option = FAULT_KINDS[self.kind].options().get("size")
@@ -70,11 +64,13 @@ class Swept:
     @property
     def family(self) -> str:
         """What it shares with the same fault in other sizes."""
-        return " ".join([self.kind, *self._others])
+        return " ".join([self.kind, *(f"{name}={value}" for name, value in self.items if name != "size")])
 
     @property
-    def _others(self) -> list[str]:
-        return [f"{name}={value}" for name, value in self.items if name != "size"]
+    def words(self) -> str:
+        """As a title: kind, size and unit, other numbers."""
+        size = "" if self.size is None else f" {self.size:g} {self.unit}".rstrip()
+        return f"{self.kind}{size}{self.family.removeprefix(self.kind)}"
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
         """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
@@ -348,8 +344,7 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
     ends = np.cumsum(high - low)
     after = ends[-1] * (np.arange(plan.times) + 0.5) / plan.times
     place = np.searchsorted(ends, after)
-    times: list[float] = (low[place] + (after - (ends - (high - low))[place])).tolist()
-    return times
+    return np.asarray(low[place] + (after - (ends - (high - low))[place])).tolist()
 
 
 def _take_times(one: Subject, baseline: Baseline, times: Sequence[float], within: float) -> None:

@@ -256,20 +256,10 @@ def page(
 ) -> str:
     """Lay out a page.
 
-    Parameters
-    ----------
-    title, summary
-        What stands at the top: a line, and sentences, of which the first is the verdict.
-    sections
-        In their order.
-    store
-        Holds the long series that figures name by ``packed``.
-    severity
-        Of the verdict: its colour; None: there is no verdict.
-    origin
-        UTC that times count from, ns; None: not known.
+    ``summary``: sentences at the top, of which the first is the verdict, in the colour of its ``severity`` (None: there
+    is no verdict). ``store`` holds the long series that figures name by ``packed``. ``origin``: UTC that times count
+    from, ns; None: not known.
     """
-    # The first sentence has the colour of its severity.
     looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
@@ -383,15 +373,9 @@ _TEXT = 4 / 3  # characters of base64 per byte
 class PageStore:
     """Series over one time, of which a page keeps all samples, or the extremes of spans of samples; memory is bounded.
 
-    When there are too many spans, neighbours are put together and the next spans are twice as long.
-
-    Parameters
-    ----------
-    kinds
-        Name and kind of each of c series.
-    most
-        Spans kept at most, 2 or more; half of them once samples are put together: a span of several samples is two
-        values, of one it is one. None: as many as a page may hold.
+    When there are too many spans, neighbours are put together and the next spans are twice as long. ``kinds``: name and
+    kind of each of c series. ``most``: spans that are kept, 2 or more, half of them once samples are put together (a
+    span of several samples is two values); None: as many as a page may hold.
     """
 
     def __init__(self, kinds: Mapping[str, str], most: int | None = None) -> None:

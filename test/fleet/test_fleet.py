@@ -10,9 +10,6 @@ import resource
 import shutil
 import signal
 import struct
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -332,21 +329,3 @@ def test_where_nothing_could_be_judged_that_is_the_end(tmp_path, capsys):
     run(tmp_path / "o", tmp_path, codes=[2])
     assert f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'}" in capsys.readouterr().err
     assert (tmp_path / "o" / "flights.parquet").exists()
-
-
-def test_a_signal_is_answered_in_words(fleet, tmp_path):
-    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
-    command = [sys.executable, "-m", "fdi_ros.cli", "fleet", str(fleet / "heron"), *words]
-    # As plain Python it takes so long that it cannot be done before the signal comes.
-    slow = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=slow)
-    # The first thing that is written when a recording is judged.
-    while not (tmp_path / "o" / "configs").exists() and started.poll() is None:
-        time.sleep(0.001)
-    time.sleep(0.5)
-    started.send_signal(signal.SIGTERM)
-    said = started.communicate(timeout=60)[1]
-    assert (started.returncode, said) == (
-        130,
-        "fdi: stopped; what was judged is kept, the same command goes on from there\n",
-    )

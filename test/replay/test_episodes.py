@@ -17,7 +17,7 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.episodes import GAP, Size, detail_words, episode_words, pieces, size_words, stretch_words
+from fdi_ros.replay.episodes import GAP, Size, detail_words, episode_words, pieces, size_words
 from fdi_ros.replay.recorder import Batches, Recorder
 from fdi_ros.replay.run import Sink, Walk
 
@@ -45,20 +45,13 @@ def outputs(geometry, states, errors=None, time=None):
     return time, output_of(n, events, stamp=stamp, **figures)
 
 
-def cut(output, rows):
-    events = [event for event in output.events if rows.start <= event.row < rows.stop]
-    return Output(output.rows[rows], output.n, events)
-
-
-def told(geometry, *parts, pieces=1):
-    """The story of parts, each its own stretch; every part in so many pieces."""
-    recorder = Recorder(geometry, NOISE)
-    for number, (time, output) in enumerate(parts):
-        if number:
-            recorder.begin_stretch()
-        for rows in filter(len, np.array_split(np.arange(len(time)), pieces)):
-            span = slice(int(rows[0]), int(rows[-1]) + 1)
-            recorder.add(time[span], cut(output, span))
+def told(geometry, part, pieces=1):
+    """The story of a stretch that comes in so many pieces."""
+    recorder, (time, output) = Recorder(geometry, NOISE), part
+    for rows in filter(len, np.array_split(np.arange(len(time)), pieces)):
+        span = slice(int(rows[0]), int(rows[-1]) + 1)
+        events = [event for event in output.events if span.start <= event.row < span.stop]
+        recorder.add(time[span], Output(output.rows[span], output.n, events))
     return recorder.story()
 
 
@@ -193,17 +186,11 @@ def test_units_that_begin_one_after_the_other_were_not_silent():
     assert (one.who, one.state, one.stands) == ("imu_2", "STALE", True)
 
 
-@pytest.mark.parametrize(
-    ("course", "value", "last", "words"),
-    [
-        ("steady", -0.2, -0.2, "-0.200 +- 0.010 rad/s"),
-        ("steady", -0.009, -0.2, "too small to measure"),
-        ("growing", 0.009, 0.2, "too small to measure, growing to +0.2 rad/s"),
-        ("growing", -0.02, -0.2, "-0.020 +- 0.010 rad/s, growing to -0.2 rad/s"),
-    ],
-)
-def test_a_size_has_its_sign_and_one_below_its_error_is_none(course, value, last, words):
-    assert size_words(Size(value, 0.01, course, last)) == words
+def test_a_size_has_its_sign_and_one_below_its_error_is_none():
+    assert size_words(Size(-0.2, 0.01, "steady", -0.2)) == "-0.200 +- 0.010 rad/s"
+    assert size_words(Size(-0.009, 0.01, "steady", -0.2)) == "too small to measure"
+    assert size_words(Size(0.009, 0.01, "growing", 0.2)) == "too small to measure, growing to +0.2 rad/s"
+    assert size_words(Size(-0.02, 0.01, "growing", -0.2)) == "-0.020 +- 0.010 rad/s, growing to -0.2 rad/s"
 
 
 def test_two_faults_are_two_episodes_and_what_returns_is_over():
@@ -212,21 +199,6 @@ def test_two_faults_are_two_episodes_and_what_returns_is_over():
     assert (first.channels, first.stands, first.duration_s) == (("imu_1.y",), False, pytest.approx(200 * STEP))
     assert (second.channels, second.stands) == (("imu_2.z",), True)
     assert first.words.startswith("imu_1.y FAULTY from 1.562 s to 4.688 s")
-
-
-def test_a_new_stretch_is_told_of_for_itself():
-    stands = outputs(THREE, course(9, 200, (100, {4: S.FAULTY})))
-    later = outputs(THREE, course(9, 200), None, 100 + STEP * np.arange(200))
-    story = told(THREE, stands, later)
-    (one,) = story.episodes
-    assert (one.stretch, one.stands, one.end_s) == (1, True, pytest.approx(199 * STEP))
-    assert story.gaps == [(pytest.approx(199 * STEP), 100.0)]
-    assert [line.split(", ", 1)[1] for line in stretch_words(story)] == [
-        "100 % judged, 1 episode",
-        "100 % judged, nothing declared",
-    ]
-    watched = [stretch.watched_s for stretch in story.stretches]
-    assert watched == [pytest.approx(100 * STEP), pytest.approx(199 * STEP)]
 
 
 @given(st.lists(st.floats(0.001, 30.0), min_size=1, max_size=60), st.integers(1, 20))

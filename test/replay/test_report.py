@@ -200,20 +200,6 @@ def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     assert "g2" in named[6]
 
 
-def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
-    paper = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
-    assert paper.startswith(b"%PDF")
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
-    browser.execute_script("dispatchEvent(new Event('beforeprint'))")
-    widths = ask(browser, "[...document.querySelectorAll('.stage svg')].map(s => +s.getAttribute('width'))")
-    cut = ask(browser, "[...document.querySelectorAll('.scroll')].map(s => getComputedStyle(s).overflow)")
-    browser.execute_script("dispatchEvent(new Event('afterprint'))")
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
-    # A4 less margins of 14 mm, at 96 dots an inch.
-    assert max(widths) <= (210 - 28) / 25.4 * 96 + 3
-    assert set(cut) == {"visible"}
-
-
 @pytest.fixture(scope="module")
 def pages(folder, report):
     """A page of every kind, by the verb that makes it."""

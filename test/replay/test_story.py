@@ -148,21 +148,6 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
         sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
 
 
-def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed (extra: fleet)")
-    folder, out = tmp_path / "kite", tmp_path / "out"
-    folder.mkdir()
-    two_armings(folder / "log.bin", logs.write_dataflash)
-    assert fdi("fleet", folder, "--output", out, "--workers", 1, "--quiet")[::2] == (3, "")
-    (flight,), (one,) = (parquet.read_table(out / f"{name}.parquet").to_pylist() for name in ("flights", "episodes"))
-    assert (flight["error"], flight["episodes"], one["channels"]) == ("", 1, ["imu_2.y"])
-    assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
-    assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)
-    summary = replay(folder / "log.bin", Config.from_file(flight["config"]))
-    assert [episode.words for episode in summary.story.episodes] == [one["words"]]
-    assert flight["why"] == [verdict(summary).words]
-
-
 # What an autopilot says of itself stands beside it, whatever log it is in ---------------------------------------------
 
 
