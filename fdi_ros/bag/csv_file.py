@@ -27,8 +27,7 @@ from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.bag.flight_log import FlightLog
-from fdi_ros.bag.log_parts import ImuSamples, Portion, Source
+from fdi_ros.bag.flight_log import FlightLog, ImuSamples, Portion, Source, imu_samples
 from fdi_ros.bag.raw import MOST_SHOWN
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
@@ -63,8 +62,8 @@ class Columns(NamedTuple):
 class CsvLog(FlightLog):
     """An open table, read in portions."""
 
-    stack = "a table of text (.csv)"
     magic = b""
+    refusal = "is no table of text (.csv)"
     kinds = (KIND,)
     settings: ClassVar = {"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"}
     one_imu = "this table has one IMU ({}): nothing to compare it with"
@@ -74,7 +73,6 @@ class CsvLog(FlightLog):
         """Read the table from its start up to `end`."""
         delimiter, columns = find_columns(self.file, self.note)
         offset, bad, rest = self.file.tell(), 0, b""
-        self.counts.clear()
         while rest or offset < self.end:
             data = rest + self.file.read(max(0, min(_PORTION, self.end - offset - len(rest))))
             final = offset + len(data) >= self.end
@@ -218,14 +216,13 @@ def _number(cells: Sequence[str], column: int) -> float:
         return math.nan
 
 
-def _samples(table: Array, end: Int, columns: Columns) -> list[ImuSamples]:
+def _samples(table: Array, end: Int, columns: Columns) -> list[tuple[Source, ImuSamples]]:
     """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at places in the file (k,)."""
     # What no date is, no time is either; it is left out as impossible.
     stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(np.int64)
-    samples = []
+    found = []
     for k, factor in enumerate(columns.factors):
         rate = table[:, 1 + 3 * k : 4 + 3 * k] * factor
-        absent = np.full(rate.shape, np.nan)
-        measured = np.asarray(~np.isnan(rate).all(axis=1))
-        samples.append(ImuSamples(Source(KIND, k), stamp, rate, absent, end).at(measured))
-    return samples
+        measured = ~np.isnan(rate).all(axis=1)
+        found.append((Source(KIND, k), imu_samples(stamp, rate, end=end)[measured]))
+    return found

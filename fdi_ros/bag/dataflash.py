@@ -18,25 +18,20 @@ spectra, and are not read.
 Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
 TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
 
-FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted. The
-multiplier of a type that has its own (c, C, e, E: hundredths) is that again.
-
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.flight_log import FlightLog
-from fdi_ros.bag.log_parts import FLU, ImuSamples, Portion, Source, per_time, possible_start
+from fdi_ros.bag.flight_log import FLU, FlightLog, ImuSamples, Portion, Source, imu_samples, per_time, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
@@ -52,8 +47,7 @@ _TYPES = (
 )
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
-_HUNDREDTHS = "cCeE"
-_TYPES_OF = {"Message": "Z", "Label": "Z", "UnitIds": "N", "MultIds": "N", "I": "B"}
+_TYPES_OF = {"Message": "Z", "I": "B"}
 """Columns that are read and may not be any number, and their types."""
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
@@ -63,9 +57,7 @@ _VALUES = {
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
-_TABLES = {"FMTU": ("FmtType", "UnitIds", "MultIds"), "UNIT": ("Id", "Label"), "MULT": ("Id", "Mult")}
-"""Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
-_OTHERS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode"), **_TABLES}  # columns of further messages that are read
+_TEXTS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode")}  # columns of what the autopilot says
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
@@ -125,19 +117,11 @@ def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int,
     return count, position, lost
 
 
-class _Message(NamedTuple):
-    """A kind of message that is read."""
-
-    name: str
-    fields: np.dtype[np.void]  # columns that are read, within a whole record
-    columns: Sequence[tuple[str, str]]  # names and types of all columns, in their order
-
-
 class DataflashLog(FlightLog):
     """An open log, read in portions, in bounded memory."""
 
-    stack = "ArduPilot"
     magic = b"\xa3\x95"
+    refusal = "is no log of ArduPilot"
     kinds = tuple(_VALUES)
     settings: ClassVar = {
         "Copter": "ArduCopter: LOG_BITMASK bit 18, Fast IMU",
@@ -151,7 +135,11 @@ class DataflashLog(FlightLog):
 
     def portions(self) -> Iterator[Portion]:
         """Read the log from its start up to `end`."""
-        self._forget()
+        self._sizes = np.zeros(256, dtype=np.int64)
+        self._names: dict[int, str] = {}
+        self._layouts: dict[int, np.dtype[np.void]] = {}
+        """Columns that are read of records of each message."""
+        self._lacking: dict[int, str] = {}  # of messages that cannot be read: why
         offset = lost = 0
         while True:
             self.file.seek(offset)
@@ -159,29 +147,20 @@ class DataflashLog(FlightLog):
             final = offset + _PORTION >= self.end
             # Numbers of a damaged log may be anything.
             with np.errstate(all="ignore"):
-                samples, size, beside = self._read(data, final)
+                samples, size, beside = self._read(data, offset, final)
             lost += beside
-            yield [one._replace(end=one.end + offset) for one in samples], (offset + size) / self.end
             offset += size
+            yield samples, offset / self.end
             if final or not size:
                 break
         if lost + self.end - offset:
             self.note(f"{lost + self.end - offset} bytes belong to no whole record and were left out")
 
-    def _forget(self) -> None:
-        """Begin anew: what a log says of its records counts from there on."""
-        self.unread.clear()
-        self.counts.clear()
-        self.said.clear()
-        self.vehicle, self.start_utc = "", None
-        self._sizes = np.zeros(256, dtype=np.int64)
-        self._names: dict[int, str] = {}
-        self._messages: dict[int, _Message] = {}
-        self._unknown: dict[int, str] = {}  # of messages of IMUs that cannot be read: why
-        self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _TABLES}
+    def _read(self, data: Bytes, begin: int, final: bool) -> tuple[list[tuple[Source, ImuSamples]], int, int]:
+        """Read a portion that begins at a place in the file.
 
-    def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:
-        """Read a portion; return its samples, where its last record ends, and the bytes before that in no record."""
+        Returned are its samples, where its last record ends in it, and the bytes before that in no record.
+        """
         found = np.empty((2, len(data) // _HEAD + 1), dtype=np.int64)
         count, end, lost = find_records(data, self._sizes, final, found)
         number, offset = found[:, :count]
@@ -192,70 +171,48 @@ class DataflashLog(FlightLog):
         starts = dict(zip(there.tolist(), np.split(offset[order], begins[1:]), strict=False))
         for k, of_message in starts.items():
             self.counts[self._names.get(k, "unknown")] += len(of_message)
-            if k in self._unknown:
-                self.unread[self._names[k]] = self._unknown[k]
-        rows = {k: _rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
-        # Units before the samples: in a short log both are in one portion.
-        for k, of_kind in rows.items():
-            self._learn(self._messages[k].name, of_kind)
-        samples: list[ImuSamples] = []
-        for k, of_kind in rows.items():
-            name, kind, _ = self._messages[k]
+            if k in self._lacking:
+                self.unread[self._names[k]] = self._lacking[k]
+        samples: list[tuple[Source, ImuSamples]] = []
+        for k, layout in self._layouts.items():
+            if k not in starts:
+                continue
+            name = self._names[k]
+            rows = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[starts[k]].view(layout)[:, 0]
             if (sensor := _SENSORS.fullmatch(name)) is not None:
-                source = Source(sensor[1], int(sensor[2] or 1) - 1)
-                samples += _samples(source, of_kind, self._factors(k), starts[k] + kind.itemsize)
-            elif _GPS.fullmatch(name) and self.start_utc is None:
-                self.start_utc = _start_utc(of_kind)
+                samples += _samples(Source(sensor[1], int(sensor[2] or 1) - 1), rows, begin + starts[k])
+            elif name in _TEXTS:
+                self._take_texts(name, rows)
+            elif self.start_utc is None:
+                self.start_utc = _start_utc(rows)
         return samples, int(end), int(lost)
 
     def _describe(self, content: bytes) -> None:
         """Take in a FMT record, if it is the first of its message."""
-        number, size, name_, types_, columns_ = struct.unpack("<BB4s16s64s", content)
-        name, types, columns = (
-            text.partition(b"\0")[0].decode("ascii", "replace") for text in (name_, types_, columns_)
-        )
+        number, size, *texts = struct.unpack("<BB4s16s64s", content)
+        name, types, columns = (text.partition(b"\0")[0].decode("ascii", "replace") for text in texts)
         if number in self._names:
             return
         self._names[number] = name
-        if not (_SENSORS.fullmatch(name) or _GPS.fullmatch(name) or name in _OTHERS):
-            return
-        message, lacks = _message(name, size, types, columns)
-        if message is not None:
-            self._messages[number] = message
-        elif _SENSORS.fullmatch(name):
-            self._unknown[number] = lacks
+        sensor = _SENSORS.fullmatch(name)
+        if sensor or _GPS.fullmatch(name) or name in _TEXTS:
+            try:
+                self._layouts[number] = _layout(name, size, types, columns.split(","))
+            except ValueError as error:
+                if sensor:
+                    self._lacking[number] = str(error)
 
-    def _learn(self, name: str, rows: Rows) -> None:
-        """Take in what records (k,) of a message say of flight, vehicle and units of columns; the first counts."""
-        if name in _TABLES:
-            number, *columns = (rows[column] for column in _TABLES[name])
-            for k, *told in zip(number.astype(np.int64).tolist(), *(one.tolist() for one in columns), strict=True):
-                self._told[name].setdefault(k, told)
-            return
+    def _take_texts(self, name: str, rows: Rows) -> None:
+        """Take in what records (k,) say, and what of that names the vehicle."""
         if name == "MSG":
             texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
             vehicles = (match[1].title() for one in texts if (match := _FIRMWARE.match(one)))
             self.vehicle = self.vehicle or next(vehicles, "")
-        elif name == "ERR":
+        else:
             texts = list(map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist()))
-        if name in _OTHERS and {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
+        if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
-
-    def _factors(self, number: int) -> dict[str, float]:
-        """Return what values of each column are to be multiplied by, for rad, m and s."""
-        units, multipliers = self._told["FMTU"].get(number, (b"", b""))
-        factors: dict[str, float] = {}
-        for k, (column, kind) in enumerate(self._messages[number].columns):
-            factor = 0.01 if kind in _HUNDREDTHS else 1.0
-            if k < len(multipliers) and kind not in _HUNDREDTHS:
-                (said,) = self._told["MULT"].get(multipliers[k], (1.0,))
-                # 0 stands for none.
-                factor *= said if math.isfinite(said) and said > 0 else 1.0
-            if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[0].startswith(b"deg"):
-                factor *= math.pi / 180.0
-            factors.setdefault(column, factor)
-        return factors
 
 
 def _error_text(subsystem: float, code: float) -> str:
@@ -266,57 +223,48 @@ def _error_text(subsystem: float, code: float) -> str:
     return f"{name}: error {code:g}" if code else f"{name}: resolved"
 
 
-def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message | None, str]:
-    """Return what is read of the records of a message; None: it lacks what is needed, and what that is."""
-    names = columns.split(",")
-    if len(names) != len(types) or set(types) - _TYPES.keys():
-        return None, "its FMT record is damaged"
+def _layout(name: str, size: int, types: str, columns: Sequence[str]) -> np.dtype[np.void]:
+    """Return what is read of the records of a message; `ValueError` says what it lacks."""
+    if len(columns) != len(types) or set(types) - _TYPES.keys():
+        raise ValueError("its FMT record is damaged")
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
-    needed = {*_OTHERS.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
+    needed = {*_TEXTS.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
     fields: dict[str, tuple[str, int]] = {}
     at = _HEAD
-    for column, kind in zip(names, types, strict=True):
-        allowed = _TYPES_OF.get(column, _NUMBERS + _HUNDREDTHS * (column in (*rate, *acceleration)))
-        if column in (*needed, *acceleration, *_OPTIONAL) and kind in allowed:
+    for column, kind in zip(columns, types, strict=True):
+        if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(column, _NUMBERS):
             fields.setdefault(column, (_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
     if at != size:
-        return None, f"its records have {size} bytes, its columns {at}"
+        raise ValueError(f"its records have {size} bytes, its columns {at}")
     if lacking := sorted(needed - fields.keys()):
-        return None, f"it has no column {lacking[0]}"
+        raise ValueError(f"it has no column {lacking[0]}")
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
-        return None, "it has no column of times"
+        raise ValueError("it has no column of times")
     formats, offsets = ([field[k] for field in fields.values()] for k in (0, 1))
     layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
-    return _Message(name, np.dtype(layout), list(zip(names, types, strict=True))), ""
+    return np.dtype(layout)
 
 
-def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int) -> list[ImuSamples]:
-    """Return the samples in the records (k,) of one message, of each instance by itself; end (k,) is where they end."""
+def _samples(source: Source, rows: Rows, start: Int) -> list[tuple[Source, ImuSamples]]:
+    """Return the samples of each instance in the records (k,) of one message, which begin at `start` (k,)."""
     columns = rows.dtype.names or ()
-    instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), source.instance)
-    rate, acceleration = (_vectors(rows, names, factors) for names in _VALUES[source.kind])
+    rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
-        acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
-    stamp = _stamp(rows)
-    return [
-        ImuSamples(Source(source.kind, k), stamp, rate * FLU, acceleration * FLU, end).at(instance == k)
-        for k in np.unique(instance).tolist()
-    ]
+        acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else acceleration * np.nan
+    samples = imu_samples(_stamp(rows), rate * FLU, acceleration * FLU, start + rows.itemsize)
+    if "I" not in columns:
+        return [(source, samples)]
+    return [(Source(source.kind, k), samples[rows["I"] == k]) for k in np.unique(rows["I"]).tolist()]
 
 
-def _rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
-    """Return the records (k,) of a type that begin at k places in a portion."""
-    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
-
-
-def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3), in their units; NaN where the rows do not have them."""
+def _vectors(rows: Rows, columns: Sequence[str]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
     if not set(columns) <= set(rows.dtype.names or ()):
         return np.full((len(rows), 3), np.nan)
-    return np.column_stack([rows[column].astype(np.float64) * factors[column] for column in columns])
+    return np.column_stack([rows[column].astype(np.float64) for column in columns])
 
 
 def _stamp(rows: Rows) -> Int:

@@ -17,14 +17,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fdi_ros.bag.log_parts import FEWEST, ImuSamples, LogText, Portion, Source, Track, copies_of, medians
-from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
+from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, LogText, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
@@ -34,6 +35,13 @@ from fdi_ros.system.text import shown
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
+FLU = np.array([1.0, -1.0, -1.0])  # from FRD
+_FEWEST = 20  # samples by which the rate of a source can be judged
+_TOLERANCE = 0.95  # of that rate; clocks and loggers are not exact
+_MAX_INTERVAL_RATIO = 1.5
+"""Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
+_MAX_STEP_BACK = 1_000_000  # us; a log goes on as long as its times step back by no more
+_BESIDE = 17  # samples whose median says where a log has come to: no few damaged times move it
 _COARSE_RATE = 0.5  # Hz; means may be logged no more seldom
 _MAX_TIME_STEP = 10_000_000  # us; a sample that far from those logged before and after it has a damaged time
 _TOGETHER = 1 << 10  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
@@ -43,14 +51,117 @@ _MOST_NAMES = 6  # messages that are named of a log without IMUs
 _MOST_TEXTS = 1000  # texts of a log that are kept: the first ones
 
 
+class Source(NamedTuple):
+    """Where samples come from: one instance of one kind of logged message."""
+
+    kind: str
+    instance: int
+
+
+ImuSamples = NDArray[np.void]
+"""(k,) samples of one IMU, in FLU: ``stamp``, us since the start of the autopilot, or since 1970; ``rate`` (3,), rad/s;
+``acceleration`` (3,), m/s^2, NaN: not logged with the rate; ``end`` of its record in the file, bytes, 0: not known."""
+_SAMPLE = np.dtype([("stamp", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3), ("end", "i8")])
+
+Portion = tuple[list[tuple[Source, ImuSamples]], float]
+"""Samples in one portion of a log, and the share of the log that is read up to its end, 0 to 1."""
+
+
+def imu_samples(stamp: Int, rate: Array, acceleration: Array | float = np.nan, end: Int | int = 0) -> ImuSamples:
+    """Return samples (k,) with these stamps (k,), rates and accelerations (k, 3), and ends (k,)."""
+    samples = np.empty(len(stamp), _SAMPLE)
+    samples["stamp"], samples["end"] = stamp, end
+    samples["rate"], samples["acceleration"] = rate, acceleration
+    return samples
+
+
+def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+    """Concatenate samples: as bytes, since NumPy copies fields one by one, which takes 30 times as long."""
+    return np.concatenate([one.view(f"V{_SAMPLE.itemsize}") for one in parts]).view(_SAMPLE)
+
+
+@dataclass
+class Track:
+    """What was seen of one source: how fast it is logged, and where its time steps back for good."""
+
+    slowest: float  # samples per second that it must be logged at
+    count: int = 0
+    fast: int = 0  # samples that follow the one before without a gap
+    fast_time: int = 0  # us between these and the ones before
+    first: int = 0
+    last: int = 0  # stamps of the first and the last, us
+    come: int | None = None  # stamp up to which the log has come, us; None: at its start.
+    recent: ImuSamples = field(default_factory=lambda: np.empty(0, _SAMPLE))  # the last samples
+
+    def add(self, stamp: Int) -> None:
+        """Take in the stamps (k,) of further samples."""
+        if not len(stamp):
+            return
+        steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
+        steps = steps[(steps > 0) & (steps <= 1e6 * _MAX_INTERVAL_RATIO / self.slowest)]
+        self.fast += len(steps)
+        self.fast_time += int(steps.sum())
+        self.first = self.first if self.count else int(stamp[0])
+        self.last = int(stamp[-1])
+        self.count += len(stamp)
+
+    def first_behind(self, samples: ImuSamples) -> int:
+        """Return where the record of the first sample behind a step of time ends, bytes; 0: there is none.
+
+        There a second log begins in the file.
+        """
+        samples = _joined([self.recent, samples])
+        self.recent = samples[1 - _BESIDE :]
+        if not len(samples):
+            return 0
+        come = stamp = samples["stamp"]
+        if (np.abs(np.diff(stamp)) > _MAX_STEP_BACK).any():
+            come = _medians(stamp, _BESIDE)
+        first = int(come[0]) if self.come is None else self.come
+        before = np.maximum.accumulate(np.append(first, come[:-1]))
+        self.come = max(first, int(come.max()))
+        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+        behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
+        return int(samples["end"][np.argmax(behind)]) if behind.any() else 0
+
+    @property
+    def steady(self) -> bool:
+        """Whether most samples follow one another without gaps."""
+        return 2 * self.fast > self.count
+
+    @property
+    def rate(self) -> float:
+        """Samples per second: between gaps, or if there is little else than gaps, on average."""
+        if self.steady:
+            return self.fast * 1e6 / self.fast_time
+        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+
+    @property
+    def fast_enough(self) -> bool:
+        """Whether its rate can be judged and is high enough, in bursts at least."""
+        return self.count >= _FEWEST and self.rate >= _TOLERANCE * self.slowest
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return self.fast_enough and self.steady
+
+    @property
+    def figures(self) -> str:
+        """Words for how fast it is logged."""
+        if self.count < 2:
+            return "once"
+        if self.last <= self.first:
+            return "at times that do not advance"
+        return f"at {self.rate:.3g} Hz{' in bursts' if self.fast_enough and not self.steady else ''}"
+
+
 class FlightLog(BagFile):
     """An open log of a flight stack, read as a recording of Imu topics; each format derives from this.
 
     `BagError` if it has no two IMUs that are logged fast enough.
     """
 
-    stack: ClassVar[str]  # what writes such logs
-    magic: ClassVar[bytes]  # first bytes of a file
     kinds: ClassVar[tuple[str, ...]]  # messages that samples of every IMU are logged in
     settings: ClassVar[Mapping[str, str]]
     """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
@@ -64,14 +175,9 @@ class FlightLog(BagFile):
     """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
     most: ClassVar[int] = 0  # bytes of a log that is read whole; 0: it is read in portions, and may have any size
 
-    def __init__(self, path: Path, damage: Damage) -> None:
-        super().__init__(path, damage, self.magic, f"is no log of {self.stack}")
+    def __init__(self, path: Path, damage: Damage, most: int) -> None:
+        super().__init__(path, damage, most)
         self.end = self.size  # the log is read up to there, bytes
-        self.unread: dict[str, str] = {}  # messages of IMUs that are there and cannot be read, by name, and why
-        self.counts: Counter[str] = Counter()  # records of every message, by name
-        self.vehicle = ""  # kind of vehicle by the name of its firmware; empty: not known
-        self.start_utc: int | None = None  # UTC of the start of the autopilot, us since 1970; None: not known.
-        self.said: list[LogText] = []  # what the autopilot said up to the place that was read, us
         try:
             if self.most and self.end > self.most:
                 raise BagError(
@@ -86,9 +192,16 @@ class FlightLog(BagFile):
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
         self._shift = 0 if dated else self.start_utc or 0  # added to stamps, us; 0: they are dates, or no date is known
         self.texts = tuple(one._replace(stamp=self._log_time(one.stamp)) for one in self.said)
-        """What the autopilot said, with the times of recording, ns."""
         self.topics = tuple(Topic(_topic(one), IMU, count=self._tracks[one].count) for one in self._sources)
         self.start_time = self._log_time(self._starts[0])
+
+    def begin(self) -> None:
+        """Begin a walk: what one before it has found counts no more."""
+        self.unread: dict[str, str] = {}  # messages of IMUs that are there and cannot be read, by name, and why
+        self.counts: Counter[str] = Counter()  # records of every message, by name
+        self.vehicle = ""  # kind of vehicle by the name of its firmware; empty: not known
+        self.start_utc: int | None = None  # UTC of the start of the autopilot, us since 1970; None: not known.
+        self.said: list[LogText] = []  # what the autopilot said up to the place that was read, us
 
     @abstractmethod
     def portions(self) -> Iterator[Portion]:
@@ -107,18 +220,17 @@ class FlightLog(BagFile):
         # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
         templates = np.stack([ImuTemplate(_topic(source).removeprefix("/")).bytes for source in sources])
         number = np.array([topics.index(_topic(source)) for source in sources])
-        for (samples, progress), later in zip(self.portions(), [*self._starts[1:], NO_HORIZON], strict=False):
-            found = [self._possible(one) for one in samples if one.source in sources]
+        for (portion, progress), later in zip(self.portions(), [*self._starts[1:], NO_HORIZON], strict=False):
+            found = [(source, self._possible(one)) for source, one in portion if source in sources]
             if not found:
                 continue
-            place = np.concatenate([np.full(len(one.stamp), sources.index(one.source)) for one in found])
-            stamp = (np.concatenate([one.stamp for one in found]) + self._shift) * 1000
-            rate = np.concatenate([one.rate for one in found])
-            acceleration = np.concatenate([one.acceleration for one in found])
+            place = np.repeat([sources.index(source) for source, _ in found], [len(one) for _, one in found])
+            samples = _joined([one for _, one in found])
+            stamp = (samples["stamp"] + self._shift) * 1000
             order, horizon = np.argsort(stamp, kind="stable"), self._log_time(later)
             for k in range(0, len(order), _TOGETHER):
                 rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
-                data = _encoded(templates[place[rows]], stamp[rows], rate[rows], acceleration[rows])
+                data = _encoded(templates[place[rows]], stamp[rows], samples.take(rows))
                 count, size = data.shape
                 yield Batch(
                     buffer=data.reshape(-1),
@@ -134,31 +246,36 @@ class FlightLog(BagFile):
 
     def _survey(self) -> bool:
         """Go through the log; False: it ends where the time steps back, and is to be gone through again up to there."""
+        self.begin()
         self._tracks: dict[Source, Track] = {}
         self._shared: Counter[tuple[Source, Source]] = Counter()
         """Samples that two sources, in order, have at the same time."""
         starts: list[int] = []
-        for samples, _ in self.portions():
-            found = [self._possible(one) for one in samples]
+        for portion, _ in self.portions():
+            found = [(source, self._possible(samples)) for source, samples in portion]
             # The step may lie among the last samples of the portion before.
-            ends = [0, *(int(end) for track in self._tracks.values() for end in track.end)]
-            for source in (one.source for one in found):
-                slowest = _COARSE_RATE if source.kind == self.coarse else self.slowest
-                self._tracks.setdefault(source, Track(slowest))
-            if first := min(filter(None, [self._tracks[one.source].first_behind(one) for one in found]), default=0):
-                ends += [int(one.end[one.end < first].max(initial=0)) for one in found]
-                self._end_at(max(end for end in ends if end < first))
+            ends = [track.recent["end"] for track in self._tracks.values()]
+            steps = [self._track(source).first_behind(samples) for source, samples in found]
+            if first := min(filter(None, steps), default=0):
+                before = np.concatenate([[0], *ends, *(samples["end"] for _, samples in found)])
+                self._end_at(int(before[before < first].max()))
                 return False
-            for one in found:
-                self._tracks[one.source].add(one.stamp)
-            others = [one for one in found if self.counted_by not in ("", one.source.kind)]
-            for one, other in combinations(sorted(others, key=lambda one: one.source)[:_MOST_COMPARED], 2):
-                if one.source != other.source:
-                    self._shared[one.source, other.source] += len(np.intersect1d(one.stamp, other.stamp))
-            starts.append(min([int(one.stamp.min()) for one in found if len(one.stamp)], default=NO_HORIZON))
+            for source, samples in found:
+                self._track(source).add(samples["stamp"])
+            others = [one for one in found if self.counted_by not in ("", one[0].kind)]
+            others = sorted(others, key=lambda one: one[0])[:_MOST_COMPARED]
+            for (one, samples), (other, beside) in combinations(others, 2):
+                if one != other:
+                    self._shared[one, other] += len(np.intersect1d(samples["stamp"], beside["stamp"]))
+            starts.append(min([int(one["stamp"].min()) for _, one in found if len(one)], default=NO_HORIZON))
         self._starts: list[int] = np.minimum.accumulate(starts[::-1])[::-1].tolist()
         """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
         return True
+
+    def _track(self, source: Source) -> Track:
+        """Return what was seen of a source so far."""
+        slowest = _COARSE_RATE if source.kind == self.coarse else self.slowest
+        return self._tracks.setdefault(source, Track(slowest))
 
     def _end_at(self, step: int) -> None:
         """Leave out what lies behind a place in the file."""
@@ -170,15 +287,15 @@ class FlightLog(BagFile):
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
-        stamp = samples.stamp
+        stamp = samples["stamp"]
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
             # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
-            good &= np.abs(stamp - medians(stamp, 5)) <= _MAX_TIME_STEP
+            good &= np.abs(stamp - _medians(stamp, 5)) <= _MAX_TIME_STEP
         if good.all():
             return samples
         self.note("samples with impossible times were left out")
-        return samples.at(good)
+        return samples[good]
 
     def _log_time(self, stamp: int) -> int:
         """Time of recording, ns, of what happened at a stamp in us."""
@@ -211,7 +328,7 @@ class FlightLog(BagFile):
             if source.kind == kind and not track.usable:
                 few = f"has too few samples to judge its rate ({track.count})"
                 slow = f"is logged {track.figures}, expected at least {self.slowest:g} Hz"
-                self.note(f"{kind} {source.instance} {few if track.count < FEWEST else slow}, and was left out")
+                self.note(f"{kind} {source.instance} {few if track.count < _FEWEST else slow}, and was left out")
         return sorted(source for source, track in sensors.items() if source.kind == kind and track.usable)
 
     def _sensors(self) -> dict[Source, Track]:
@@ -221,7 +338,7 @@ class FlightLog(BagFile):
         there = {source.instance for source in tracks if source.kind == self.counted_by}
         if there:
             return {source: track for source, track in tracks.items() if source.instance in there}
-        for copy, source in copies_of(tracks, self._shared).items():
+        for copy, source in _copies_of(tracks, self._shared).items():
             del tracks[copy]
             self.note(
                 f"{copy.kind} {copy.instance} has the times of {source.kind} {source.instance}: taken for the same"
@@ -247,14 +364,14 @@ class FlightLog(BagFile):
         has = ", ".join((*there, *unread))
         if not unread and max(map(len, kinds.values())) < _FEWEST_IMUS:
             return f": {self.one_imu.format(has)}"
-        needed = f"two IMUs or more, each by itself, at {self.slowest:g} Hz or more, {FEWEST} samples or more"
+        needed = f"two IMUs or more, each by itself, at {self.slowest:g} Hz or more, {_FEWEST} samples or more"
         return f" has {has}; needed: {needed}: {setting}"
 
 
 def _logged(kind: str, tracks: Sequence[Track]) -> str:
     """Say how a kind of message is logged."""
-    fastest = max(tracks, key=lambda track: (track.count >= FEWEST, track.rate))
-    few = f", {fastest.count} samples" if 1 < fastest.count < FEWEST else ""
+    fastest = max(tracks, key=lambda track: (track.count >= _FEWEST, track.rate))
+    few = f", {fastest.count} samples" if 1 < fastest.count < _FEWEST else ""
     return f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
 
 
@@ -262,8 +379,8 @@ def _topic(source: Source) -> str:
     return f"/imu_{source.instance}"
 
 
-def _encoded(data: Bytes, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
-    """Fill in k messages of sensor_msgs/msg/Imu (k, size); stamp in ns, rate and acceleration (k, 3) in FLU."""
+def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
+    """Fill in k messages of sensor_msgs/msg/Imu (k, size); stamp in ns."""
     at = ImuTemplate("imu_0").at
     layout: Any = {
         "names": ("sec", "nanosec", "rate", "acceleration", "absent"),
@@ -274,8 +391,43 @@ def _encoded(data: Bytes, stamp: Int, rate: Array, acceleration: Array) -> Bytes
     }
     fields = data.view(np.dtype(layout))[:, 0]
     fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
-    fields["rate"] = rate
-    fields["acceleration"] = np.where(np.isnan(acceleration), 0.0, acceleration)
+    fields["rate"], absent = samples["rate"], np.isnan(samples["acceleration"])
+    fields["acceleration"] = np.where(absent, 0.0, samples["acceleration"])
     # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
-    fields["absent"] = -1.0 * np.isnan(acceleration).any(axis=1)
+    fields["absent"] = -1.0 * absent.any(axis=1)
     return data
+
+
+def _medians(stamp: Int, window: int) -> Int:
+    """Return the median of so many stamps (k,) beside each; before the first and after the last they are mirrored."""
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, window // 2, mode="reflect"), window)
+    return np.sort(beside, axis=1)[:, window // 2]
+
+
+def _copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
+    """Return which sources are copies of which others: those with the same times, since sensors have their own.
+
+    A copy has the number of the sensor and that of all sensors in the sum. Where all have the same times, as in a
+    simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
+    """
+    same: set[Source] = set()
+    for pair, count in shared.items():
+        if sensors.keys() >= set(pair) and 2 * count > min(sensors[source].count for source in pair):
+            same.update(pair)
+    ordered, half = sorted(same), len(same) // 2
+    return {} if len(same) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
+
+
+def possible_start(utc: Int, stamp: Int) -> int | None:
+    """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
+
+    ``utc`` (k,) us since 1970, ``stamp`` (k,) us since the start.
+    """
+    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc >= EARLIEST // 1000) & (utc <= LATEST // 1000 - LOG_SPAN)
+    return int((utc - stamp)[np.argmax(good)]) if good.any() else None
+
+
+def per_time(change: Array, seconds: NDArray[Any]) -> Array:
+    """Divide changes (k, 3) by the times (k,) that they took, s; NaN: the log does not say how long."""
+    seconds = seconds.astype(np.float64)
+    return change / np.where(seconds > 0, seconds, np.nan)[:, None]

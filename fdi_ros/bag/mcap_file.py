@@ -110,7 +110,6 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
 
 
 T = TypeVar("T")
-MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _FIRST, _RUN = 1 << 16, 1 << 22
@@ -132,10 +131,13 @@ class Piece(NamedTuple):
 
 
 class McapFile(BagFile):
-    """An open MCAP file, whose chunks may unpack to ``most`` bytes."""
+    """An open MCAP file."""
+
+    magic = b"\x89MCAP0\r\n"
+    refusal = "is not an MCAP file"
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
-        super().__init__(path, damage, MAGIC, "is not an MCAP file")
+        super().__init__(path, damage, most)
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {}
         self._counts: dict[int, int] = {}
@@ -182,7 +184,7 @@ class McapFile(BagFile):
             yield batch if (batch.topic >= 0).all() else batch.at(batch.topic >= 0)
 
     def _scan(self) -> None:
-        position, left = len(MAGIC), RECORDS + self.size // RECORD_BYTES
+        position, left = len(self.magic), RECORDS + self.size // RECORD_BYTES
         while position < self.size:
             head = self._read(position, _RECORD.size)
             opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, self.size)
@@ -190,7 +192,7 @@ class McapFile(BagFile):
             left -= 1
             if opcode == FOOTER:
                 # Bytes of damage may look like a footer: what is behind it is not left out without a word.
-                if end + len(MAGIC) != self.size:
+                if end + len(self.magic) != self.size:
                     self.note(f"it has a footer at byte {position} of {self.size}: read up to there")
                 return
             if left < 0:

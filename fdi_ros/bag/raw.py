@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,32 +116,42 @@ class Damage:
         return (*self.lines, *([f"{self.more} more places"] if self.more else []))
 
 
-class BagFile(ABC):
-    """One open file of a recording; ``damage`` takes what of it cannot be read.
+class LogText(NamedTuple):
+    """What the autopilot of a flight log said of itself."""
 
-    `BagError` if it cannot be opened, is empty, or does not begin with ``magic``, for which the refusal is said.
+    stamp: int  # time of recording, ns; while the log is read, us as of its samples
+    kind: str  # message it was logged in: MSG, ERR, or the severity
+    text: str
+
+
+class BagFile(ABC):
+    """One open file of a recording, which may unpack to ``most`` bytes; ``damage`` takes what cannot be read of it.
+
+    `BagError` if it cannot be opened, is empty, or does not begin with `magic`.
     """
 
+    magic: ClassVar[bytes]  # first bytes of a file
+    refusal: ClassVar[str]  # what is said of a file that begins with others
     topics: tuple[Topic, ...]  # one that several publishers wrote may come several times
     start_time: int  # time of recording of the first message, ns; without messages `NO_HORIZON`
+    texts: tuple[LogText, ...] = ()
 
-    def __init__(self, path: Path, damage: Damage, magic: bytes, refusal: str) -> None:
-        self.path, self._damage = path, damage
+    def __init__(self, path: Path, damage: Damage, most: int) -> None:
+        self.path, self._damage, self._left = path, damage, most
         try:
             self.file = open_regular(path)
         except OSError as error:
             raise BagError(f"cannot open {path}: {error.strerror}") from error
         self.size = os.fstat(self.file.fileno()).st_size
-        begin = self.file.read(max(len(LFS), len(magic)))
+        begin = self.file.read(max(len(LFS), len(self.magic)))
         if begin == LFS:
             refusal = "is a git-lfs pointer, not the recording: run git lfs pull"
         elif not begin:
             refusal = "is empty"
-        elif begin.startswith(magic):
-            self.file.seek(len(magic))
+        elif begin.startswith(self.magic):
             return
         else:
-            refusal = f"{refusal}: it starts with {begin[: len(magic)]!r}"
+            refusal = f"{self.refusal}: it starts with {begin[: len(self.magic)]!r}"
         self.file.close()
         raise BagError(f"{path} {refusal}")
 
@@ -166,16 +176,7 @@ LFS = b"version https://git-lfs."  # what a file begins with that git has put in
 MADE_BY_FDI = "fdi_ros"  # key in the custom data of the metadata.yaml of an output bag
 
 
-@dataclass(frozen=True)
-class RecordingFiles:
-    """Where a recording lies."""
-
-    paths: tuple[Path, ...]
-    compressed: bool = False  # each message is compressed by itself
-    made_by_fdi: bool = False  # the folder is one that ``fdi replay --output`` has written
-
-
-def find_files(path: Path, damage: Damage) -> RecordingFiles:
+def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     """Find the files of a recording, a folder or a file; ``damage`` takes what is wrong with metadata.yaml.
 
     `BagError` if there is no recording.
@@ -183,13 +184,13 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
             raise BagError(f"{path} is not a recording: expected {EXPECTED}")
-        return RecordingFiles((path,))
+        return (path,)
     if not path.is_dir():
         raise BagError(f"no recording at {path}")
-    about = _metadata(path / "metadata.yaml", damage)
+    about = _metadata(path, damage)
     # One that is named twice is read once.
     names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
-    there = [name for name in names if _is_file(path / name)]
+    there = [name for name in names if os.path.isfile(path / name)]
     for name in names.keys() - set(there):
         damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
     # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
@@ -201,12 +202,13 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
         raise BagError(f"{path} is a folder without .mcap or .db3 files")
     if len(paths) > FILES:
         damage.add(f"{len(paths)} files, expected at most {FILES}: the others were left out")
-    custom = about.get("custom_data")
-    return RecordingFiles(
-        tuple(paths[:FILES]),
-        str(about.get("compression_mode", "")).lower() == "message",
-        isinstance(custom, dict) and MADE_BY_FDI in custom,
-    )
+    return tuple(paths[:FILES])
+
+
+def is_made_by_fdi(folder: Path) -> bool:
+    """Whether a rosbag2 folder is one that fdi has written."""
+    custom = _metadata(folder, Damage()).get("custom_data")
+    return isinstance(custom, dict) and MADE_BY_FDI in custom
 
 
 def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
@@ -217,19 +219,13 @@ def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
     if not (folder / "metadata.yaml").is_file():
         return None
     try:
-        return find_files(folder, Damage()).paths
+        return find_files(folder, Damage())
     except BagError:
-        return () if _metadata(folder / "metadata.yaml", Damage()) else None
+        return () if _metadata(folder, Damage()) else None
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def _metadata(path: Path, damage: Damage) -> dict[str, Any]:
+def _metadata(folder: Path, damage: Damage) -> dict[str, Any]:
+    path = folder / "metadata.yaml"
     if not path.exists():
         damage.add("there is no metadata.yaml: the recording was cut off, the files were read without it")
         return {}

@@ -19,22 +19,23 @@ import zstandard
 from fdi_ros import __version__
 from fdi_ros.bag.csv_file import CsvLog
 from fdi_ros.bag.dataflash import DataflashLog
-from fdi_ros.bag.flight_log import FlightLog
-from fdi_ros.bag.log_parts import LogText
+from fdi_ros.bag.library_bags import Ros1File, SqliteFile
+from fdi_ros.bag.library_logs import Tlog, Ulog
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.raw import MADE_BY_FDI, BagFile, Batch, Damage, Topic, find_files
-from fdi_ros.bag.ros1_file import Ros1File
-from fdi_ros.bag.sqlite_file import SqliteFile
-from fdi_ros.bag.tlog import Tlog
-from fdi_ros.bag.ulog import Ulog
+from fdi_ros.bag.raw import MADE_BY_FDI, BagFile, Batch, Damage, LogText, Topic, find_files
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
 from fdi_ros.sources import SOURCES, source_of_type
 from fdi_ros.system.files import CHANNELS, LATEST, max_unpacked_bytes, open_regular
 from fdi_ros.system.text import shown
 
-LOGS: dict[str, type[FlightLog]] = {".bin": DataflashLog, ".csv": CsvLog, ".tlog": Tlog, ".ulg": Ulog, ".ulog": Ulog}
-"""Formats of flight logs, and tables of text."""
+FORMATS: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile, ".bag": Ros1File, ".bin": DataflashLog} | {
+    ".csv": CsvLog,
+    ".tlog": Tlog,
+    ".ulg": Ulog,
+    ".ulog": Ulog,
+}
+"""By the suffix of a file, in small letters."""
 
 
 class Recording:
@@ -59,11 +60,10 @@ class Recording:
         """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[BagFile] = []
-        found = find_files(self.path, self.damage)
-        self._compressed = found.compressed
+        paths = find_files(self.path, self.damage)
         try:
-            self._left = max_unpacked_bytes(sum(path.stat().st_size for path in found.paths))
-            refused = [error for path in found.paths if (error := self._open(path)) is not None]
+            self._left = max_unpacked_bytes(sum(path.stat().st_size for path in paths))
+            refused = [error for path in paths if (error := self._open(path)) is not None]
             if not self._files:
                 raise refused[0]
         except BaseException:
@@ -101,7 +101,7 @@ class Recording:
     @property
     def texts(self) -> tuple[LogText, ...]:
         """What the autopilot of a flight log said of itself, with times of recording, ns, in their order."""
-        return tuple(sorted(text for file in self._files if isinstance(file, FlightLog) for text in file.texts))
+        return tuple(sorted(text for file in self._files for text in file.texts))
 
     def require(self, names: Sequence[str], type_name: str) -> None:
         """Check that topics are there, of the type, serialised as CDR and not empty.
@@ -142,14 +142,9 @@ class Recording:
         """Open a file; why it cannot be is noted and returned: of several files the others are read."""
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
-            suffix = plain.suffix.lower()
-            if suffix in LOGS:
-                file: BagFile = LOGS[suffix](plain, self.damage)
-            elif suffix in (".mcap", ".bag"):
-                file = (McapFile if suffix == ".mcap" else Ros1File)(plain, self.damage, self._left)
-            else:
-                file = SqliteFile(plain, self.damage, self._compressed, self._left)
-            self._files.append(file)
+            # metadata.yaml may name files of any suffix.
+            kind = FORMATS.get(plain.suffix.lower(), SqliteFile)
+            self._files.append(kind(plain, self.damage, self._left))
         except BagError as error:
             self.damage.add(str(error))
             return error

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from fdi_ros import __version__
-from fdi_ros.bag.raw import Damage, find_files
+from fdi_ros.bag.raw import Damage, find_files, is_made_by_fdi
 from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.layout import Severity, with_first_line_coloured
@@ -226,7 +226,7 @@ def _parts(source: Path) -> list[Path]:
         found.append(real_path(source / "metadata.yaml"))
         # What is no recording is refused when it is read.
         with suppress(BagError):
-            found += map(real_path, find_files(source, Damage()).paths)
+            found += map(real_path, find_files(source, Damage()))
     return found
 
 
@@ -240,8 +240,8 @@ def _why_no_folder(path: Path) -> str:
         return "no folder"
     there = {child.name for child in path.iterdir()}
     try:
-        found = find_files(path, Damage())
-        ours = found.made_by_fdi and there == {"metadata.yaml", *(file.name for file in found.paths)}
+        files = {file.name for file in find_files(path, Damage())}
+        ours = is_made_by_fdi(path) and there == {"metadata.yaml", *files}
     except BagError:
         ours = False
     ours = ours and all(child.is_file() for child in path.iterdir())

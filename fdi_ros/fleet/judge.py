@@ -20,8 +20,7 @@ import numpy as np
 
 from fdi_ros.bag.csv_file import has_gyros
 from fdi_ros.bag.raw import LFS, LOG_SUFFIXES, SUFFIXES, Damage, files_of_bag, find_files
-from fdi_ros.bag.reader import LOGS
-from fdi_ros.bag.ros1_file import MAGIC
+from fdi_ros.bag.reader import FORMATS
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file, parameters_of
 from fdi_ros.errors import BagError, FdiError
@@ -94,7 +93,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
     if not name.endswith(LOG_SUFFIXES):
         return True
     # Firmware and much else is called .bin, too, and any table .csv.
-    magic = MAGIC if suffix == ".bag" else LOGS[suffix].magic
+    magic = FORMATS[suffix].magic
     try:
         with open_regular(path) as file:
             if suffix == ".csv":
@@ -159,7 +158,7 @@ def digest_of(path: Path) -> str:
     stats: list[tuple[str, int, int]] = []
     # Reading it says what is wrong.
     with suppress(BagError, OSError):
-        for file in (*find_files(path, Damage()).paths, *path.glob("metadata.yaml")):
+        for file in (*find_files(path, Damage()), *path.glob("metadata.yaml")):
             about = file.stat()
             stats.append((file.name, about.st_size, about.st_mtime_ns))
     return hashlib.sha256(repr(stats).encode("utf-8", "backslashreplace")).hexdigest()[:32]

@@ -24,9 +24,9 @@ from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 
+from fdi_ros.bag.library_bags import SqliteFile
 from fdi_ros.bag.raw import Damage
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
@@ -265,7 +265,7 @@ def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path,
 def test_a_query_ends_by_a_signal_and_by_itself(tmp_path):
     """A database whose pages point at each other is endless for SQLite; so is, for a moment, a large one."""
     database(tmp_path / "bag.db3", TABLE).close()
-    file, asked = SqliteFile(tmp_path / "bag.db3", Damage(), False, 1 << 30), f"SELECT MAX(x) FROM ({ENDLESS} FROM c)"
+    file, asked = SqliteFile(tmp_path / "bag.db3", Damage(), 1 << 30), f"SELECT MAX(x) FROM ({ENDLESS} FROM c)"
     file._steps = 1 << 62
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

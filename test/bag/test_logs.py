@@ -19,7 +19,7 @@ from bag.logs import FIX, HEAD, SCALE, UTC, format_record, units, write_dataflas
 from bag.recordings import IMU, STORE
 from pymavlink.DFReader import DFReader_binary
 
-from fdi_ros.bag import dataflash, flight_log, ulog
+from fdi_ros.bag import dataflash, flight_log, library_logs
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FdiError
@@ -158,41 +158,11 @@ def test_pymavlink_reads_the_same(tmp_path, kind):
         assert np.abs(theirs[name][:, 0] - stamp * 1e-9).max() < 2e-6
 
 
-@pytest.mark.parametrize(
-    ("units_of", "multipliers", "factor"),
-    [(b"s#EEEooo", b"F-000000", 1.0), (b"s#kkkooo", b"F-000000", np.pi / 180), (b"s#EEEooo", b"F-CCC000", 1e-3)],
-)
-def test_units_and_multipliers_are_those_that_the_log_says(tmp_path, units_of, multipliers, factor):
-    tables = {"UNIT": (67, "QbZ", "TimeUS,Id,Label"), "MULT": (68, "Qbd", "TimeUS,Id,Mult")}
-    tables["FMTU"] = (69, "QBNN", "TimeUS,FmtType,UnitIds,MultIds")
-    extra = b"".join(format_record(number, name, *form) for name, (number, *form) in tables.items())
-    for letter, label in (("E", b"rad/s"), ("k", b"deg/s"), ("o", b"m/s/s"), ("s", b"s")):
-        extra += HEAD + struct.pack("<BQb64s", 67, 1, ord(letter), label)
-    for letter, value in (("-", 0.0), ("0", 1.0), ("F", 1e-6), ("C", 1e-3)):
-        extra += HEAD + struct.pack("<BQbd", 68, 1, ord(letter), value)
-    extra += HEAD + struct.pack("<BQB16s16s", 69, 1, logs.MESSAGES["IMU"][0], units_of, multipliers)
-    made = units(seconds=8.0)
-    found, _ = messages(log(tmp_path, "IMU", made, extra=extra))
-    np.testing.assert_allclose(found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12)
-
-
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_number_of_a_unit_or_an_error_that_is_none_is_no_defect(tmp_path, number):
-    extra = format_record(67, "UNIT", "fZ", "Id,Label") + HEAD + struct.pack("<Bf64s", 67, number, b"deg/s")
-    extra += format_record(90, "ERR", "Qff", "TimeUS,Subsys,ECode") + HEAD + struct.pack("<BQff", 90, 1, number, 1.0)
+def test_a_number_of_an_error_that_is_none_is_no_defect(tmp_path, number):
+    extra = format_record(90, "ERR", "Qff", "TimeUS,Subsys,ECode") + HEAD + struct.pack("<BQff", 90, 1, number, 1.0)
     found, damage = messages(log(tmp_path, "IMU", units(seconds=8.0), extra=extra))
     assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
-
-
-def test_types_of_hundredths_are_hundredths(tmp_path):
-    records = np.zeros((100, 2), [("head", "S2"), ("type", "u1"), ("time", "<u8"), ("x", "<i2"), ("y", "<i4", 2)])
-    records["head"], records["type"], records["time"] = HEAD, (70, 71), 10_000 * np.arange(100)[:, None]
-    records["x"], records["y"][..., 0] = np.arange(100)[:, None], -5
-    described = [format_record(k, name, "Qcee", "TimeUS,GyrX,GyrY,GyrZ") for k, name in ((70, "IMU"), (71, "IMU2"))]
-    path = tmp_path / "log.bin"
-    path.write_bytes(b"".join([*described, records.tobytes()]))
-    rate = messages(path)[0]["/imu_0"][1]
-    np.testing.assert_allclose(rate, np.column_stack([0.01 * np.arange(100), [0.05] * 100, [0] * 100]))
 
 
 def test_what_was_appended_is_read_from_its_offset(tmp_path):
@@ -247,7 +217,7 @@ def test_what_is_read_does_not_depend_on_the_portions(tmp_path, kind, monkeypatc
     path = log(tmp_path, kind)
     whole = messages(path)
     monkeypatch.setattr(dataflash, "_PORTION", 5000)
-    monkeypatch.setattr(ulog, "_TOGETHER", 50)
+    monkeypatch.setattr(library_logs.Ulog, "together", 50)
     monkeypatch.setattr(flight_log, "_TOGETHER", 64)
     cut = messages(path)
     assert cut[1] == whole[1]

@@ -1,0 +1,451 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Logs that are read whole by a library: PX4's ULog files by pyulog, telemetry logs of ground stations by pymavlink.
+
+ULog (.ulg, .ulog). Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time
+they were taken in) and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the
+uORB messages of these names say. By default they are logged at 1 to 2 Hz, and so is vehicle_imu_status (body frame,
+calibrated: the mean of the last 0.1 s): of such a log the means are read, for a coarse check. No bit of SDLOG_PROFILE
+changes that for all IMUs: "Sensor comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fifo. A
+list of topics on the SD card does ("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the
+default one. sensor_combined has the one IMU that PX4 has selected: nothing to compare.
+
+Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates. How long the
+logger dropped out is told; what was lost then is a gap in the samples.
+
+pyulog keeps each message that is no sample as an object, makes one for each field that a format announces, tries again
+byte by byte where a file is damaged, and prints. So it is given a file that ends early if it has more of that than
+any logger writes.
+
+Telemetry logs (.tlog). A record is 8 bytes of time (us since 1970, the first byte first) and a message of MAVLink 1 or
+2, with the time it came over a link. A record counts only where another one begins behind it, and one that is used only
+if pymavlink accepts it, by its checksum. What the messages of IMUs say is told by the same description as live
+(`fdi_ros.mavlink.protocol`), of one autopilot: the first with a HEARTBEAT. Stamps are the autopilot's own; UTC is
+that of the message that came with the least delay.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+from abc import abstractmethod
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count, takewhile
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.flight_log import (
+    FLU,
+    SETTINGS,
+    FlightLog,
+    ImuSamples,
+    Portion,
+    Source,
+    imu_samples,
+    per_time,
+    possible_start,
+)
+from fdi_ros.errors import BagError
+from fdi_ros.mavlink.protocol import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, understood
+from fdi_ros.mavlink.vehicle import dialect
+from fdi_ros.model.samples import Array, Int
+from fdi_ros.system import require
+from fdi_ros.system.files import (
+    TLOG_BYTES,
+    ULOG_BYTES,
+    ULOG_FIELDS,
+    ULOG_MESSAGE_COST,
+    ULOG_OTHER_BYTES,
+    ULOG_TOPIC_COST,
+)
+
+Columns = Mapping[str, NDArray[Any]]
+"""(k,) values of each field of k messages; pyulog has those of an array as fields ``name[0]``, ``name[1]``, ..."""
+
+
+class LibraryLog(FlightLog):
+    """An open log, read whole."""
+
+    together: ClassVar[int]  # messages of a source handed on at once, about
+
+    def begin(self) -> None:
+        """Begin a walk, and read the log up to `end`."""
+        super().begin()
+        self.file.seek(0)
+        self._columns = self.load(self.file.read(self.end))
+
+    @abstractmethod
+    def load(self, data: bytes) -> dict[Source, Columns]:
+        """Return the messages of IMUs; what else is told is taken in."""
+
+    @abstractmethod
+    def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
+        """Return the samples in messages of a kind; None: they lack a field, or have another form."""
+
+    def portions(self) -> Iterator[Portion]:
+        """Return the samples, some of each source together."""
+        portions = max(map(_size, self._columns.values()), default=0) // self.together + 1
+        for k in range(portions):
+            found = []
+            for source, columns in self._columns.items():
+                rows = slice(_size(columns) * k // portions, _size(columns) * (k + 1) // portions)
+                samples = self.samples(source.kind, {name: column[rows] for name, column in columns.items()})
+                if samples is not None:
+                    found.append((source, samples))
+            yield found, (k + 1) / portions
+
+
+def _size(columns: Columns) -> int:
+    """Return the number of messages."""
+    return len(next(iter(columns.values())))
+
+
+# ULog ----------------------------------------------------------------------------------------------------------------
+
+_HEAD = 3  # bytes of a message before its content: two of its size, one of its kind
+_SUBSCRIPTION, _DATA = b"AD"
+_DEEPEST = 16  # formats within formats
+_SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
+_KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
+_GPS = ("sensor_gps", "vehicle_gps_position")
+_LACKS = "its format lacks a field, or is not that of its samples"
+_WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+"""What pyulog raises of a damaged file."""
+_MEAN_TIME = 100_000  # us over which PX4 takes the means of vehicle_imu_status
+_FIX = 3  # fix_type from which on the time is known: a fix in three dimensions
+
+
+class _Bounded(io.BytesIO):
+    """A file that ends where its messages that are no samples come to more than any logger writes."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self.reached = 0  # up to there the file was read, bytes
+        self.cut = False  # it ends within a message
+        self._left = ULOG_OTHER_BYTES
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes; a message begins with three."""
+        data = super().read(size) if self._left > 0 else b""
+        if size == _HEAD and len(data) == _HEAD and data[2] != _DATA:
+            cost = ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
+            self._left -= (data[0] | data[1] << 8) + cost
+        self.cut = len(data) < (size or 0) and not (size == _HEAD and not data)
+        self.reached = max(self.reached, self.tell())
+        return data
+
+
+class Ulog(LibraryLog):
+    """An open file of PX4."""
+
+    magic = b"ULog\x01\x12\x35"
+    refusal = "is no log of PX4"
+    kinds = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo")
+    settings: ClassVar = {"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"}
+    one_imu = (
+        "this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
+        f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n"
+    )
+    coarse = _STATUS
+    selected = _SELECTED
+    most = ULOG_BYTES
+    together = 1 << 14
+
+    def load(self, data: bytes) -> dict[Source, Columns]:
+        """Read messages with pyulog, and tell what could not be read."""
+        require("reading PX4's logs (.ulg)", ("pyulog",))
+        if (second := data.find(self.magic, 1)) > 0:
+            self.note(
+                f"a second log begins at byte {second}: the {len(data) - second} bytes from there on were left out"
+            )
+            data = data[:second]
+        bounded = _Bounded(data)
+        log = _parsed(bounded, self.file.name)
+        if bounded.cut or bounded.reached < len(data):
+            self.note(f"it is cut off or damaged: read up to byte {bounded.reached}")
+        if log.file_corruption:
+            self.note("it is damaged: what pyulog could not read was left out")
+        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
+            times = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
+            self.note(
+                f"the logger dropped out {times}, for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
+            )
+        for text in log.logged_messages:
+            self.add_text(int(text.timestamp), text.log_level_str(), text.message)
+        parts: defaultdict[Source, list[Columns]] = defaultdict(list)
+        for one in log.data_list:
+            self.counts[one.name] += _size(one.data)
+            if one.name in _KINDS:
+                parts[Source(one.name, one.multi_id)].append(one.data)
+            elif one.name in _GPS and self.start_utc is None:
+                self.start_utc = _start_utc(one.data)
+        found = {
+            source: columns
+            for source, columns in {source: _joined(columns) for source, columns in parts.items()}.items()
+            if self.samples(source.kind, {name: column[:0] for name, column in columns.items()}) is not None
+        }
+        lacking = {source.kind for source in parts.keys() - found.keys()} - {_STATUS}
+        announced = log.message_formats.keys() - self.counts.keys() if log.file_corruption else set()
+        self.unread = dict.fromkeys(lacking | (announced & set(_KINDS)), _LACKS)
+        return found | _simultaneous({source: columns for source, columns in found.items() if source.kind == _STATUS})
+
+    def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
+        """Return the samples in messages of a kind; None: they lack a field, or have another form."""
+        acceleration = None
+        try:
+            # Numbers of a damaged log may be anything.
+            with np.errstate(all="ignore"):
+                stamp = _stamp(columns)
+                if kind == "vehicle_imu":
+                    # Changes of angle and velocity over the time of each sample.
+                    rate = per_time(_array(columns, "delta_angle"), columns["delta_angle_dt"] * 1e-6)
+                    acceleration = per_time(_array(columns, "delta_velocity"), columns["delta_velocity_dt"] * 1e-6)
+                elif kind == "sensor_gyro_fifo":
+                    stamp, rate = _unpacked(stamp, columns)
+                elif kind == _STATUS:
+                    # Means of the last 0.1 s: at the middle of these.
+                    stamp, rate = stamp - _MEAN_TIME // 2, _array(columns, "mean_gyro")
+                elif kind == _SELECTED:
+                    rate = _array(columns, "gyro_rad")
+                else:
+                    rate = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        except (KeyError, ValueError):
+            return None
+        acceleration = np.full(rate.shape, np.nan) if acceleration is None else acceleration
+        if not rate.shape == acceleration.shape == (len(stamp), 3):
+            return None
+        return imu_samples(stamp, rate * FLU, acceleration * FLU)
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    """Return the messages of a topic: what was appended to a file begins with the topics anew."""
+    if len(parts) == 1:
+        return parts[0]
+    common = set.intersection(*(set(part) for part in parts))
+    return {name: np.concatenate([part[name] for part in parts]) for name in common}
+
+
+def _parsed(file: _Bounded, path: str) -> Any:
+    """Return a file as pyulog reads it; `BagError` if it does not."""
+    from pyulog import ULog
+    from pyulog.exceptions import ULogException, ULogIncompatibleFlagException
+
+    try:
+        # pyulog prints what it thinks of a file.
+        with contextlib.redirect_stdout(io.StringIO()):
+            formats = ULog(_Bounded(file.getvalue()), parse_header_only=True).message_formats
+            known: dict[str, int] = {}
+            if any(count_fields(formats, name, known) > ULOG_FIELDS for name in formats):
+                raise BagError(f"{path} defines a message of more than {ULOG_FIELDS} fields")
+            return ULog(file)
+    except ULogIncompatibleFlagException as error:
+        raise BagError(f"{path} is a ULog of a later version, whose flags say that it must not be read") from error
+    except (ULogException, *_WRONG) as error:
+        raise BagError(f"{path} cannot be read by pyulog: {error}") from error
+
+
+def count_fields(formats: Mapping[str, Any], name: str, known: dict[str, int], depth: int = 0) -> int:
+    """Return the number of fields of a message with all that its formats nest, at most one more than is allowed."""
+    if name not in known:
+        if depth > _DEEPEST:
+            return ULOG_FIELDS + 1
+        # A format within itself has no end.
+        known[name] = ULOG_FIELDS + 1
+        total = sum(
+            max(1, length) * (count_fields(formats, kind, known, depth + 1) if kind in formats else 1)
+            for kind, length, _ in formats[name].fields
+        )
+        known[name] = min(total, ULOG_FIELDS + 1)
+    return known[name]
+
+
+def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
+    """Return the means of several IMUs at common stamps: those that were taken over mostly the same time.
+
+    What is interpolated over a second of flight differs by more than any fault.
+    """
+    stamps = {source: _stamp(columns) for source, columns in topics.items() if _size(columns)}
+    if len(stamps) < 2:
+        return {}
+    times = np.sort(min(stamps.values(), key=len))
+    nearest = {source: _nearest(stamp, times) for source, stamp in stamps.items()}
+    late = [stamps[source][k] - times for source, k in nearest.items()]
+    kept = np.max(np.abs(late), axis=0) <= _MEAN_TIME // 2
+    return {
+        source: {
+            "timestamp": times[kept],
+            **{name: column[k[kept]] for name, column in topics[source].items() if name.startswith("mean_gyro")},
+        }
+        for source, k in nearest.items()
+    }
+
+
+def _nearest(stamp: Int, times: Int) -> Int:
+    """Return which of k stamps are next to m times, (m,)."""
+    order = np.argsort(stamp, kind="stable")
+    ordered = stamp[order]
+    after = np.searchsorted(ordered, times).clip(0, len(stamp) - 1)
+    before = (after - 1).clip(0)
+    return order[np.where(times - ordered[before] < ordered[after] - times, before, after)]
+
+
+def _array(columns: Columns, name: str) -> NDArray[Any]:
+    """Return a field that is an array, (k, length); `ValueError` if there is none."""
+    there = takewhile(columns.__contains__, (f"{name}[{k}]" for k in count()))
+    return np.stack([columns[one].astype(np.float64) for one in there], axis=1)
+
+
+def _stamp(columns: Columns) -> Int:
+    """Time of samples (k,), us since the start of the autopilot; before version 1.11 that of publication."""
+    stamp = columns["timestamp"].astype(np.int64)
+    if "timestamp_sample" not in columns:
+        return stamp
+    sampled = columns["timestamp_sample"].astype(np.int64)
+    return np.where(sampled > 0, sampled, stamp)
+
+
+def _unpacked(last: Int, columns: Columns) -> tuple[Int, Array]:
+    """Return all samples of k messages of sensor_gyro_fifo: equally spaced, the last (k,) of each at its time."""
+    raw = np.stack([_array(columns, axis) for axis in "xyz"], axis=-1)
+    room = raw.shape[1]
+    size = np.minimum(columns["samples"].astype(np.int64), room)
+    before = size[:, None] - 1 - np.arange(room)
+    spacing = columns["dt"].astype(np.float64)
+    spacing = np.where((spacing > 0) & (spacing < 1e6), spacing, 0.0)
+    stamp = last[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
+    rate = raw * columns["scale"].astype(np.float64)[:, None, None]
+    return stamp[before >= 0], rate[before >= 0]
+
+
+def _start_utc(columns: Columns) -> int | None:
+    """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
+    if not {"timestamp", "time_utc_usec"} <= columns.keys():
+        return None
+    fixed = columns["fix_type"] >= _FIX if "fix_type" in columns else np.ones(_size(columns), dtype=bool)
+    utc, stamp = (columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp"))
+    return possible_start(utc, stamp)
+
+
+# Telemetry logs -------------------------------------------------------------------------------------------------------
+
+_HEARTBEAT, _STATUSTEXT = 0, 253
+_AUTOPILOT_COMPONENT = 1
+_MARKS = (0xFE, 0xFD)  # first bytes of messages of MAVLink 1 and 2
+_TIME = 8
+_LEAST = _TIME + 8  # bytes of the shortest record
+_MAX_DELAY_SPREAD = 3_600_000_000
+"""us; a message that came by so much more or less late than half of the others has a damaged time."""
+_LATEST = 1 << 53  # us; no time is later
+_ROW = struct.Struct("=3q6d")
+_COLUMNS = np.dtype([("stamp", "i8"), ("came", "i8"), ("end", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3)])
+"""Of each sample, with the time at which its message came, us since 1970."""
+
+
+class Tlog(LibraryLog):
+    """An open log of a ground station."""
+
+    magic = b"\0"
+    refusal = "is no log of a ground station (.tlog)"
+    kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
+    settings: ClassVar = {"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"}
+    one_imu = (
+        "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
+        " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
+    )
+    slowest = 5.0  # many ground stations ask for no more than 10 Hz
+    most = TLOG_BYTES
+    together = 1 << 16
+
+    def load(self, data: bytes) -> dict[Source, Columns]:
+        """Read the messages of IMUs of the first autopilot that says that it is one."""
+        found: defaultdict[Source, bytearray] = defaultdict(bytearray)
+        texts: list[tuple[int, str]] = []
+        beats = (beat for _, _, beat in self._messages(data, (_HEARTBEAT,)) if beat.autopilot != NO_AUTOPILOT)
+        if (beat := next(beats, None)) is None:
+            return {}
+        for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
+            if message.get_srcSystem() != beat.get_srcSystem():
+                continue
+            came, number = int.from_bytes(data[at : at + _TIME], "big"), message.get_msgId()
+            if number == _STATUSTEXT:
+                texts.append((came, str(message.text)))
+                continue
+            kind = MESSAGES[number].kind
+            if not understood(kind, beat.autopilot):
+                continue
+            self.counts[kind] += 1
+            start = at + _TIME
+            payload = start + (10 if data[start] == 0xFD else 6)
+            reading = read(number, data[payload : payload + data[start + 1]])
+            if reading is not None and reading.unit < MOST_UNITS:
+                times = min(reading.stamp // 1000, _LATEST), min(came, _LATEST)
+                row = _ROW.pack(*times, end, *reading.rate, *reading.acceleration)
+                found[Source(kind, reading.unit)] += row
+        raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
+        if raw in found and scaled not in found:
+            found[scaled] = found.pop(raw)
+        tables = {source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()}
+        self.start_utc = _start_utc_by([table["came"] - table["stamp"] for table in tables.values()])
+        if self.start_utc is not None:
+            for came, text in texts:
+                self.add_text(came - self.start_utc, "STATUSTEXT", text)
+        return {source: {name: table[name] for name in _COLUMNS.names or ()} for source, table in tables.items()}
+
+    def samples(self, kind: str, columns: Columns) -> ImuSamples:
+        """Return the samples in messages of a kind."""
+        return imu_samples(columns["stamp"], columns["rate"], columns["acceleration"], columns["end"])
+
+    def portions(self) -> Iterator[Portion]:
+        """Return the samples; at the end, say what was left out."""
+        yield from super().portions()
+        if self._lost:
+            self.note(f"{self._lost} bytes belong to no whole record and were left out")
+
+    def _messages(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[tuple[int, int, Any]]:
+        """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts; count what is lost.
+
+        Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
+        """
+        codec = dialect()
+        parser = codec.MAVLink(None)
+        at = lost = 0
+        while at + _LEAST <= len(data):
+            end = record_end(data, at)
+            if end > len(data):
+                break
+            if not end:
+                at, lost = at + 1, lost + 1
+                continue
+            start = at + _TIME
+            second = data[start] == 0xFD
+            number = int.from_bytes(data[start + 7 : start + 10], "little") if second else data[start + 5]
+            if number in numbers and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT:
+                with contextlib.suppress(codec.MAVError):
+                    yield at, end, parser.decode(bytearray(data[start:end]))
+            at = end
+        self._lost = lost + len(data) - at
+
+
+def record_end(data: bytes, at: int) -> int:
+    """Return where the record at a place ends; 0: there is none, or none behind it that proves it."""
+    mark = data[at + _TIME]
+    if data[at] != 0 or mark not in _MARKS:
+        return 0
+    end = at + _TIME + data[at + _TIME + 1] + 8
+    if mark == 0xFD:
+        end += 4 + 13 * (data[at + _TIME + 2] & 1)
+    if end + _TIME >= len(data):
+        return end
+    return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
+
+
+def _start_utc_by(starts: Sequence[Int]) -> int | None:
+    """Return the UTC of the start of the autopilot by that of each message: of the one with the least delay."""
+    ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
+    near = ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD] if len(ordered) else ordered
+    return possible_start(near[:1], np.zeros_like(near[:1]))
