@@ -39,6 +39,8 @@ _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD
 class Link(ABC):
     """A way to an autopilot; messages that are sent wait, whole, until there is room."""
 
+    _gone = "the other side has closed the connection"
+
     def __init__(self, url: str) -> None:
         self.url = url
         self.trouble = "not open yet"  # why it is not open, in words; empty: it is
@@ -56,9 +58,15 @@ class Link(ABC):
         """Whether the handle can be used; raises OSError if it never can."""
         return True
 
-    @abstractmethod
     def _read(self) -> tuple[Any, bytes]:
         """Read once, from whom and what; raises BlockingIOError where nothing is there, OSError when lost."""
+        # A serial line without bytes reads as empty, too: what claims to have some and has none is gone.
+        if not select.select([self._handle], [], [], 0)[0]:
+            raise BlockingIOError
+        data = os.read(self._handle.fileno(), _DATAGRAM)
+        if not data:
+            raise OSError(errno.EIO, self._gone)
+        return None, data
 
     def _write(self, data: bytes) -> int:
         """Write what there is room for, and return how much."""
@@ -188,15 +196,11 @@ class Tcp(Link):
         if code not in (0, errno.EINPROGRESS):
             raise OSError(code, os.strerror(code))
 
-    def _read(self) -> tuple[Any, bytes]:
-        data = self._handle.recv(_DATAGRAM)
-        if not data:
-            raise OSError(errno.ECONNRESET, "the other side has closed the connection")
-        return None, data
-
 
 class Serial(Link):
     """A serial line, by pyserial."""
+
+    _gone = "the device is gone"
 
     def __init__(self, url: str, device: str, baud: int) -> None:
         super().__init__(url)
@@ -208,15 +212,6 @@ class Serial(Link):
     def _open(self) -> None:
         # Two programs that read one line each get half of it.
         self._handle = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
-
-    def _read(self) -> tuple[Any, bytes]:
-        # A line without bytes reads as empty, too: one that claims to have some and has none was pulled out.
-        if not select.select([self._handle], [], [], 0)[0]:
-            raise BlockingIOError
-        data = os.read(self._handle.fileno(), _DATAGRAM)
-        if not data:
-            raise OSError(errno.EIO, "the device is gone")
-        return None, data
 
 
 def open_link(url: str) -> Link:

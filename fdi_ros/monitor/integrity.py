@@ -1,20 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Protection level: how far off the fused rate may be, undetected, by solution separation.
+"""Protection level: how far off the fused rate may be, undetected, by multiple-hypothesis solution separation.
 
-Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is right; it differs
-from the fused rate by no more than the separation test lets pass (multiple-hypothesis solution separation, as in
-advanced receiver autonomous integrity monitoring: Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1)).
-With x_0 the fused rate, x_L that without the channels L, prior P_L, the level of one axis solves
-
-    sum_L P_L (Q((level - T_L) / sigma_L) + Q(level / sigma_0)) + P_more = risk
-
-sigma_L the standard deviation of x_L, T_L the largest ``|x_0 - x_L|`` that passes the test, P_more the prior of all
-that is not covered. The test is ``|r_i| <= K std(r_i)`` for every channel fused: for a single fault that is exactly the
-separation ``x_0 - x_i = G_i r_i / S_ii``, for a pair ``x_0 - x_L = G_L S_LL^-1 r_L``.
-
-The fault may take any size, whatever is worst. Where level < T_L the first Q counts as one.
+Hypotheses: no channel faulty, each one, each pair; the fault may take any size, whatever is worst. As in advanced
+receiver autonomous integrity monitoring (Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1));
+docs/integrity.md has the formulas.
 
 It is worked out once for each set of channels, at noise_std. For a sample whose errors are larger the risk stays shared
 among the hypotheses as it is there: then ``T_L + q_L sigma_L`` with ``q_L = (level - T_L) / sigma_L`` is enough, and

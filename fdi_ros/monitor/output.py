@@ -221,7 +221,6 @@ class SampleOutput:
     """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
     needs_rate: bool = False  # whether it is of samples with a fused rate alone
     on_demand: bool = False  # whether the node leaves it out while nobody subscribes
-    by_path: bool = False  # whether the live sample path fills it, by the same function
 
 
 FUSED = SampleOutput(
@@ -229,7 +228,6 @@ FUSED = SampleOutput(
     lambda frame_id, n: ImuTemplate(frame_id),
     lambda out, row, n, shift: fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]),
     needs_rate=True,
-    by_path=True,
 )
 """Fused rate and its covariance."""
 INTEGRITY = SampleOutput(
@@ -237,7 +235,6 @@ INTEGRITY = SampleOutput(
     lambda frame_id, n: ChannelsTemplate(n + 5),
     lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n),
     on_demand=True,
-    by_path=True,
 )
 """Statistic, threshold, states of the channels, protection level."""
 OUTPUTS = (FUSED, INTEGRITY)  # all that is said of samples, live and in an output bag

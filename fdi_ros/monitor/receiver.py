@@ -10,6 +10,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -63,19 +64,18 @@ class SampleRateCheck:
     def __init__(self, configured: float) -> None:
         self.words = ""  # what is wrong, for people; empty: nothing is known to be
         self._configured = configured
-        self._before: tuple[int, int] | None = None
-        self._rates: deque[float] = deque(maxlen=RATE_WINDOWS)
+        self._points: deque[tuple[int, int]] = deque(maxlen=RATE_WINDOWS + 1)  # numbers of samples, with their stamps
 
     def check(self, count: int, stamp: int) -> None:
         """Take the number of samples so far and the stamp of the last one, ns."""
-        before, self._before = self._before, (count, stamp)
-        if before is None or count <= before[0] or stamp <= before[1]:
-            self._rates.clear()
+        points = self._points
+        if points and (count <= points[-1][0] or stamp <= points[-1][1]):
+            points.clear()
+        points.append((count, stamp))
+        rates = [1e9 * (now[0] - before[0]) / (now[1] - before[1]) for before, now in pairwise(points)]
+        if len(rates) < RATE_WINDOWS or max(rates) > (1 + RATE_TOLERANCE) * min(rates):
             return
-        self._rates.append(1e9 * (count - before[0]) / (stamp - before[1]))
-        if len(self._rates) < RATE_WINDOWS or max(self._rates) > (1 + RATE_TOLERANCE) * min(self._rates):
-            return
-        rate, self.words = sum(self._rates) / RATE_WINDOWS, ""
+        rate, self.words = sum(rates) / RATE_WINDOWS, ""
         if abs(rate / self._configured - 1) > RATE_TOLERANCE:
             self.words = (
                 f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
@@ -122,7 +122,7 @@ class Receiver:
         messages = self.messages[FUSED], self.messages[INTEGRITY]
         self._records = (*self.pipeline.path, *(self.aligner, self.live, self._events), *messages)
         self._process: Callable[[], int] = partial(process, *self._records)
-        if others := [output for output in self.messages if not output.by_path]:
+        if others := [output for output in self.messages if output not in (FUSED, INTEGRITY)]:
             self._process = partial(self._process_and_fill, self._process, others)
 
     def _process_and_fill(self, compiled: Callable[[], int], others: Sequence[SampleOutput]) -> int:

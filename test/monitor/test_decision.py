@@ -121,13 +121,3 @@ def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_sm
     assert decider.channels("faulty") == ({3} if returns is None else set())
     changes = [decider.take((), agrees=ALL, error=np.zeros(12)) for _ in range(20)]
     assert sum(changes) == (returns is None)
-
-
-def test_the_clean_time_of_a_second_channel_counts_from_its_own_declaration():
-    decider, others = Decider(1, 1, latch=False, clean_time=10), ALL & ~mask_of((3,))
-    decider.take((3,), isolated=True)
-    for _ in range(15):
-        decider.take((), agrees=others)
-    decider.take((1,), isolated=True)
-    assert np.flatnonzero([decider.take((), agrees=others) for _ in range(20)]).tolist() == [9]
-    assert decider.channels("faulty") == {3}
