@@ -5,7 +5,7 @@
 
 Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives
 the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
-one: `enter`, then `next_sample` until there is none; `finish` and `next_sample` at the end of a recording.
+one: `enter`, then `next_sample` until there is none.
 
 Where a sample is formed: at the stamp of a message, if there is no sample between this message and the one before of
 the same unit. So the samples come at the rate of the fastest unit, never faster, whatever the phases; and the
@@ -47,7 +47,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import MAX_UNITS, Units, allocate, compiled
-from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Counters, DelayBuffer, Sample, Unit
+from fdi_ros.core.records import (
+    MAX_PENDING,
+    RESTAMP_SAMPLES,
+    RING,
+    Aligner,
+    Counters,
+    DelayBuffer,
+    PathSettings,
+    Sample,
+    Unit,
+)
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
@@ -118,12 +128,6 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
     aligner.phase, aligner.force = _FORMING, _NONE
     if unit.end - unit.begin > MAX_PENDING:
         aligner.force = unit.messages[(unit.begin + 1) % RING].stamp
-
-
-@compiled
-def finish(aligner: Aligner) -> None:
-    """Let `next_sample` give what is left at the end of a recording, without waiting for any unit."""
-    aligner.phase, aligner.force = _FORMING, _ALL
 
 
 @compiled
@@ -449,7 +453,7 @@ class Alignment:
 
     def flush(self) -> NDArray[Any]:
         """Return what is left at the end of a recording, without waiting for any unit, (S,) `Sample`."""
-        finish(self.rows[0])
+        self.rows["phase"], self.rows["force"] = _FORMING, _ALL
         return self._aligned(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
     def is_live(self, unit: int) -> bool:
@@ -503,23 +507,15 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
 
 @compiled
 def restamp(
-    line: DelayBuffer,
-    n: int,
-    units: int,
-    members: NDArray[np.int64],
-    late: Units,
-    stamp: int,
-    values: NDArray[Any],
-    received: int,
-    plain: int,
-    out: NDArray[Any],
+    line: DelayBuffer, settings: PathSettings, late: Units, sample: Sample, received: int, plain: int, out: Array
 ) -> int:
     """Keep a sample, and give the values of the instant that it now stands for, into ``out`` (n,); NaN: none.
 
-    Of the sample: stamp, ns, values (n,) rad/s, bits of those received and of those finite and in range. ``members``:
-    bits of the channels of each unit; ``late`` (units,): by how much their stamps are late, s. Returned are the bits of
-    the channels that have a value, of the instant that the largest delay lies before the stamp.
+    ``received``, ``plain``: bits of the values received, and of those finite and in range; ``late`` (units,): by how
+    much the stamps of each unit are late, s. Returned are the bits of the channels that have a value, of the instant
+    that the largest delay lies before the stamp.
     """
+    n, units, members, stamp = settings.n, settings.units, settings.members, sample.stamp
     row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:
         step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
@@ -530,7 +526,7 @@ def restamp(
     for u in range(units):
         top = max(top, late[u])
     for i in range(n):
-        row.values[i] = out[i] = values[i]
+        row.values[i] = out[i] = sample.z[i]
     found = received
     for u in range(units):
         back = round(1e9 * (top - late[u]))
@@ -541,7 +537,7 @@ def restamp(
 
 
 @compiled
-def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
+def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array) -> int:
     """Values of some channels at a stamp, into ``out``; return bits of those that there are.
 
     By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not

@@ -33,19 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
-from fdi_ros.core.records import BIAS_PORTIONS, Bias, Portion, Sensors, ValueGroup
-from fdi_ros.core.subsets import invert
+from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, ValueGroup
+from fdi_ros.core.subsets import apply_gain, eliminate_rate
 from fdi_ros.model.samples import MAX_RATE, Array
-
-DEFAULT_DURATION = 2_000_000_000  # of the average of the bias where the settings give none, ns
-
-
-def restart_bias(core: NDArray[Any]) -> None:
-    """Begin a new average of the bias; core (1,)."""
-    bias = core[0]["bias"]
-    bias["duration"] = bias["duration"] or DEFAULT_DURATION
-    bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
-
 
 LEAST_ROWS = 10  # samples that an average takes at least
 LEAST_GIVEN = 4  # a channel gives one value in so many samples at least: a unit may be slower than the others
@@ -64,7 +54,14 @@ FALSE_SWAY = 0.001  # probability that noise is taken for motion; then the next 
 PRIOR = 3  # degrees of freedom of what is known of the size of biases beforehand
 LEAST_SQUARE = 1e-30  # (rad/s)^2; instead of zero, to divide by
 _RATE = 3  # dimensions of a body rate
-_PLANE = 1e-3  # axes whose H'H has a determinant below this many cubes of its mean eigenvalue do not span space
+
+
+def restart_bias(core: NDArray[Any]) -> None:
+    """Begin a new average of the bias; core (1,)."""
+    bias = core[0]["bias"]
+    # Where the settings give no time, 2 s: white noise then leaves less than a tenth of itself.
+    bias["duration"] = bias["duration"] or 2_000_000_000
+    bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
 
 
 def prepare_limits(bias: Any) -> None:
@@ -93,21 +90,22 @@ def f_quantile(probability: float, above: int, below: int) -> float:
 
 
 @compiled
-def update_bias(average: Bias, sensors: Sensors, stamp: int, z: Array, good: int, lost: int) -> bool:
+def update_bias(core: Core, subsets: NDArray[Any], stamp: int, good: int, lost: int) -> bool:
     """Take one sample into the average; return whether it was used: False if with it the bias is learned.
 
-    ``z`` (n,) rad/s, as delivered. ``good``: bits of the channels that are finite and in range. ``lost``: of those
-    declared faulty or taken out, which are no evidence about rest, and keep their bias.
+    ``good``: bits of the channels that are finite and in range. ``lost``: of those declared faulty or taken out, which
+    are no evidence about rest, and keep their bias.
     """
+    average, n, z = core.bias, core.settings.n, core.now.aligned
     if average.started and stamp >= average.start + average.duration:
-        conclude(average, sensors, lost)
+        conclude(core, subsets, lost)
         if not average.learning:
             return False
     if not average.started:
-        begin(average, sensors.n, stamp)
+        begin(average, n, stamp)
     average.rows += 1
     portion = average.portions[(stamp - average.start) * BIAS_PORTIONS // average.duration]
-    for i in range(sensors.n):
+    for i in range(n):
         if good >> i & 1:
             average.count[i] += 1
             add_value(average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
@@ -197,10 +195,11 @@ def begin_in_motion(average: Bias, n: int) -> None:
 
 
 @compiled
-def conclude(average: Bias, sensors: Sensors, lost: int) -> None:
+def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
     """Accept the time as rest and set the bias, or note why not."""
+    average, n = core.bias, core.settings.n
     heard = at_rest = resting = restless = 0
-    for i in range(sensors.n):
+    for i in range(n):
         enough = average_channel(average, i)
         if enough and average.count[i] * LEAST_GIVEN > average.rows and not lost >> i & 1:
             heard |= 1 << i
@@ -211,10 +210,10 @@ def conclude(average: Bias, sensors: Sensors, lost: int) -> None:
                 restless += 1
     average.started = False
     average.heard, average.restless = heard, heard & ~at_rest
-    moved = moves_together(average, sensors, at_rest, resting)
+    moved = moves_together(core, subsets[at_rest], at_rest, resting)
     # One channel that does not look at rest is a bad channel; if more do, the vehicle moves.
     if restless <= 1 and resting >= 3 and average.rows >= LEAST_ROWS and not moved:
-        for i in range(sensors.n):
+        for i in range(n):
             if at_rest >> i & 1:
                 average.value[i] = average.average[i]
         average.known = at_rest | lost
@@ -224,22 +223,28 @@ def conclude(average: Bias, sensors: Sensors, lost: int) -> None:
 
 
 @compiled
-def moves_together(average: Bias, sensors: Sensors, mask: int, k: int) -> bool:
+def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
     """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
+    average, sensors, parity = core.bias, core.settings.sensors, core.now.parity
     average.common_rate = average.sway = 0.0
     average.max_common_rate = average.max_sway = math.inf
-    if not spans(average, sensors, mask):
+    if not subset.spans:
         return False
     noise = 0.0
     for i in range(sensors.n):
         average.part[i] = average.average[i] - average.centre[i]
+        for j in range(sensors.n):
+            parity.weight[i, j] = 0.0
         if mask >> i & 1:
+            # One channel is as good as another, whatever its noise.
+            parity.weight[i, i] = 1.0
             noise += sensors.noise_std[i] * sensors.noise_std[i] / k
-    turn, explained, other = split(average, sensors, mask)
+    eliminate_rate(parity, sensors.n, sensors.axes, 0.0)
+    turn, explained, other = split(core, mask)
     size = (PRIOR * USUAL * USUAL + other) / (k - _RATE + PRIOR)
     average.common_rate = turn
     average.max_common_rate = turn * math.sqrt(average.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
-    explained, other, count = split_portions(average, sensors, mask)
+    explained, other, count = split_portions(core, mask)
     if k > _RATE and count > 1:
         average.sway = math.sqrt(explained / (_RATE * (count - 1)))
         average.max_sway = math.sqrt(average.sway_ratio[k - 1] * other / ((k - _RATE) * (count - 1)) + noise)
@@ -247,62 +252,39 @@ def moves_together(average: Bias, sensors: Sensors, mask: int, k: int) -> bool:
 
 
 @compiled
-def spans(average: Bias, sensors: Sensors, mask: int) -> bool:
-    """Whether the channels in mask span space; the inverse of their H'H is noted."""
-    for a in range(3):
-        for b in range(3):
-            average.normal[a, b] = 0.0
-            for i in range(sensors.n):
-                if mask >> i & 1:
-                    average.normal[a, b] += sensors.axes[i, a] * sensors.axes[i, b]
-    size = (average.normal[0, 0] + average.normal[1, 1] + average.normal[2, 2]) / 3
-    determinant = math.exp(invert(average.normal, 3, average.inverse))
-    return determinant > _PLANE * size * size * size
-
-
-@compiled
-def split(average: Bias, sensors: Sensors, mask: int) -> tuple[float, float, float]:
-    """Length of the rate that explains ``average.part``; sums of squares of what it explains, and of the rest."""
-    x = y = z = 0.0
-    for i in range(sensors.n):
-        if mask >> i & 1:
-            x += sensors.axes[i, 0] * average.part[i]
-            y += sensors.axes[i, 1] * average.part[i]
-            z += sensors.axes[i, 2] * average.part[i]
-    m = average.inverse
-    rate_x = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
-    rate_y = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
-    rate_z = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+def split(core: Core, mask: int) -> tuple[float, float, float]:
+    """Length of the rate that explains ``bias.part``; sums of squares of what it explains, and of the rest."""
+    axes, part, rate = core.settings.sensors.axes, core.bias.part, core.now.others_rate
+    apply_gain(core.now.parity.gain, core.settings.n, part, rate)
     explained = other = 0.0
-    for i in range(sensors.n):
+    for i in range(core.settings.n):
         if mask >> i & 1:
-            along = sensors.axes[i, 0] * rate_x + sensors.axes[i, 1] * rate_y + sensors.axes[i, 2] * rate_z
+            along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
             explained += along * along
-            other += (average.part[i] - along) * (average.part[i] - along)
-    return math.sqrt(rate_x * rate_x + rate_y * rate_y + rate_z * rate_z), explained, other
+            other += (part[i] - along) * (part[i] - along)
+    return math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]), explained, other
 
 
 @compiled
-def split_portions(average: Bias, sensors: Sensors, mask: int) -> tuple[float, float, int]:
+def split_portions(core: Core, mask: int) -> tuple[float, float, int]:
     """Deviations of the portions from their mean: sums of squares of both parts, and the number of portions."""
-    count = 0
-    for i in range(sensors.n):
+    average, n, count, explained, other = core.bias, core.settings.n, 0, 0.0, 0.0
+    for i in range(n):
         average.middle[i] = 0.0
     for b in range(BIAS_PORTIONS):
-        if is_filled(average.portions[b], sensors.n, mask):
+        portion = average.portions[b]
+        if is_filled(portion, n, mask):
             count += 1
-            for i in range(sensors.n):
+            for i in range(n):
                 if mask >> i & 1:
-                    average.middle[i] += average.portions[b].total[i] / average.portions[b].count[i]
-    explained = other = 0.0
+                    average.middle[i] += portion.total[i] / portion.count[i]
     for b in range(BIAS_PORTIONS):
-        if is_filled(average.portions[b], sensors.n, mask):
-            for i in range(sensors.n):
+        portion = average.portions[b]
+        if is_filled(portion, n, mask):
+            for i in range(n):
                 if mask >> i & 1:
-                    average.part[i] = (
-                        average.portions[b].total[i] / average.portions[b].count[i] - average.middle[i] / count
-                    )
-            _, one, two = split(average, sensors, mask)
+                    average.part[i] = portion.total[i] / portion.count[i] - average.middle[i] / count
+            _, one, two = split(core, mask)
             explained += one
             other += two
     return explained, other, count

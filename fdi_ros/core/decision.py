@@ -27,7 +27,7 @@ from fdi_ros.core.health import (
     intermittent_channels,
     update_stuck,
 )
-from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, PathSettings, Subset
+from fdi_ros.core.records import Core, Current, Decision, Estimate, Evidence, PathSettings, Subset
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
@@ -37,66 +37,55 @@ SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit befo
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
-    n, now, evidence = core.settings.n, core.now, core.now.evidence
-    limits, health = core.settings.health, core.health
+    settings, health, now, evidence = core.settings, core.health, core.now, core.now.evidence
     evidence.judged = not math.isnan(now.verdict.statistic)
     evidence.checked = subsets[now.input_mask].detectable if evidence.judged else 0
-    if core.settings.estimates:
+    if settings.estimates:
         evidence.checked &= core.estimate.checked
     evidence.held = core.known.held
-    evidence.broken = evidence.repeats = clear = 0
-    for i in range(n):
+    evidence.broken = evidence.repeats = evidence.agrees = clear = 0
+    may_return = not settings.latch and core.decision.faulty != 0
+    for i in range(settings.n):
         if health.condition[i] == NON_FINITE_LASTING:
             evidence.broken |= 1 << i
-        if limits.stuck_time and evidence.stamp - health.run_stamp[i] >= limits.stuck_time:
+        if settings.stuck_time and evidence.stamp - health.run_stamp[i] >= settings.stuck_time:
             evidence.repeats |= 1 << i
         if not now.verdict.suspects[i]:
             clear |= 1 << i
         evidence.error[i] = now.corrected[i] - now.along[i]
-    evidence.intermittent = intermittent_channels(health, n, INTERMITTENT_SHARE)
-    update_agreement(core)
+        if may_return and now.plain >> i & 1:
+            # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+            variance = 2 * variance_of(settings.sensors, i, now.along[i], core.acceleration.value)
+            if abs(evidence.error[i]) <= settings.return_limit * math.sqrt(variance):
+                evidence.agrees |= 1 << i
+    evidence.intermittent = intermittent_channels(health, settings.n, INTERMITTENT_SHARE)
     clear &= now.usable
     return update_stuck(core, subsets[clear], clear, evidence.stamp)
 
 
 @compiled
-def update_agreement(core: Core) -> None:
-    """Which channels agree with the others, where one that was declared may return."""
-    core.now.evidence.agrees = 0
-    if core.settings.decision.latch or not core.decision.faulty:
-        return
-    for i in range(core.settings.n):
-        # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
-        variance = 2 * variance_of(core.settings.sensors, i, core.now.along[i], core.acceleration.value)
-        if core.now.plain >> i & 1 and abs(core.now.evidence.error[i]) <= core.settings.return_limit * math.sqrt(
-            variance
-        ):
-            core.now.evidence.agrees |= 1 << i
-
-
-@compiled
-def fill_suspects(core: Core, n: int, stuck: int) -> None:
+def fill_suspects(core: Core, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
-    evidence, verdict = core.now.evidence, core.now.verdict
-    evidence.certain = evidence.undecided = 0
-    evidence.outliers = bits_of(verdict.outliers, n) | core.now.repeated | evidence.flickers
-    suspects = bits_of(verdict.suspects, n)
-    if stuck & core.now.repeated:
-        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
-        stuck |= units_of(core.settings, stuck & core.now.repeated)
-    if core.settings.decision.evidence and verdict.alarm and not evidence.held:
+    settings, now, evidence, verdict = core.settings, core.now, core.now.evidence, core.now.verdict
+    n, evidence.certain, evidence.undecided = settings.n, 0, 0
+    evidence.outliers = bits_of(verdict.outliers, n) | now.repeated | evidence.flickers
+    if settings.by_evidence and verdict.alarm and not evidence.held:
         if verdict.isolated:
-            evidence.certain = suspects
+            evidence.certain = bits_of(verdict.suspects, n)
         else:
-            evidence.undecided = suspects
-    update_drifted(core.settings, core.estimate, core.now)
+            evidence.undecided = bits_of(verdict.suspects, n)
+    for u in range(settings.units):
+        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        if settings.members[u] & stuck & now.repeated:
+            stuck |= settings.members[u]
+    update_drifted(settings, core.estimate, now)
     evidence.certain |= evidence.drifted
-    add_stuck(core.settings, core.now, stuck)
+    add_stuck(settings, now, stuck)
     for i in range(n):
         if verdict.error[i] != 0:
             core.last_error[i] = verdict.error[i]
     evidence.suspected, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
-    if core.settings.decision.evidence:
+    if settings.by_evidence:
         evidence.suspected, evidence.isolated = stuck, stuck & (stuck - 1) == 0
 
 
@@ -109,8 +98,7 @@ def update_drifted(settings: PathSettings, estimate: Estimate, now: Current) -> 
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
             if now.input_mask >> i & 1 and bias > settings.max_drift:
                 now.evidence.drifted |= 1 << i
-                now.verdict.suspects[i] = True
-                now.verdict.error[i] = estimate.bias[i]
+                now.verdict.suspects[i], now.verdict.error[i] = True, estimate.bias[i]
 
 
 @compiled
@@ -120,16 +108,6 @@ def bits_of(flags: NDArray[np.uint8], n: int) -> int:
     for i in range(n):
         if flags[i]:
             mask |= 1 << i
-    return mask
-
-
-@compiled
-def units_of(settings: PathSettings, channels: int) -> int:
-    """Set of all channels of the units that these are of."""
-    members, mask = settings.members, 0
-    for u in range(settings.units):
-        if members[u] & channels:
-            mask |= members[u]
     return mask
 
 
@@ -146,32 +124,32 @@ WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
 
 
 @compiled
-def decide(limits: DecisionSettings, decision: Decision, n: int, evidence: Evidence) -> bool:
+def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bool:
     """Take the verdict on one sample; return whether it changed what is declared."""
     suspected = evidence.suspected & ~decision.faulty
     counted = 0 if evidence.held else suspected
     doubtful = suspected | evidence.outliers & ~decision.faulty
-    push(decision, limits, n, (doubtful, counted, counted if evidence.isolated else 0, evidence.checked))
-    decision.suspicion = at_least(decision, SUSPECTED, n, 1)
+    push(decision, settings, (doubtful, counted, counted if evidence.isolated else 0, evidence.checked))
+    decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
     # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
         decision.last_doubt = evidence.stamp
-    faulty, undecided = confirm(decision, limits, n)
+    faulty, undecided = confirm(decision, settings)
     broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
     faulty |= evidence.certain & ~decision.faulty
-    if limits.evidence:
+    if settings.by_evidence:
         # A set follows the evidence, and ends with it; one by votes stays.
         decision.voted |= undecided
-        if evidence.stamp - decision.last_doubt >= limits.clean_time:
+        if evidence.stamp - decision.last_doubt >= settings.clean_time:
             decision.voted = 0
         wanted = (decision.voted | evidence.undecided) if evidence.judged else decision.ambiguous
     else:
         wanted = decision.ambiguous | undecided
-    follow_declared(limits, decision, n, evidence)
+    follow_declared(settings, decision, evidence)
     returns, clears = 0, False
-    if not limits.latch:
-        returns = update_returns(limits, decision, n, evidence.stamp)
-        clears = decision.ambiguous != 0 and evidence.stamp - decision.last_doubt >= limits.clean_time
+    if not settings.latch:
+        returns = update_returns(settings, decision, evidence.stamp)
+        clears = decision.ambiguous != 0 and evidence.stamp - decision.last_doubt >= settings.clean_time
     # A set of which a member is now known to be faulty is explained by it.
     if clears or decision.ambiguous & (faulty | broken):
         decision.voted = wanted = 0
@@ -181,13 +159,13 @@ def decide(limits: DecisionSettings, decision: Decision, n: int, evidence: Evide
     if after == decision.faulty and wanted == decision.ambiguous:
         return False
     decision.ambiguous = wanted
-    for i in range(n):
+    for i in range(settings.n):
         if after >> i & 1 and not decision.faulty >> i & 1:
             decision.why[i] = reason_for(evidence, i)
         elif not after >> i & 1:
             decision.why[i] = UNDECLARED
     decision.faulty = after
-    forget_alarms(decision, limits, n)
+    forget_alarms(decision, settings)
     return True
 
 
@@ -204,9 +182,9 @@ def reason_for(evidence: Evidence, i: int) -> int:
 
 
 @compiled
-def push(decision: Decision, limits: DecisionSettings, n: int, sets: tuple[int, int, int, int]) -> None:
+def push(decision: Decision, settings: PathSettings, sets: tuple[int, int, int, int]) -> None:
     """Move the window on by one sample with these sets, by kind."""
-    decision.at = (decision.at + 1) % limits.window
+    decision.at = (decision.at + 1) % settings.window
     if sets[COUNTED]:
         decision.alarms += 1
     if decision.sets[COUNTED, decision.at]:
@@ -215,36 +193,36 @@ def push(decision: Decision, limits: DecisionSettings, n: int, sets: tuple[int, 
         new, old = sets[kind], decision.sets[kind, decision.at]
         decision.sets[kind, decision.at] = new
         if new != old:
-            for i in range(n):
+            for i in range(settings.n):
                 decision.count[kind, i] += (new >> i & 1) - (old >> i & 1)
 
 
 @compiled
-def at_least(decision: Decision, kind: int, n: int, least: int) -> int:
+def at_least(decision: Decision, settings: PathSettings, kind: int, least: int) -> int:
     """Bits of the channels that are in the sets of a kind of so many samples of the window at least."""
     mask = 0
-    for i in range(n):
+    for i in range(settings.n):
         if decision.count[kind, i] >= least:
             mask |= 1 << i
     return mask
 
 
 @compiled
-def confirm(decision: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
+def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
     """Channels that the alarms of the window declare faulty, and a set one of which is.
 
     A channel is faulty when at least `alarms` of the last `window` samples suspected it and at least half that many
     suspected nothing but faulty channels with it. When the alarms are as many but do not single it out, the channels
     that at least half of them suspected are undecided together, and so they are when all the window disagrees about it.
     """
-    half = (limits.alarms + 1) // 2
-    enough = at_least(decision, COUNTED, n, limits.alarms)
-    faulty = enough & at_least(decision, ISOLATED, n, half)
+    half = (settings.alarms + 1) // 2
+    enough = at_least(decision, settings, COUNTED, settings.alarms)
+    faulty = enough & at_least(decision, settings, ISOLATED, half)
     undecided = 0
-    if enough or decision.alarms == limits.window:
-        undecided = at_least(decision, COUNTED, n, half)
+    if enough or decision.alarms == settings.window:
+        undecided = at_least(decision, settings, COUNTED, half)
         if not undecided:
-            undecided = at_least(decision, COUNTED, n, 1)
+            undecided = at_least(decision, settings, COUNTED, 1)
     if undecided & (undecided - 1) == 0:
         # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
         faulty |= undecided & enough
@@ -252,11 +230,11 @@ def confirm(decision: Decision, limits: DecisionSettings, n: int) -> tuple[int, 
 
 
 @compiled
-def follow_declared(limits: DecisionSettings, decision: Decision, n: int, evidence: Evidence) -> None:
+def follow_declared(settings: PathSettings, decision: Decision, evidence: Evidence) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
-    for i in range(n):
+    for i in range(settings.n):
         # That of one that is not declared counts from its declaration, not from that of another.
-        is_declared = decision.faulty >> i & 1 and not limits.latch
+        is_declared = decision.faulty >> i & 1 and not settings.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
             decision.last_bad[i] = decision.renewed[i] = evidence.stamp
             decision.error_sum[i], decision.error_count[i] = 0.0, 0
@@ -267,39 +245,39 @@ def follow_declared(limits: DecisionSettings, decision: Decision, n: int, eviden
 
 
 @compiled
-def update_returns(limits: DecisionSettings, decision: Decision, n: int, stamp: int) -> int:
+def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> int:
     """Bits of the declared channels that have agreed for the clean time.
 
     A small fault agrees sample by sample. So the mean is of the last one or two clean times: of what was before it is
     no more.
     """
     returns = 0
-    for i in range(n):
-        if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= limits.clean_time:
+    for i in range(settings.n):
+        if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= settings.clean_time:
             total = abs(decision.error_sum[i] + decision.earlier_sum[i])
-            if total <= limits.mean_limit[i] * (decision.error_count[i] + decision.earlier_count[i]):
+            if total <= settings.mean_limit[i] * (decision.error_count[i] + decision.earlier_count[i]):
                 returns |= 1 << i
-            elif stamp - decision.renewed[i] >= limits.clean_time:
+            elif stamp - decision.renewed[i] >= settings.clean_time:
                 decision.earlier_sum[i], decision.earlier_count[i] = decision.error_sum[i], decision.error_count[i]
                 decision.error_sum[i], decision.error_count[i], decision.renewed[i] = 0.0, 0, stamp
     return returns
 
 
 @compiled
-def forget_kind(decision: Decision, limits: DecisionSettings, n: int, kind: int) -> None:
+def forget_kind(decision: Decision, settings: PathSettings, kind: int) -> None:
     """Forget which channels were in the sets of a kind."""
-    for k in range(limits.window):
+    for k in range(settings.window):
         decision.sets[kind, k] = 0
-    for i in range(n):
+    for i in range(settings.n):
         decision.count[kind, i] = 0
 
 
 @compiled
-def forget_alarms(decision: Decision, limits: DecisionSettings, n: int) -> None:
+def forget_alarms(decision: Decision, settings: PathSettings) -> None:
     """Forget the alarms of the window. What was checked stays known; it is the last kind."""
     decision.alarms = 0
     for kind in range(CHECKED):
-        forget_kind(decision, limits, n, kind)
+        forget_kind(decision, settings, kind)
 
 
 @compiled
@@ -310,7 +288,7 @@ def clear_declarations(core: NDArray[Any]) -> int:
     decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0
     for i in range(settings.n):
         decision.why[i] = UNDECLARED
-    forget_alarms(decision, settings.decision, settings.n)
+    forget_alarms(decision, settings)
     return declared
 
 

@@ -31,22 +31,21 @@ from fdi_ros.core.records import (
     Current,
     DelayBuffer,
     Health,
-    HealthSettings,
     PathSettings,
+    Sample,
     Subset,
 )
-from fdi_ros.core.subsets import LARGEST_RATE, fill_rate
-from fdi_ros.model.samples import Array
+from fdi_ros.core.subsets import fill_rate
+from fdi_ros.model.samples import MAX_RATE, Array
 
 FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(int, Condition)
 NOT_BAD = -(1 << 62)  # instead of the stamp at which a run of non-finite values began
 
 
 @compiled
-def check(
-    limits: HealthSettings, health: Health, n: int, stamp: int, z: NDArray[np.float64], received: NDArray[np.uint8]
-) -> None:
-    """Check the values z (n,) of one sample; results in ``health.condition``."""
+def check(settings: PathSettings, health: Health, sample: Sample) -> None:
+    """Check the values of one sample; results in ``health.condition``."""
+    n, stamp, received = settings.n, sample.stamp, sample.received
     if health.begun == 0:
         for i in range(n):
             health.value[i] = math.nan
@@ -55,10 +54,10 @@ def check(
     health.begun += 1
     follow_presence(health, n, stamp, received)
     for i in range(n):
-        condition = receive(limits, health, i, stamp, z[i]) if received[i] else MISSING
-        if condition == FINE and limits.frozen_time and stamp - health.run_stamp[i] >= limits.frozen_time:
+        condition = receive(settings, health, i, stamp, sample.z[i]) if received[i] else MISSING
+        if condition == FINE and settings.frozen_time and stamp - health.run_stamp[i] >= settings.frozen_time:
             condition = FROZEN
-        if stamp - health.received_stamp[i] > limits.stale_time:
+        if stamp - health.received_stamp[i] > settings.stale_time:
             condition = SILENT
         health.condition[i] = condition
         health.counts[condition, i] += 1
@@ -67,11 +66,11 @@ def check(
 
 
 @compiled
-def receive(limits: HealthSettings, health: Health, i: int, stamp: int, z: float) -> int:
+def receive(settings: PathSettings, health: Health, i: int, stamp: int, z: float) -> int:
     """Remember a value that was received of channel i; return what is wrong with it by itself."""
     # Across a hole it is unknown what the value was: a run begins anew.
     step = stamp - health.received_stamp[i]
-    hole = step > limits.stale_time
+    hole = step > settings.stale_time
     health.received_stamp[i] = stamp
     follow_share(health, i, math.isfinite(z), step)
     if math.isfinite(z):
@@ -81,10 +80,10 @@ def receive(limits: HealthSettings, health: Health, i: int, stamp: int, z: float
         if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
             health.step[i] = change
         health.value[i], health.bad_stamp[i] = z, NOT_BAD
-        return OUT_OF_RANGE if abs(z) >= limits.max_rate[i] else FINE
+        return OUT_OF_RANGE if abs(z) >= settings.max_rate[i] else FINE
     if health.bad_stamp[i] == NOT_BAD or hole:
         health.bad_stamp[i] = stamp
-    return NON_FINITE_LASTING if stamp - health.bad_stamp[i] >= limits.non_finite_time else NON_FINITE
+    return NON_FINITE_LASTING if stamp - health.bad_stamp[i] >= settings.non_finite_time else NON_FINITE
 
 
 # Values that come and go ----------------------------------------------------------------------------------------------
@@ -303,7 +302,7 @@ def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int)
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
     if not now.usable or (coarse and is_at_rest(settings, now)):
         return False
-    fresh, least = 0, max(ALL_REPEAT, settings.health.stuck_time) if coarse else ALL_REPEAT
+    fresh, least = 0, max(ALL_REPEAT, settings.stuck_time) if coarse else ALL_REPEAT
     for i in range(settings.n):
         if stamp - health.run_stamp[i] < least:
             fresh |= 1 << i
@@ -451,7 +450,7 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
             continue
         values = np.hstack([series[a][-size:], series[b][-size:]])
         rows["values"][:size, :6] = values
-        rows["plain"][:size] = (np.abs(values) < LARGEST_RATE) @ (1 << np.arange(6))
+        rows["plain"][:size] = (np.abs(values) < MAX_RATE) @ (1 << np.arange(6))
         hits = 0
         for count in (size, size * 3 // 4, size // 2):
             line["count"] = max(count, ROWS + 3)

@@ -198,13 +198,6 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
 
 
 @compiled
-def fill_channels(out: Bytes, at: int, values: Array, count: int) -> None:
-    """Write values into one serialised Float64MultiArray, little endian; out and at as for `fill_imu`."""
-    for i in range(count):
-        _write_double(out, at + 8 * i, values[i])
-
-
-@compiled
 def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int) -> None:
     """Write statistic, threshold, states of n channels and protection level of one sample into a Float64MultiArray.
 
@@ -251,5 +244,5 @@ class ChannelsTemplate:
 
     def fill(self, values: Iterable[float]) -> bytes:
         """Return the message with these values."""
-        fill_channels(self.bytes, self.at, np.array([*values], dtype=np.float64).reshape(self.count), self.count)
+        self.bytes[self.at :] = np.array([*values], dtype="<f8").reshape(self.count).view(np.uint8)
         return self.bytes.tobytes()

@@ -42,7 +42,7 @@ from fdi_ros.core.health import FINE, OUT_OF_RANGE, all_repeat, check, leave_fli
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, PathSettings, Sample
 from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
-from fdi_ros.model.samples import Array, Bytes
+from fdi_ros.model.samples import Bytes
 
 NOISY, NOISIER = 3.0, 1.4
 """A channel is noisy from so many times the noise expected, if that is so many times what any other has."""
@@ -52,107 +52,98 @@ WAITING = -1
 RAIL_LIMIT = 10.0  # a value out of range is fed to the detector as so many ranges at most
 
 
+Path = tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]]
+"""What the path works on: the monitor, (1,) `Core`; its detector, (1,) `Bank`; the bytes of the detector's states; all
+sets of channels, (2^n,) `Subset`."""
+
+
 @compiled
 def run(
-    core: NDArray[Any],
-    bank: NDArray[Any],
-    memory: NDArray[np.uint8],
-    subsets: NDArray[Any],
-    samples: NDArray[Any],
-    start: int,
-    out: NDArray[Any],
-    events: NDArray[Any],
-    stop_at_event: bool,
+    path: Path, samples: NDArray[Any], start: int, out: NDArray[Any], events: NDArray[Any], stop_at_event: bool
 ) -> tuple[int, int, bool]:
     """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
 
-    ``core`` (1,) `Core`; ``bank`` (1,) `Bank` of the detector, ``memory`` the bytes of its states; ``subsets`` (2^n,)
-    `Subset`. Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first
-    sample that brings one.
+    Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first sample that
+    brings one.
 
     Returned are the row at which work ended, N if all is done; the number of events; and whether something must be
     prepared. If it is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set; if the
     row before it lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is
     set.
     """
-    monitor, count = core[0], 0
+    core, count = path[0][0], 0
     for k in range(start, len(samples)):
-        if len(events) - count < monitor.settings.n:
+        if len(events) - count < core.settings.n:
             return k, count, False
         before = count
-        count = step(monitor, bank[0], memory, subsets, samples[k], k, events, before)
+        count = step(path, samples[k], k, events, before)
         if count < 0:
             return k, before, True
-        out[k] = monitor.last
-        wants = monitor.wanted != 0 or monitor.copies.found
+        out[k] = core.last
+        wants = core.wanted != 0 or core.copies.found
         if wants or (stop_at_event and count > before):
             return k + 1, count, wants
     return len(samples), count, False
 
 
 @compiled
-def step(
-    core: Core,
-    bank: Bank,
-    memory: NDArray[np.uint8],
-    subsets: NDArray[Any],
-    sample: Sample,
-    row: int,
-    events: NDArray[Any],
-    count: int,
-) -> int:
+def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int) -> int:
     """Work one sample; the output is ``core.last``. Return the number of events.
 
     Or `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.input_mask``: then the same
     sample is to be given again.
     """
+    core, bank = path[0][0], path[1][0]
     now = core.now
     if not now.waiting:
-        prepare_sample(core, bank, memory, subsets, sample)
+        prepare_sample(path, sample)
     now.waiting = not now.learned_from and not judge_sample(bank, now.input_mask, now.input, core.known, now.verdict)
-    return WAITING if now.waiting else conclude_sample(core, bank, memory, subsets, row, events, count)
+    return WAITING if now.waiting else conclude_sample(path, row, events, count)
 
 
 @compiled
-def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
+def forget(path: Path) -> None:
     """Let the detector forget all samples. A loop: the assignment of a slice takes seconds to compile."""
+    bank, memory = path[1][0], path[2]
     for k in range(bank.rows * bank.states_size):
         memory[k] = 0
 
 
 @compiled
-def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: NDArray[Any], sample: Sample) -> None:
+def prepare_sample(path: Path, sample: Sample) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see.
 
     The checks are on the values as delivered, so that what is wrong is met at once; where units are late the
     values judged are those of an earlier instant, of this and earlier samples that were checked, too.
     """
+    core, subsets = path[0][0], path[3]
     settings, now, stamp = core.settings, core.now, sample.stamp
     now.evidence.stamp = stamp
-    now.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
+    now.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.stale_time
     core.last_stamp = stamp
     core.samples += 1
-    check(settings.health, core.health, settings.n, stamp, sample.z, sample.received)
+    check(settings, core.health, sample)
     plain, fine = bring_together(core, sample)
     update_copies(core.copies, settings, core.line, stamp)
     now.learned_from = False
     if core.bias.learning:
-        learn_bias(core, bank, memory, stamp, now.aligned, plain)
+        learn_bias(path, stamp, plain)
     if now.learned_from:
         return
     out = out_of_use(core)
     now.plain, now.in_use = plain, plain & ~out
     now.usable = now.in_use & fine
     leave_flickering(core, subsets)
-    correct_values(core)
+    for i in range(settings.n):
+        now.corrected[i] = now.aligned[i] - core.bias.value[i] - core.correction[i]
     fill_rate(subsets[now.in_use], settings.n, now.in_use, now.corrected, now.rate)
     fill_input(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, now.evidence.interrupted
     core.known.beyond = now.input_mask & ~now.usable
-    core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
+    core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
     now.repeated = update_repeated(core) if settings.estimates else 0
     core.known.repeated = now.repeated != 0
-    now.all_repeat = settings.estimates and all_repeat(core.settings, core.health, now, stamp)
+    now.all_repeat = settings.estimates and all_repeat(settings, core.health, now, stamp)
     if now.all_repeat:
         now.input_mask = 0
     if settings.needs_acceleration:
@@ -164,50 +155,33 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
     """Values of one instant, into ``now.aligned``; return bits of those there are and in range, and of those well."""
-    settings, n, late = core.settings, core.settings.n, core.estimate.late
+    settings, aligned = core.settings, core.now.aligned
     delivered = inside = plain = fine = 0
-    for i in range(n):
+    for i in range(settings.n):
         if sample.received[i]:
             delivered |= 1 << i
-            if abs(sample.z[i]) < settings.health.max_rate[i]:
+            if abs(sample.z[i]) < settings.max_rate[i]:
                 inside |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
-    delivered = restamp(
-        core.line,
-        n,
-        settings.units,
-        settings.members,
-        late,
-        sample.stamp,
-        sample.z,
-        delivered,
-        inside,
-        core.now.aligned,
-    )
-    for i in range(n):
-        if delivered >> i & 1 and abs(core.now.aligned[i]) < settings.health.max_rate[i]:
+    delivered = restamp(core.line, settings, core.estimate.late, sample, delivered, inside, aligned)
+    for i in range(settings.n):
+        if delivered >> i & 1 and abs(aligned[i]) < settings.max_rate[i]:
             plain |= 1 << i
     return plain, fine
 
 
 @compiled
-def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z: Array, plain: int) -> None:
-    """Take a sample for the bias, if it is still being learned; whether it was taken is in ``now.learned_from``."""
-    settings, bias = core.settings, core.bias
-    core.now.learned_from = update_bias(bias, settings.sensors, stamp, z, plain, left_out(core))
-    if settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
-        begin_in_motion(bias, settings.n)
+def learn_bias(path: Path, stamp: int, plain: int) -> None:
+    """Take a sample for the bias; whether it was taken is in ``now.learned_from``."""
+    core, subsets = path[0][0], path[3]
+    bias = core.bias
+    core.now.learned_from = update_bias(core, subsets, stamp, plain, left_out(core))
+    if core.settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
+        begin_in_motion(bias, core.settings.n)
     if not bias.learning:
-        forget(bank, memory)
-        begin_bias(core, settings.n)
-
-
-@compiled
-def correct_values(core: Core) -> None:
-    """Values less what was known of their errors at the last sample, in ``now.corrected``."""
-    for i in range(core.settings.n):
-        core.now.corrected[i] = core.now.aligned[i] - core.bias.value[i] - core.correction[i]
+        forget(path)
+        begin_bias(core)
 
 
 @compiled
@@ -248,9 +222,9 @@ def update_noisy(settings: PathSettings, now: Current) -> None:
 
 
 @compiled
-def begin_bias(core: Core, n: int) -> None:
+def begin_bias(core: Core) -> None:
     """Begin to follow the biases that were just learned."""
-    settings, motion, largest = core.settings, core.bias.outcome == IN_MOTION, 0.0
+    n, settings, motion, largest = core.settings.n, core.settings, core.bias.outcome == IN_MOTION, 0.0
     lost = left_out(core)
     for i in range(n):
         largest = max(largest, core.health.step[i])
@@ -278,7 +252,7 @@ def fill_input(core: Core, out: int) -> None:
         now.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         now.input[i] = now.aligned[i] - core.bias.value[i]
         if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(now.aligned[i]):
-            limit = core.settings.health.max_rate[i]
+            limit = core.settings.max_rate[i]
             if abs(now.along[i]) < RAIL_MARGIN * limit:
                 now.input[i] = min(max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
                 now.input_mask |= 1 << i
@@ -287,28 +261,20 @@ def fill_input(core: Core, out: int) -> None:
 
 
 @compiled
-def conclude_sample(
-    core: Core,
-    bank: Bank,
-    memory: NDArray[np.uint8],
-    subsets: NDArray[Any],
-    row: int,
-    events: NDArray[Any],
-    count: int,
-) -> int:
+def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> int:
     """Decide, fuse and write events after the detector; the output is ``core.last``. Return the number of events."""
-    n, now, last = core.settings.n, core.now, core.last
+    core, bank, subsets = path[0][0], path[1][0], path[3]
+    settings, now, last, verdict = core.settings, core.now, core.last, core.now.verdict
     last.stamp = now.evidence.stamp
     if now.learned_from:
-        skip_sample(core, n)
+        skip_sample(core)
         return write_events(core, subsets[alive(core)], row, True, events, count)
-    if core.settings.estimates:
+    if settings.estimates:
         apply_estimate(core, bank)
-        update_noisy(core.settings, now)
-    stuck = gather_evidence(core, subsets)
-    fill_suspects(core, n, stuck)
+        update_noisy(settings, now)
+    fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous
-    changed = decide(core.settings.decision, core.decision, n, now.evidence)
+    changed = decide(settings, core.decision, now.evidence)
     # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too
     # little would be left: then only what is in doubt from now on.
     now.usable &= ~core.decision.faulty
@@ -316,23 +282,22 @@ def conclude_sample(
     enough = not changed or subsets[now.usable & ~now.doubtful].spare
     fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
     # What is known of the sensors holds whatever is declared.
-    if changed and not core.settings.estimates:
-        forget(bank, memory)
+    if changed and not settings.estimates:
+        forget(path)
     living = alive(core)
-    checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
+    checked = subsets[living].detectable & at_least(core.decision, settings, CHECKED, settings.alarms)
     update_states(core, checked, 0 if changed else core.decision.suspicion, False)
-    verdict = now.verdict
     last.statistic, last.threshold, last.alarm = verdict.statistic, verdict.threshold, verdict.alarm
     update_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
 
 
 @compiled
-def skip_sample(core: Core, n: int) -> None:
+def skip_sample(core: Core) -> None:
     """Remember a sample that only the bias was learned from."""
     last = core.last
-    forget_kind(core.decision, core.settings.decision, n, CHECKED)
-    for i in range(n):
+    forget_kind(core.decision, core.settings, CHECKED)
+    for i in range(core.settings.n):
         core.reference[i] = last.residual[i] = math.nan
     update_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
@@ -408,26 +373,18 @@ def receive_arrived(live: Live, code: int, stamp: int) -> int:
 
 @compiled
 def process(
-    core: NDArray[Any],
-    bank: NDArray[Any],
-    memory: Bytes,
-    subsets: NDArray[Any],
-    aligner: NDArray[Any],
-    live: NDArray[Any],
-    events: NDArray[Any],
-    fused: Bytes,
-    integrity: Bytes,
+    path: Path, aligner: NDArray[Any], live: NDArray[Any], events: NDArray[Any], fused: Bytes, integrity: Bytes
 ) -> int:
     """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
 
-    ``events`` takes its events, ``fused`` and ``integrity`` the messages to be published about it; all else as for
-    `run`, `aligner` and `live` (1,) records.
+    ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and ``integrity`` the messages to be
+    published about it.
     """
-    monitor, main = live[0], core[0]
+    monitor, main = live[0], path[0][0]
     if not monitor.ready:
         return 0
     sample = monitor.sample
-    count = step(main, bank[0], memory, subsets, sample, 0, events, 0)
+    count = step(path, sample, 0, events, 0)
     if count < 0:
         return SUPPLY | MORE
     monitor.events = count

@@ -3,8 +3,8 @@
 
 """Every record of the sample path, in the order of a sample; `Core` is what one monitor has and remembers.
 
-What the settings give stands in records of their own (`PathSettings`, `HealthSettings`, `DecisionSettings`). So does
-what is only of the sample on its way (`Current`); most of the rest is memory. Methods have records of their own.
+What the settings give is in `PathSettings`, what is only of the sample on its way in `Current`; most of the rest is
+memory. Methods have records of their own.
 """
 
 from __future__ import annotations
@@ -243,18 +243,6 @@ class Condition(IntEnum):
 
 
 @record
-class HealthSettings:
-    """Limits and times of the checks."""
-
-    max_rate: Channels  # rad/s
-    non_finite_time: Whole  # ns
-    stuck_time: Whole  # ns; 0: never stuck
-    frozen_time: Whole  # ns; 0: never frozen
-    stale_time: Whole  # ns
-    recovery_time: Whole  # ns
-
-
-@record
 class Health:
     """What the checks remember of the samples before, and how each channel fares in this one."""
 
@@ -365,8 +353,6 @@ class Bias:
     max_sway: Real  # at rest, rad/s
     # While an average is concluded:
     ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]  # values being sorted
-    normal: Matrix  # H'H of the channels at rest
-    inverse: Matrix
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
 
@@ -450,18 +436,6 @@ class Evidence:
 
 
 @record
-class DecisionSettings:
-    """When a fault is declared, and whether it is forgiven."""
-
-    evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
-    alarms: Whole  # that confirm a fault
-    window: Whole  # samples among which they count
-    latch: Flag
-    clean_time: Whole  # ns
-    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
-
-
-@record
 class Decision:
     """What is declared, and the alarms of the last window."""
 
@@ -520,9 +494,24 @@ class PathSettings:
 
     n: Whole  # channels
     sensors: Sensors
-    health: HealthSettings
-    decision: DecisionSettings
+    units: Whole
+    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
+    # Of the checks:
+    max_rate: Channels  # rad/s
+    non_finite_time: Whole  # ns
+    stuck_time: Whole  # ns; 0: never stuck
+    frozen_time: Whole  # ns; 0: never frozen
+    stale_time: Whole  # ns
+    recovery_time: Whole  # ns
+    # When a fault is declared, and whether it is forgiven:
+    by_evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
+    alarms: Whole  # that confirm a fault
+    window: Whole  # samples among which they count
+    latch: Flag
+    clean_time: Whole  # ns
+    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
     return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
+    # Of estimate and fusion:
     needs_acceleration: Flag
     publish_under_doubt: Flag  # a rate of channels under doubt, where they cannot be left out
     estimates: Flag  # the detector estimates the errors of the sensors
@@ -532,8 +521,6 @@ class PathSettings:
     prior: Channels  # odds that a channel is faulty unnoticed
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
     learned: Channels  # of one averaged at the start, standard deviation, rad/s
-    units: Whole
-    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
 
 
 @record

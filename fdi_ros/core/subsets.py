@@ -29,7 +29,7 @@ from fdi_ros.core.records import (
 )
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Array, Mask
+from fdi_ros.model.samples import MAX_RATE, Array, Mask
 
 MIN_SPARE_RATIO = 0.1
 """Channels under suspicion are left out as long as the rest measures its worst axis at least a tenth as well as its
@@ -223,8 +223,6 @@ def note_known(acceleration: Acceleration, oldest: int) -> None:
 # (`fdi_ros.detectors.base`).
 
 
-LARGEST_RATE = 1e6
-"""rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
 UNPREPARED, REFUSED = -1, -2
 """Instead of a row: constants for these channels were not prepared yet; the method cannot run on them."""
 
@@ -268,7 +266,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
+            present.z[k] = min(max(z[i], -MAX_RATE), MAX_RATE) if math.isfinite(z[i]) else 0.0
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0
@@ -327,7 +325,6 @@ def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> Non
 UNKNOWN_RATE = 1e-6
 """k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no
 division by zero."""
-TINY = 1e-300
 
 
 @compiled
@@ -340,7 +337,8 @@ def factorise(a: Array, size: int, factor: Array) -> float:
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i == j:
-                factor[i, i] = math.sqrt(max(total, TINY))
+                # Rounding may leave less than zero of a singular matrix.
+                factor[i, i] = math.sqrt(max(total, 1e-300))
                 log += 2.0 * math.log(factor[i, i])
             else:
                 factor[i, j] = total / factor[j, j]
@@ -371,17 +369,6 @@ def invert(a: Array, size: int, out: Array) -> float:
 
 
 @compiled
-def list_channels(parity: Parity, n: int, mask: int) -> int:
-    """List the channels of a set in ``parity.place``; return how many."""
-    count = 0
-    for i in range(n):
-        if mask >> i & 1:
-            parity.place[count] = i
-            count += 1
-    return count
-
-
-@compiled
 def compute_weights(parity: Parity, n: int, mask: int, variance: Array) -> None:
     """W of independent errors of the given variances (n,), (rad/s)^2."""
     for i in range(n):
@@ -394,10 +381,13 @@ def compute_weights(parity: Parity, n: int, mask: int, variance: Array) -> None:
 @compiled
 def compute_joint_weights(parity: Parity, n: int, mask: int, covariance: Array) -> None:
     """W of errors of the given covariance (n, n), (rad/s)^2."""
-    count = list_channels(parity, n, mask)
-    for p in range(count):
-        for q in range(p + 1):
-            parity.information[p, q] = covariance[parity.place[p], parity.place[q]]
+    count = 0
+    for i in range(n):
+        if mask >> i & 1:
+            parity.place[count] = i
+            count += 1
+            for q in range(count):
+                parity.information[count - 1, q] = covariance[i, parity.place[q]]
     invert(parity.information, count, parity.weight)
     for p in range(count):
         for q in range(count):

@@ -169,7 +169,7 @@ class Detector(ABC):
         ----------
         z
             Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A finite value beyond
-            `LARGEST_RATE` counts as that.
+            `MAX_RATE` counts as that.
         acceleration
             Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing term; None is zero.
 

@@ -23,14 +23,10 @@ from fdi_ros.system.text import html_table
 
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
-SAME_DIRECTION = 0.999
-"""Above this |rho| two channels have the same parity direction for every practical purpose."""
-ROUNDING = 1e-9
-"""Relative size of what is rounding: double precision leaves 1e-16 of values, which products of matrices multiply."""
-MIN_SINGULAR_RATIO = 0.02
-"""Axes whose smallest singular value is below this share of the largest do not span three dimensions."""
-MIN_SENSITIVITY = 0.03
-"""sqrt(S_ii) below which a fault of channel i does not reach the parity vector."""
+SAME_DIRECTION = 0.999  # |rho| above which two channels have one parity direction for every practical purpose
+ROUNDING = 1e-9  # relative: double precision leaves 1e-16 of values, which products of matrices multiply
+MIN_SINGULAR_RATIO = 0.02  # axes whose smallest singular value is a smaller share of the largest do not span space
+MIN_SENSITIVITY = 0.03  # sqrt(S_ii) below which a fault of channel i does not reach the parity vector
 
 
 def spans_space(axes: Array) -> bool:
@@ -201,18 +197,9 @@ class Geometry:
         return float(np.sqrt(np.trace(self.covariance())))
 
     def subset(self, mask: ArrayLike) -> Geometry:
-        """Geometry of the channels marked in mask (n,) bool.
-
-        Raises
-        ------
-        GeometryError
-            If fewer than 4 channels are left or they do not span three dimensions.
-        """
+        """Geometry of the channels marked in mask (n,) bool; `GeometryError` if they are too few, or in a plane."""
         kept = np.flatnonzero(np.asarray(mask, dtype=bool))
-        # Units are told by their names, which stay the same.
-        geometry = Geometry(self.axes[kept], [self.channel_names[i] for i in kept])
-        geometry.unit_of = tuple(self.unit_of[i] for i in kept)
-        return geometry
+        return Geometry(self.axes[kept], *([names[i] for i in kept] for names in (self.channel_names, self.unit_of)))
 
 
 def _check_axes(axes: Array) -> None:
@@ -247,14 +234,11 @@ def _rotation(mount: ArrayLike, index: int) -> Array:
     return rotation
 
 
-PARALLEL = 0.985
-"""Two channels measure the same axis from this cosine of the angle between them on: 10 deg."""
-_AXES = "xyz"
-_FEW = 3
-"""Names that are told one by one; of more it is said how many they are, or which few are not among them."""
-
-
 # Names for sets ------------------------------------------------------------------------------------------------------
+
+
+PARALLEL = 0.985  # cosine of the angle from which on two channels measure the same axis: 10 deg
+_FEW = 3  # names that are told one by one; of more it is said how many they are, or which few are not among them
 
 
 def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
@@ -308,7 +292,7 @@ def axis_words(geometry: Geometry, channel: int) -> str:
     axis = geometry.axes[channel] / np.linalg.norm(geometry.axes[channel])
     largest = int(np.abs(axis).argmax())
     if abs(axis[largest]) >= PARALLEL:
-        return f"{'-' if axis[largest] < 0 else ''}{_AXES[largest]}"
+        return f"{'-' if axis[largest] < 0 else ''}{'xyz'[largest]}"
     return " ".join(f"{value:.2f}" for value in axis)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
+from fdi_ros.model.geometry import MIN_SENSITIVITY, ROUNDING, Geometry
 from fdi_ros.model.samples import Array
 
 
@@ -74,13 +74,7 @@ class NoiseModel:
         return not (self.scale_std.any() or self.timing_std.any())
 
     def for_channels(self, n: int) -> NoiseModel:
-        """Return the same model with one value per channel.
-
-        Raises
-        ------
-        ConfigError
-            If a value is given per channel for another number of channels than n.
-        """
+        """Return the same model with one value per channel; `ConfigError` if one has them for another number than n."""
         return NoiseModel(**{name: _spread(name, v, n) for name, v in vars(self).items() if v is not None})
 
     def subset(self, mask: ArrayLike) -> NoiseModel:
@@ -92,14 +86,7 @@ class NoiseModel:
     def variance(self, geometry: Geometry, rate: Array, acceleration: Array | None = None) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.
 
-        Parameters
-        ----------
-        geometry
-            The channels' axes.
-        rate
-            Body rate, (N, 3) rad/s.
-        acceleration
-            Body angular acceleration, (N, 3) rad/s^2; None is zero.
+        ``rate``: of the body, (N, 3) rad/s; ``acceleration``: angular, (N, 3) rad/s^2, None is zero.
         """
         total = (rate @ geometry.axes.T * self.scale_std) ** 2 + self.noise_std**2
         if acceleration is not None:
@@ -125,8 +112,7 @@ def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above
     return array
 
 
-MUCH_NOISIER = 3.0
-"""Times the noise of every channel of other units; vibration of the body, however mounted, makes up to sqrt(3)."""
+MUCH_NOISIER = 3.0  # times all channels of other units; vibration of the body, however mounted, makes up to sqrt(3)
 
 
 def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int, float]]:
@@ -166,34 +152,20 @@ DEFAULT_PROBABILITY = 1e-6  # per sample
 DEFAULT_RUN_LENGTH, MIN_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 2.0, 1e15
 """Samples; the default is one false alarm in 1000 hours at 100 Hz."""
 OPTIONS = ("run_length", "false_alarm_probability", "false_alarms_per_hour", "sample_rate")
-"""Names of its fields among the options of a detector."""
+"""Of a detector, in which `FalseAlarmRate` is given."""
 
 
 @dataclass(frozen=True)
 class FalseAlarmRate:
     """A false-alarm rate as it is asked for; stated in no way, each reading has its default.
 
-    Parameters
-    ----------
-    probability
-        Per sample, 0 to 1, both excluded.
-    per_hour
-        Expected false alarms per hour, > 0; needs the sample rate.
-    run_length
-        Mean samples to a false alarm.
-    sample_rate
-        Hz, > 0.
-
-    Raises
-    ------
-    ConfigError
-        If it is stated in two ways, or a value is out of its range.
+    `ConfigError` if it is stated in two ways, or a value is out of its range.
     """
 
-    probability: float | None = None
-    per_hour: float | None = None
-    run_length: float | None = None
-    sample_rate: float | None = None
+    probability: float | None = None  # per sample, between 0 and 1
+    per_hour: float | None = None  # expected false alarms, > 0; needs the sample rate
+    run_length: float | None = None  # mean samples to a false alarm
+    sample_rate: float | None = None  # Hz, > 0
 
     def __post_init__(self) -> None:
         given = [name for name, value in self._named().items() if value is not None and name != "sample_rate"]
@@ -206,10 +178,7 @@ class FalseAlarmRate:
                 raise ConfigError(f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {self.sample_rate}")
 
     def per_sample(self) -> float:
-        """Probability of a false alarm in one sample; `DEFAULT_PROBABILITY` if nothing is stated.
-
-        `ConfigError` if it is not between 0 and 1.
-        """
+        """Probability of a false alarm in one sample; `ConfigError` if it is not between 0 and 1."""
         probability = DEFAULT_PROBABILITY if self.probability is None else self.probability
         if self.per_hour is not None and self.sample_rate is not None:
             probability = self.per_hour / (3600.0 * self.sample_rate)
@@ -220,10 +189,7 @@ class FalseAlarmRate:
         return probability
 
     def mean_run_length(self) -> float:
-        """Mean samples to a false alarm; `DEFAULT_RUN_LENGTH` if nothing is stated.
-
-        `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`.
-        """
+        """Mean samples to a false alarm; `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`."""
         samples = DEFAULT_RUN_LENGTH if self.run_length is None else self.run_length
         if self.per_hour is not None or self.probability is not None:
             samples = 1 / self.per_sample()
@@ -282,52 +248,47 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
     Above, over samples drawn beyond the threshold along each direction in turn (Naiman and Priebe 2001), which keeps
     its relative accuracy far into the tail.
     """
-    unique = _distinct(directions)
-    m = unique.shape[1]
-    tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
+    kept: list[int] = []
+    for i, direction in enumerate(directions):
+        # Twins but for rounding count once.
+        if all(abs(direction @ directions[j]) < 1 - ROUNDING for j in kept):
+            kept.append(i)
+    unique = directions[kept]
+    tail = _sphere_tail(unique) if unique.shape[1] <= 3 else _union_tail(unique)
     bonferroni = normal_isf(probability / (2 * len(unique)))
     return solve_log(tail, probability, bonferroni)
 
 
-def _distinct(directions: Array) -> Array:
-    kept: list[int] = []
-    for i, direction in enumerate(directions):
-        if all(abs(direction @ directions[j]) < 1 - 1e-9 for j in kept):
-            kept.append(i)
-    return directions[kept]
-
-
 def _sphere_tail(directions: Array) -> Callable[[float], float]:
-    points, weights = half_sphere(directions.shape[1])
+    points, weights = _half_sphere(directions.shape[1])
     largest = np.abs(points @ directions.T).max(axis=1)
     inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
     return lambda t: float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
 
 
-def half_sphere(m: int, circle: int = 360, around: int = 128, heights: int = 48) -> tuple[Array, Array]:
+def _half_sphere(m: int) -> tuple[Array, Array]:
     """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
 
-    In a plane there are `circle` of them; in space `around` at each of the heights, which are those of Gauss and
-    Legendre.
+    In a plane there are 360 of them; in space 128 at each of 48 heights, which are those of Gauss and Legendre.
     """
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
     if m == 2:
-        angle = np.pi * (np.arange(circle) + 0.5) / circle
-        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(circle, 1 / circle)
-    nodes, weights = np.polynomial.legendre.leggauss(heights)
-    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(around) + 0.5) / around
-    radius, level = np.sqrt(1 - height**2), np.ones(around)
-    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, level)]
-    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / around, around)
+        angle = np.pi * (np.arange(360) + 0.5) / 360
+        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(360, 1 / 360)
+    nodes, weights = np.polynomial.legendre.leggauss(48)
+    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(128) + 0.5) / 128
+    radius = np.sqrt(1 - height**2)
+    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, np.ones(128))]
+    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / 128, 128)
 
 
-def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], float]:
+def _union_tail(directions: Array) -> Callable[[float], float]:
     # Seeded once: the threshold is a function of the geometry, the same in every run.
     rng = np.random.default_rng(20190101)
     n, m = directions.shape
     # The more directions share in the estimate, the fewer draws each needs: the cost grows with n squared, not cubed.
-    draws = min(most_draws, 16 * most_draws // n)
+    draws = min(4096, 16 * 4096 // n)
     white = rng.standard_normal((draws, m)) @ directions.T
     log_levels = np.log((rng.permutation(draws) + 0.5) / draws)
     nodes = np.linspace(log_levels.min(), 0.0, 257)
@@ -366,8 +327,7 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
 
 
 DETECTION = 0.99  # probability with which the smallest detectable error is seen in one sample
-IN_PLANE = 0.1
-"""Directions in parity space whose third singular value is below are in one plane: mounts are known no better."""
+IN_PLANE = 0.1  # third singular value below which directions are in one plane: mounts are known no better
 MOST_SETS = 4  # sets of channels that are listed
 
 

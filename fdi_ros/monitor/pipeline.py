@@ -19,7 +19,7 @@ from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits, restart_bias
 from fdi_ros.core.decision import REASONS, RETURN_MEAN, ChannelState, Reason, clear_declarations
 from fdi_ros.core.fusion import update_level
-from fdi_ros.core.path import begin_bias, run
+from fdi_ros.core.path import Path, begin_bias, run
 from fdi_ros.core.records import Core, EventRow, OutputRow, Sample
 from fdi_ros.core.subsets import (
     describe_sensors,
@@ -146,7 +146,7 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     if not detector.takes_any:
         # What another detector had found of the sensors is taken off no longer.
         core["estimate"], core["correction"] = 0, 0.0
-    settings["decision"]["evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
+    settings["by_evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
     settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
 
@@ -162,17 +162,16 @@ def _fill_settings(settings: Any, config: Config, geometry: Geometry, noise: Noi
     settings["reach"] = normal_isf(integrity.risk / 2) if integrity.risk > 0 else 0.0
     settings["units"] = len(geometry.units)
     settings["members"][: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
-    limits, health = settings["health"], config.health
-    limits["max_rate"][:n] = health.max_rate
-    limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
-    limits["stuck_time"] = _nanoseconds(health.stuck_time)
-    limits["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
-    limits["stale_time"] = _nanoseconds(health.stale_timeout)
-    limits["recovery_time"] = _nanoseconds(health.range_recovery_time)
-    limits, decision = settings["decision"], config.decision
-    limits["alarms"], limits["window"] = decision.confirm_alarms, decision.confirm_window
-    limits["latch"], limits["clean_time"] = decision.latch, _nanoseconds(decision.clean_time)
-    limits["mean_limit"][:n] = RETURN_MEAN * noise.noise_std
+    health, decision = config.health, config.decision
+    settings["max_rate"][:n] = health.max_rate
+    settings["non_finite_time"] = _nanoseconds(health.non_finite_time)
+    settings["stuck_time"] = _nanoseconds(health.stuck_time)
+    settings["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
+    settings["stale_time"] = _nanoseconds(health.stale_timeout)
+    settings["recovery_time"] = _nanoseconds(health.range_recovery_time)
+    settings["alarms"], settings["window"] = decision.confirm_alarms, decision.confirm_window
+    settings["latch"], settings["clean_time"] = decision.latch, _nanoseconds(decision.clean_time)
+    settings["mean_limit"][:n] = RETURN_MEAN * noise.noise_std
 
 
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
@@ -340,7 +339,7 @@ class Pipeline:
             core["copies"]["found"] = False
             clear_declarations(self.core)
             self.detector.reset()
-            begin_bias(core, self.geometry.n)
+            begin_bias(core)
         if core["now"]["waiting"]:
             self.detector.prepare(int(core["now"]["input_mask"]))
         if core["wanted"]:
@@ -373,10 +372,7 @@ class Pipeline:
         elif before is not None:
             detector.reset()
         self.detector = detector
-        self.path: tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]] = (
-            *(self.core, detector.bank, detector.memory, self.subsets),
-        )
-        """What the sample path works on: the monitor, the detector and its memory, the sets of channels."""
+        self.path: Path = (self.core, detector.bank, detector.memory, self.subsets)
         self.core["excluded"] = mask_of(np.flatnonzero(excluded))
         self.core["now"]["waiting"] = False
         suit_detector(self.core, config, detector)
@@ -391,7 +387,7 @@ class Pipeline:
         events: list[Event] = []
         first = row = 0
         while row < len(rows):
-            row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
+            row, count, waits = run(self.path, samples, row, rows, self._events, stop)
             if count:
                 self._events["row"][:count] -= first
                 events += events_of(self._events[:count])

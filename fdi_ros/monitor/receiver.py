@@ -21,7 +21,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, are_parted, is_live, new_aligner
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.health import copies_among
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
+from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import MORE, NEVER, process
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
@@ -120,8 +120,8 @@ class Receiver:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
         self._detector = self.pipeline.detector
         messages = self.messages[FUSED], self.messages[INTEGRITY]
-        self._records = (*self.pipeline.path, *(self.aligner, self.live, self._events), *messages)
-        self._process: Callable[[], int] = partial(process, *self._records)
+        self._records = (self.aligner, self.live, self._events, *messages)
+        self._process: Callable[[], int] = partial(process, self.pipeline.path, *self._records)
         if others := [output for output in self.messages if output not in (FUSED, INTEGRITY)]:
             self._process = partial(self._process_and_fill, self._process, others)
 
@@ -196,14 +196,15 @@ class Receiver:
 
     def warm(self, kind: Source | type[Source]) -> None:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
+        path: Any = tuple(one.copy() for one in self.pipeline.path)
         aside: Any = tuple(one.copy() for one in self._records)
         with reported("the way from message to message"):
             kind.receive(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
-            process(*aside)
-            self.encoder.fill(INTEGRITY, aside[0][0]["last"])
+            process(path, *aside)
+            self.encoder.fill(INTEGRITY, path[0][0]["last"])
             is_live(self.aligner[0], 0)
             are_parted(self.aligner[0])
-            clear_declarations(aside[0])
+            clear_declarations(path[0])
 
 
 _FEW = 5  # channels for a method that does not take six
@@ -237,7 +238,6 @@ def warm_path() -> None:
     for kind in SOURCES.values():
         receiver.warm(kind)
         warm_codec(kind)
-    ChannelsTemplate(1).fill([0.0])
     ImuTemplate("").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
 
 

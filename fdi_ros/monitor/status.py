@@ -306,7 +306,7 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     unit, now = mask_of(channels), core["now"]
     seconds = float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max()) / 1e9
     is_old = int(now["repeated"]) & unit == unit and not now["all_repeat"]
-    return seconds if is_old and seconds >= core["settings"]["health"]["stuck_time"] / 1e9 > 0 else 0.0
+    return seconds if is_old and seconds >= core["settings"]["stuck_time"] / 1e9 > 0 else 0.0
 
 
 def _errors(detector: Detector, begun: bool) -> tuple[ErrorStatus, ...]:

@@ -25,7 +25,7 @@ from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.records import Core
 from fdi_ros.detectors.papers.single_fault import judge_sums
 core = allocate(Core)
-core["settings"]["n"], core["settings"]["decision"]["window"] = 6, 8
+core["settings"]["n"], core["settings"]["window"] = 6, 8
 core["decision"]["faulty"] = core["decision"]["ambiguous"] = 5
 with reported("it"):
     clear_declarations(core)

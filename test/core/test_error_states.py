@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate
 from fdi_ros.core.alignment import restamp
-from fdi_ros.core.records import DelayBuffer, Parity
+from fdi_ros.core.records import DelayBuffer, Parity, PathSettings, Sample
 from fdi_ros.core.subsets import compute_joint_weights, eliminate_rate
 from fdi_ros.estimator.error_states import (
     MAX_STATES,
@@ -141,10 +141,11 @@ ALL = 0b111111
 
 def restamped(late, samples):
     """Channels and values (6,) that two units of three channels are given, of stamps, values and what is plain."""
-    line, out, members = allocate(DelayBuffer)[0], np.zeros(MAX_CHANNELS), np.array([0b111, 0b111000, 0, 0])
-    for stamp, values, plain in samples:
-        full = np.concatenate([values, np.zeros(MAX_CHANNELS - 6)])
-        found = restamp(line, 6, 2, members, np.array([*late, 0.0, 0.0]), stamp, full, ALL, plain, out)
+    line, sample, out = allocate(DelayBuffer)[0], allocate(Sample)[0], np.zeros(MAX_CHANNELS)
+    config = allocate(PathSettings)[0]
+    config["n"], config["units"], config["members"] = 6, 2, [0b111, 0b111000, 0, 0]
+    for sample["stamp"], sample["z"][:6], plain in samples:
+        found = restamp(line, config, np.array([*late, 0.0, 0.0]), sample, ALL, plain, out)
         yield found, out[:6].copy()
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.decision import WHY, decide
-from fdi_ros.core.records import Decision, DecisionSettings, Evidence
+from fdi_ros.core.records import Decision, Evidence, PathSettings
 from fdi_ros.core.subsets import is_in, mask_of
 
 N = 5
@@ -22,8 +22,14 @@ class Decider:
     """The decision, told of one sample after the other."""
 
     def __init__(self, alarms=4, window=8, latch=True, clean_time=10):
-        self.limits, self.own, self.seen = allocate(DecisionSettings), allocate(Decision), allocate(Evidence)
-        for name, value in (("alarms", alarms), ("window", window), ("latch", latch), ("clean_time", clean_time)):
+        self.limits, self.own, self.seen = allocate(PathSettings), allocate(Decision), allocate(Evidence)
+        for name, value in (
+            ("n", N),
+            ("alarms", alarms),
+            ("window", window),
+            ("latch", latch),
+            ("clean_time", clean_time),
+        ):
             self.limits[name] = value
         self.limits["mean_limit"] = 0.5
         self.stamp = 0
@@ -34,7 +40,7 @@ class Decider:
         told = {"suspected": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
         for name in self.seen.dtype.names:
             self.seen[name] = {**told, "stamp": self.stamp, **more}.get(name, 0)
-        return decide(self.limits[0], self.own[0], N, self.seen[0])
+        return decide(self.limits[0], self.own[0], self.seen[0])
 
     def channels(self, name):
         return {i for i in range(N) if is_in(i, int(self.own[name][0]))}
