@@ -194,13 +194,13 @@ class Followed:
         self.outcome = Outcome(fault.channel, struck, fault.kind.name, fault.size, fault.start, finite(fault.stop))
         self.detected_stamp: int | None = None  # of the first declaration that names one of its channels, ns
         self._declared: dict[str, bool] = {}  # channels that were declared, and whether by themselves
-        self._false: set[str] = set()  # states in which healthy channels were declared while it lasted
+        self.false: set[str] = set()  # states in which healthy channels were declared while it lasted
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
         """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
-        return self._is_active(since) and not set(channels).isdisjoint(self.outcome.channels)
+        return self.is_active(since) and not set(channels).isdisjoint(self.outcome.channels)
 
-    def _is_active(self, since: float) -> bool:
+    def is_active(self, since: float) -> bool:
         """Whether what is declared at a time, s, may come of the fault."""
         return self.fault.start <= since < self.fault.stop + GRACE
 
@@ -219,18 +219,12 @@ class Followed:
             if not own.isolated and all(self._declared.get(name) for name in own.channels):
                 own = replace(own, isolated=True, isolated_at_s=at, isolation_delay_s=delay)
         self.outcome = replace(own, declared_channels=tuple(self._declared))
-        self._conclude()
 
-    def add_unexplained(self, change: StateChange) -> None:
-        """Take in a declaration that no fault explains."""
-        if self._is_active(change.at_s):
-            self._false.add(change.state)
-            self._conclude()
-
-    def _conclude(self) -> None:
-        own, false, found = self.outcome, self._false, self.detected_stamp is not None
-        kind = outcome_of("FAULTY" in false, own.isolated, found, "AMBIGUOUS" in false)
-        self.outcome = replace(own, outcome=kind.value)
+    def result(self) -> Outcome:
+        """Return what has become of it."""
+        false, found = self.false, self.detected_stamp is not None
+        kind = outcome_of("FAULTY" in false, self.outcome.isolated, found, "AMBIGUOUS" in false)
+        return replace(self.outcome, outcome=kind.value)
 
 
 class Evaluation:
@@ -242,7 +236,7 @@ class Evaluation:
         pairs = zip(injector.faults, injector.channels, strict=True)
         self.faults = [Followed(fault, channels, self.names) for fault, channels in pairs]
         self.events: list[StateChange] = []
-        self.samples = self._judged = self._with_rate = self._alarms = 0
+        self.samples, self._counts = 0, np.zeros(3, dtype=np.int64)  # those judged, with a rate, with an alarm
         self._unexplained: list[StateChange] = []
         self._unchecked = np.zeros(geometry.n)  # samples in which nothing checked the channel
         self._residuals = np.zeros((2, geometry.n))
@@ -264,9 +258,7 @@ class Evaluation:
             return
         judged = np.isfinite(output.threshold)
         self.samples += len(output)
-        self._with_rate += int(output.valid.sum())
-        self._judged += int(judged.sum())
-        self._alarms += int(output.alarm.sum())
+        self._counts += int(judged.sum()), int(output.valid.sum()), int(output.alarm.sum())
         self._unchecked += (_UNCHECKED[output.state] | ~judged[:, None]).sum(axis=0)
         fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
         self._residuals += (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0), fine.sum(axis=0)
@@ -342,8 +334,8 @@ class Evaluation:
             one.add(event.stamp, change)
         if not explaining and event.declares:
             self._unexplained.append(change)
-            for one in self.faults:
-                one.add_unexplained(change)
+            for one in [one for one in self.faults if one.is_active(time)]:
+                one.false.add(change.state)
 
     @property
     def unchecked(self) -> Array:
@@ -358,16 +350,17 @@ class Evaluation:
     def scores(self) -> Scores:
         """Return the figures."""
         first = self.last if self._first is None else self._first
+        judged, with_rate, alarms = self._counts.tolist()
         return Scores(
             samples=self.samples,
             duration_s=round((self.last - first) * 1e-9, 9),
-            faults=tuple(one.outcome for one in self.faults),
+            faults=tuple(one.result() for one in self.faults),
             declared=tuple(self._unexplained),
             fault_effect_rad_s=FaultEffect(*(_rms(*one) for one in self._effects.T.tolist())),
             start_s=0.0 if self._first is None else round(self.time(first), 9),
-            samples_judged=self._judged,
-            samples_with_rate=self._with_rate,
-            alarms=self._alarms,
+            samples_judged=judged,
+            samples_with_rate=with_rate,
+            alarms=alarms,
             events=tuple(self.events),
         )
 

@@ -109,13 +109,18 @@ class Report(Sink):
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
         scores, story, unit = summary.scores, summary.story, self._unit
-        common = {"shapes": _shades(summary), "marks": _marks(scores.faults, story.episodes)}
+        # Shaded are the times of injected faults, and those between stretches, where nothing is recorded.
+        times = [("fault", fault.start_s, fault.stop_s) for fault in scores.faults]
+        times += [("gap", begin, end) for begin, end in story.gaps]
+        shapes = [{"type": "rect", "kind": kind, "x0": begin, "x1": end} for kind, begin, end in times]
+        common = {"shapes": shapes, "marks": _marks(scores.faults, story.episodes)}
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         said = _autopilot_marks(summary)
         # Words are read best where little else is.
         quiet = {**common, "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)]}
         states = _timeline(self.names, self._first_states, summary, quiet)
         statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
+        levels = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
         stretches = stretch_words(story)
         spectrum = self._spectrum and self._spectrum.section(unit)
         sections = [
@@ -140,7 +145,7 @@ class Report(Sink):
                 "Protection level",
                 "Bound on the error of the fused rate with one undetected fault; gaps: none can be given.",
                 "",
-                [self._levels({**scale, **common})],
+                [_plot(levels, 220, f"protection level, {unit.name}", True, {**scale, **common})],
             ),
             *fault_sections(scores, unit),
             _channel_section(summary, unit),
@@ -187,10 +192,6 @@ class Report(Sink):
     def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
         line = {**_line(f"residual.{i}", self.names[i], colour_of(i), 1.1), "showlegend": False}
         return _plot([line], 112, f"{self.names[i]}, {self._unit.name}", i == len(self.names) - 1, layout)
-
-    def _levels(self, layout: Mapping[str, Any]) -> Figure:
-        lines = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
-        return _plot(lines, 220, f"protection level, {self._unit.name}", True, layout)
 
 
 def _channel_section(summary: Summary, unit: Unit) -> Section:
@@ -333,13 +334,6 @@ def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) 
                 parts.append((since, begin))
             since = end
     return [*parts, (since, until)] if since <= until else parts
-
-
-def _shades(summary: Summary) -> list[dict[str, Any]]:
-    """Shade the times of the injected faults, and those between the stretches, where nothing is recorded."""
-    times = [("fault", fault.start_s, fault.stop_s) for fault in summary.scores.faults]
-    times += [("gap", begin, end) for begin, end in summary.story.gaps]
-    return [{"type": "rect", "kind": kind, "x0": begin, "x1": end} for kind, begin, end in times]
 
 
 def _in_view(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[list[float]]:

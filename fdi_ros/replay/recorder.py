@@ -15,7 +15,7 @@ if the others are well.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -44,7 +44,6 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import SQUARED, finite
 
 Told = NDArray[np.uint8]  # states, of which those that say nothing are OK
-ReasonOf = Callable[[set[int]], str]
 S = ChannelState
 _DECLARED, _TOLD, _HIDING = (S.AMBIGUOUS, S.FAULTY), (S.AMBIGUOUS, S.FAULTY, S.STALE), (S.STALE, S.SUSPECT)
 """States that declare; that an episode may have; that hide what is declared."""
@@ -147,11 +146,9 @@ class Recorder:
         standing = [self._ended(one, None) for one in self._open]
         kept = [*self._episodes, *(one for one in standing if one is not None and (one.declares or one.start_s <= end))]
         parts = [*self._stretches, *([] if self._part is None else [self._part])]
-        stretches = [
-            Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))
-            for one in parts
-        ]
-        return Story(tuple(stretches), tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
+        times = [{name: round(getattr(one, name), 9) for name in ("start_s", "end_s", "watched_s")} for one in parts]
+        stretches = tuple(replace(one, **own) for one, own in zip(parts, times, strict=True))
+        return Story(stretches, tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
         """Return what the states (N, n) say; what hides nothing says nothing."""
@@ -185,8 +182,14 @@ class Recorder:
             return next((reasons[i] for i in sorted(members) if i in reasons), "")
 
         std = float(self._tail[self._row_before(at), 1])
+        # A set widens, narrows, or comes to a name.
         for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
-            self._follow_set(one, now, new, at, reason_of)
+            named, hiding = new[S.FAULTY] & one.members, {i for i in one.members if now[i] in _HIDING}
+            members = named or hiding | set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
+            if named:
+                one.kind, one.reason = S.FAULTY, reason_of(named) or one.reason
+            if named or (members and members != one.members):
+                self._step(one, members, at)
         taken = set().union(*(one.members for one in self._open if one.kind == S.FAULTY and one.since == at))
         for group in self._by_unit(new[S.FAULTY] - taken):
             self._begin(S.FAULTY, group, at, reason_of(group), std)
@@ -201,9 +204,8 @@ class Recorder:
                 self._step(lately[0], lately[0].members | group, lately[0].since)
             else:
                 self._begin(S.STALE, group, at, reason_of(group), std)
-        ended = [one for one in self._open if self._is_over(one, now)]
-        self._open = [one for one in self._open if one not in ended]
-        self._episodes_ended(ended, at)
+        self._episodes_ended([one for one in self._open if self._is_over(one, now)], at)
+        self._open = [one for one in self._open if not self._is_over(one, now)]
 
     def _holes(self, time: Array) -> Array:
         """Find the first samples after holes among those at times (N,), s; return their times."""
@@ -219,22 +221,6 @@ class Recorder:
     def _row_before(self, at: float) -> int:
         """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
         return max(0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1)
-
-    def _follow_set(
-        self, one: _Open, now: Told, new: Mapping[ChannelState, set[int]], at: float, reason_of: ReasonOf
-    ) -> None:
-        """Let a set widen, narrow, or come to a name."""
-        named = new[S.FAULTY] & one.members
-        kind, members = S.FAULTY, named
-        if not named:
-            kind, members = S.AMBIGUOUS, set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
-            members |= {i for i in one.members if now[i] in _HIDING}
-        if not members or (members == one.members and kind == one.kind):
-            return
-        one.kind = kind
-        if named:
-            one.reason = reason_of(named) or one.reason
-        self._step(one, members, at)
 
     def _begin(self, kind: ChannelState, members: set[int], at: float, reason: str, std: float) -> None:
         """Open an episode."""
@@ -309,11 +295,9 @@ class Recorder:
 
     def _apart(self, one: _Open) -> Apart | None:
         """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
-        if one.kind != S.AMBIGUOUS:
-            return None
         pairs = {key: batches.size(one.since) for key, batches in one.batches.items() if len(key) > 1}
         sizes = {pair: size for pair, size in pairs.items() if size is not None}
-        if not sizes:
+        if one.kind != S.AMBIGUOUS or not sizes:
             return None
         pair, size = max(sizes.items(), key=lambda item: abs(item[1].rad_s) / (item[1].std_rad_s or np.inf))
         if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
@@ -337,12 +321,10 @@ class Recorder:
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
-        for one in ended:
-            episode = self._ended(one, at)
-            if episode is not None and len(self._episodes) < MOST_EPISODES:
-                self._episodes.append(episode)
-            elif episode is not None:
-                self._more += 1
+        found = [episode for episode in (self._ended(one, at) for one in ended) if episode is not None]
+        room = MOST_EPISODES - len(self._episodes)
+        self._episodes += found[:room]
+        self._more += len(found[room:])
 
     def _ended(self, one: _Open, at: float | None) -> Episode | None:
         """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""

@@ -297,10 +297,14 @@ def sweep(
     if not baselines:
         raise FaultError(f"no fault can be tried: {subjects[0].refused}")
     times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
+    lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
     owned: list[tuple[Subject, tuple[Config, Onset, int, Plan]]] = []
     for one, baseline in baselines:
         _take_times(one, baseline, times, plan.within)
-        owned += [(one, job) for job in _jobs_of(one, plan)]
+        pipeline = monitor_of(one.config)
+        pipeline.restart()
+        onsets = onsets_of(pipeline, one.block, one.times, plan.within, lead)
+        owned += [(one, (one.config, onset, channel, plan)) for onset in onsets for channel in one.used]
     found: dict[int, list[Trial]] = {}
     for done, (k, trials) in enumerate(run_jobs(try_faults, [job for _, job in owned], workers, None), 1):
         found[k] = trials
@@ -357,12 +361,3 @@ def _take_times(one: Subject, baseline: Baseline, times: Sequence[float], within
         else:
             one.times += (at,)
             one.speeds += (float(np.nan_to_num(baseline.speed[rows]).max()),)
-
-
-def _jobs_of(one: Subject, plan: Plan) -> list[tuple[Config, Onset, int, Plan]]:
-    """Arguments of `try_faults`, for each time and channel."""
-    pipeline = monitor_of(one.config)
-    pipeline.restart()
-    lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
-    onsets = onsets_of(pipeline, one.block, one.times, plan.within, lead)
-    return [(one.config, onset, channel, plan) for onset in onsets for channel in one.used]
