@@ -243,20 +243,6 @@ def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
     assert "<li>300 samples without a fused rate; bias learned</li>" in text
 
 
-def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, pages):
-    for path in pages.values():
-        for figure in data_of(path.read_text())["figures"]:
-            if figure["data"][0]["type"] not in ("heatmap", "scatter3d"):
-                layout = figure["layout"]
-                assert layout["xaxis"]["title"]["text"], path
-                assert layout.get("rows") or layout["yaxis"]["title"]["text"], path
-    ticks = "f => [...f.querySelectorAll('text.tick[dy]')].map(t => t.textContent)"
-    labels = ask(browser, f"[...document.querySelectorAll('figure')].map({ticks})")
-    assert min(map(len, labels)) >= 2
-    residuals = labels[5:11]
-    assert all(one == residuals[0] for one in residuals)
-
-
 def test_a_plot_without_values_is_not_drawn_and_what_paper_leaves_out_is_said():
     empty = {"data": [{"type": "scatter", "x": [1], "y": [None]}], "layout": {}}
     drawn = {"data": [{"type": "scatter", "x": [1], "y": [2.0]}], "layout": {}}
