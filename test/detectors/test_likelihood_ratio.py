@@ -97,20 +97,6 @@ def test_suspects_are_the_channels_of_all_pairs_that_fit(seed, n, moving, size):
     assert verdict.isolated[0] == isolated
 
 
-def test_isolated_pair_is_the_true_one():
-    rng, rows = np.random.default_rng(51), 20_000
-    geometry = Geometry.cone(9)
-    z = rng.standard_normal((rows, 9))
-    z[:, 0] += 25
-    z[:, 2] -= 20
-    verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
-    pair = np.isin(np.arange(9), [0, 2])
-    right = (verdict.suspects == pair).all(axis=1) & verdict.isolated
-    assert right.mean() > 0.8
-    assert (verdict.isolated & ~right).sum() <= 2e-3 * rows
-    np.testing.assert_allclose(verdict.error[right][:, pair].mean(axis=0), [25, -20], atol=0.1)
-
-
 def test_five_channels_never_isolate_a_pair():
     geometry = Geometry.cone(5)
     z = np.random.default_rng(53).standard_normal((5000, 5))
