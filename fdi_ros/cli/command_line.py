@@ -373,33 +373,30 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def run_watch(arguments: argparse.Namespace) -> int:
-    """Show a running monitor until interrupted; without NumPy, unlike all other verbs."""
+    """Show a running monitor until interrupted; here it does not wait for what the other verbs import."""
     from fdi_ros.ros.watch import watch
 
     return watch(arguments.node, arguments.plain)
 
 
 def _failure(error: Exception) -> int:
-    """Say what has ended a verb; return the exit code."""
+    """Say what has ended a verb, in one line or as a defect; return the exit code."""
     if isinstance(error, FdiError):
-        return _refused(str(error))
-    if isinstance(error, MemoryError):
-        return _refused("there is not enough memory")
-    if isinstance(error, OSError):
+        words = str(error)
+    elif isinstance(error, MemoryError):
+        words = "there is not enough memory"
+    elif isinstance(error, OSError):
         where = f" {error.filename}" if error.filename else ""
-        return _refused(f"cannot read or write{where}: {error.strerror or error}")
-    with contextlib.suppress(OSError):
-        traceback.print_exception(error)
-        print(
-            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
-            " above and the command, to the maintainers named in its package.xml",
-            file=sys.stderr,
-        )
-    return DEFECT
-
-
-def _refused(words: str) -> int:
-    """Say what is wrong, in one line; return the exit code."""
+        words = f"cannot read or write{where}: {error.strerror or error}"
+    else:
+        with contextlib.suppress(OSError):
+            traceback.print_exception(error)
+            print(
+                f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the"
+                " lines above and the command, to the maintainers named in its package.xml",
+                file=sys.stderr,
+            )
+        return DEFECT
     try:
         sys.stdout.flush()
     except OSError:

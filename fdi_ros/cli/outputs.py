@@ -208,14 +208,15 @@ def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = 
         return
     if not path.absolute().parent.is_dir():
         raise BagError(f"cannot write {path}: there is no folder {path.absolute().parent}")
+    real = real_path(path)
     for source in sources:
-        if any(_within(real_path(path), part) for part in _parts(source)):
+        if any(part in (real, *real.parents) or real in part.parents for part in _parts(source)):
             raise BagError(f"cannot write {path}: it belongs to {source}, which is read")
     if not (path.exists() or path.is_symlink()):
         return
     if not force:
         raise BagError(f"{path} exists already; --force overwrites it")
-    if kept := _why_no_folder(path) if kind is Kind.FOLDER else _why_no_file(path, kind):
+    if kept := _what_stays(path, kind):
         raise BagError(f"{path} is {kept}; it is not overwritten even by --force")
 
 
@@ -230,32 +231,21 @@ def _parts(source: Path) -> list[Path]:
     return found
 
 
-def _within(path: Path, folder: Path) -> bool:
-    return path == folder or folder in path.parents or path in folder.parents
-
-
-def _why_no_folder(path: Path) -> str:
-    """Say what a folder is that is neither empty nor an output bag of before."""
-    if not path.is_dir():
-        return "no folder"
-    there = {child.name for child in path.iterdir()}
-    try:
-        files = {file.name for file in find_files(path, Damage())}
-        ours = is_made_by_fdi(path) and there == {"metadata.yaml", *files}
-    except BagError:
-        ours = False
-    ours = ours and all(child.is_file() for child in path.iterdir())
-    return "" if ours or not there else "a folder that holds more than a recording made by fdi"
-
-
-def _why_no_file(path: Path, kind: Kind) -> str:
-    """Say what a file is that is no former result of a kind."""
+def _what_stays(path: Path, kind: Kind) -> str:
+    """Say what lies at a path that is no former result of a kind; empty: there is one, or nothing."""
+    if kind is Kind.FOLDER:
+        if not path.is_dir():
+            return "no folder"
+        children = {child.name: child.is_file() for child in path.iterdir()}
+        with suppress(BagError):
+            complete = children.keys() == {"metadata.yaml", *(file.name for file in find_files(path, Damage()))}
+            if complete and is_made_by_fdi(path) and all(children.values()):
+                return ""
+        return "a folder that holds more than a recording made by fdi" if children else ""
     if path.is_dir():
         return "a folder"
-    if not path.exists():
-        return ""
     if not path.is_file():
-        return "no file"
+        return "no file" if path.exists() else ""
     with open_regular(path) as file:
         begin = file.read(_HEAD)
     return "no result of fdi of this kind" if begin and not re.match(kind.value, begin) else ""

@@ -24,7 +24,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any
 
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -52,15 +51,19 @@ def worker_count(workers: int | None) -> int:
     return count
 
 
+def _give_up(k: int, words: str) -> Any:
+    raise StudyError(f"a job was given up: {words}")
+
+
 def run_jobs(
-    function: Function, jobs: Sequence[Job], workers: int, cluster: str | None, lost: Lost | None = None
+    function: Function, jobs: Sequence[Job], workers: int, cluster: str | None, lost: Lost = _give_up
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs, the arguments of a function that workers can import, and give (index, result) as they are done.
 
     ``workers``: processes; 1: this one alone. ``cluster``: address of the scheduler of a Dask cluster that works
     instead, ``tcp://host:port`` or ``tls://host:port``. ``lost`` makes the result of a job that kills its worker again
     and again; without it such a job ends the run. In this process alone there is no worker to be killed. `StudyError`
-    if the address is none, the scheduler is not there or is lost, or workers die and ``lost`` is not given.
+    if the address is none, the scheduler is not there or is lost, or a job is given up and ``lost`` is not given.
     """
     if not jobs:
         return iter(())
@@ -69,14 +72,12 @@ def run_jobs(
             raise StudyError(f"scheduler is {cluster!r}, expected an address such as tcp://host:8786")
         return _on_cluster(function, jobs, cluster, lost)
     # A single job that may kill its process is kept out of this one.
-    if workers == 1 or (len(jobs) == 1 and lost is None):
+    if workers == 1 or (len(jobs) == 1 and lost is _give_up):
         return ((k, function(*job)) for k, job in enumerate(jobs))
     return _on_processes(function, jobs, min(workers, len(jobs)), lost)
 
 
-def _on_processes(
-    function: Function, jobs: Sequence[Job], workers: int, lost: Lost | None
-) -> Iterator[tuple[int, Any]]:
+def _on_processes(function: Function, jobs: Sequence[Job], workers: int, lost: Lost) -> Iterator[tuple[int, Any]]:
     """Run each job in a process that has no other: if it dies, the cause is known and no other job is run again.
 
     The processes of one pool would all be ended together.
@@ -103,12 +104,10 @@ def _on_processes(
                 idle.append(process)
                 try:
                     yield k, future.result()
-                except BrokenProcessPool as error:
+                except BrokenProcessPool:
                     deaths[k] += 1
                     if deaths[k] < MAX_DEATHS:
                         waiting.append(k)
-                    elif lost is None:
-                        raise StudyError(f"a job was given up: {_died_words(deaths[k])}") from error
                     else:
                         yield k, lost(k, _died_words(deaths[k]))
     finally:
@@ -136,12 +135,11 @@ def _follow(parent: int) -> None:
 
 # On a cluster ---------------------------------------------------------------------------------------------------------
 
-
 CONNECT_TIMEOUT = 10.0  # s
 TLS = "tls://"
 
 
-def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Lost | None) -> Iterator[tuple[int, Any]]:
+def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Lost) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
     require("--scheduler", ("dask", "distributed"))
     import distributed
@@ -154,19 +152,23 @@ def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Los
             futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_DEATHS): k for k in numbers}
             return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
 
+        def deaths(future: Any) -> int:
+            error = future.exception() if future.status == "error" else None
+            return error.allowed_failures + 1 if isinstance(error, distributed.KilledWorker) else 0
+
         suspects: list[int] = []
-        # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
-        again = ((k, future, True) for number in suspects for k, future in run([number]))
         try:
-            for k, future, alone in chain(((k, future, False) for k, future in run(range(len(jobs)))), again):
-                killed = future.status == "error" and isinstance(future.exception(), distributed.KilledWorker)
-                if not killed or lost is None:
-                    yield k, future.result()
-                elif alone:
-                    yield k, lost(k, _died_words(future.exception().allowed_failures + 1))
-                else:
+            for k, future in run(range(len(jobs))):
+                if deaths(future):
                     suspects.append(k)
-        except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
+                else:
+                    yield k, future.result()
+            # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
+            for number in suspects:
+                for k, future in run([number]):
+                    times = deaths(future)
+                    yield k, lost(k, _died_words(times)) if times else future.result()
+        except (distributed.client.FutureCancelledError, OSError) as error:
             raise StudyError(f"the cluster at {cluster} was lost: {_line(error)}") from error
 
 
