@@ -14,7 +14,6 @@ import yaml
 from test_layers import PACKAGE
 
 from fdi_ros import system
-from fdi_ros.errors import FdiError
 
 WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(system.BAGS)!r}))\n"
 """As if some libraries were not installed; where they are not, this changes nothing."""
@@ -103,15 +102,3 @@ def test_without_what_reads_recordings_the_player_says_what_brings_it():
     assert done.returncode == 2
     words = "reading recordings needs mcap, rosbags, lz4 and zstandard: pip install mcap rosbags lz4 zstandard"
     assert done.stderr == f"player_node: {words}\n"
-
-
-def test_the_command_is_one_that_pip_obeys_here(monkeypatch, tmp_path):
-    """The Python of Debian and Ubuntu refuses a plain pip install outside of an environment (PEP 668)."""
-    (tmp_path / "EXTERNALLY-MANAGED").write_text("")
-    monkeypatch.setattr(system.sysconfig, "get_path", lambda name: str(tmp_path))
-    cases = {sys.base_prefix: "pip install --user --break-system-packages one_x", "/env": "pip install one_x"}
-    for prefix, words in cases.items():
-        monkeypatch.setattr(system.sys, "prefix", prefix)
-        monkeypatch.setattr(system, "REQUIRED", ("one_x",))
-        with pytest.raises(FdiError, match=f"^who needs one_x: {words}$"):
-            system.require("who", ["one_x", "sys"])

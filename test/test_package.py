@@ -107,24 +107,6 @@ def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install,
     assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
 
 
-def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root, tmp_path):
-    """The clone's folder has the package's name: a folder on the path must not come before the install."""
-    clone = tmp_path / "fdi_ros"
-    clone.mkdir()
-    for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "resource", "fdi_ros", "launch", "config"):
-        copy = shutil.copytree if (root / name).is_dir() else shutil.copy
-        copy(root / name, clone / name, **({"ignore": NO_CACHE} if copy is shutil.copytree else {}))
-    # Without the network that the isolation of a build needs.
-    words = ["install", "-qq", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--prefix", tmp_path]
-    run([sys.executable, "-m", "pip", *map(str, words), "--ignore-installed", "--editable", str(clone)], root)
-    (site,) = tmp_path.glob("lib/python3*/site-packages")
-    # Only this install, and the folder that the clone lies in.
-    code = f"import site; site.addsitedir({str(site)!r}); import fdi_ros; print(fdi_ros.__version__, fdi_ros.__file__)"
-    told = run([sys.executable, "-S", "-E", "-c", code], tmp_path)
-    assert told.stderr == ""
-    assert told.stdout.split() == [fdi_ros.__version__, str(clone / "fdi_ros" / "__init__.py")]
-
-
 def test_one_version_everywhere_and_a_changelog_that_bloom_reads(root):
     """REP-132; what is not released yet stands under Forthcoming, which the release replaces by version and date."""
     manifest = ElementTree.parse(root / "package.xml").getroot()
