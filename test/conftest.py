@@ -16,7 +16,7 @@ from commands import Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
-LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_demo.py")
+LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_bench.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 

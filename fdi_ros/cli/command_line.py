@@ -374,8 +374,12 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def run_watch(arguments: argparse.Namespace) -> int:
     """Show a running monitor until interrupted; here it does not wait for what the other verbs import."""
-    from fdi_ros.ros.watch import watch
+    from fdi_ros.ros.process import NO_ROS
 
+    try:
+        from fdi_ros.ros.watch import watch
+    except ImportError as error:
+        raise FdiError(f"watch {NO_ROS} ({error})") from error
     return watch(arguments.node, arguments.plain)
 
 

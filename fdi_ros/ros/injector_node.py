@@ -109,7 +109,7 @@ class InjectorNode(CheckedNode):
         n = len(self._names)
         channels = self._source.channels_of(k, n)
         measured, values = self._source.parse(data, channels.stop - channels.start)
-        stamp = measured if self._source.stamped else self._now()
+        stamp = measured if self._source.stamped else self.get_clock().now().nanoseconds
         if self._origin is None:
             self._origin = stamp
         z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
@@ -121,9 +121,6 @@ class InjectorNode(CheckedNode):
         self._struck += lost or after != list(values)
         return None if lost else self._source.patch(data, after)
 
-    def _now(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
-
     def _on_switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         result = self.set_parameters([Parameter("enabled", value=on)])[0]
         response.success = result.successful
@@ -134,4 +131,4 @@ class InjectorNode(CheckedNode):
         level, words = (Level.WARN, self._injecting) if self._injecting else (Level.OK, "off")
         values = (("messages struck", str(self._struck)), ("malformed", str(self._malformed)))
         line = StatusLine(level, self.prefix + "injector", words, self.config.hardware_id, values)
-        self._diagnostics.publish(encode_diagnostics([line], self._now()))
+        self._diagnostics.publish(encode_diagnostics([line], self.get_clock().now().nanoseconds))

@@ -18,8 +18,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import ExternalShutdownException
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
@@ -67,7 +66,7 @@ class AutopilotNode(CheckedNode):
         topics = config.topics if config.has_units else [f"{name}/data_raw" for name in NAMES]
         outputs = [self.create_output(IMU, topic) for topic in topics]
         self._topics = [output.topic_name for output in outputs]
-        self._units = list(zip(outputs, map(ImuMessageBytes, names), strict=True))
+        self._units = list(zip(outputs, map(ImuTemplate, names), strict=True))
         self._reporter = Reporter(self._link, self._vehicle, names, self._topics)
         self._diagnostics = self.create_diagnostics()
         self._opened = self._valued = self._due = 0
@@ -83,7 +82,7 @@ class AutopilotNode(CheckedNode):
         self._monitor = f"{namespace}/{monitor}".lstrip("/")
         self._failover = None if params["failover"] == "off" else self._make_failover(params)
         if self._announcer is not None or self._sends_values or self._failover is not None:
-            few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+            few = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
         self.every(REPORT_PERIOD, self._report)
         self.get_logger().info(f"listening on {params['url']}")
@@ -141,8 +140,6 @@ class AutopilotNode(CheckedNode):
                     with guarded(self):
                         self._give_turn(executor)
             self._put_back()
-        except ExternalShutdownException:
-            return
         finally:
             executor.remove_node(self)
 
@@ -195,8 +192,8 @@ class AutopilotNode(CheckedNode):
                 # By the time of the system.
                 stamp = sample.stamp + self._ahead
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:
-                    output, message = self._units[sample.unit]
-                    output.publish(message.fill(stamp, sample))
+                    output, template = self._units[sample.unit]
+                    output.publish(encode_imu(template, stamp, sample))
 
     # The monitor --------------------------------------------------------------------------------------------------
 
@@ -260,17 +257,10 @@ class AutopilotNode(CheckedNode):
         super().destroy_node()
 
 
-class ImuMessageBytes:
-    """Serialised Imu messages of one unit, with acceleration."""
-
-    def __init__(self, frame_id: str) -> None:
-        template = ImuTemplate(frame_id)
-        self._data, self._at = bytearray(template.bytes.tobytes()), template.at
-
-    def fill(self, stamp: int, sample: ImuSample) -> bytes:
-        """Return the message of a sample, stamped in ns."""
-        struct.pack_into("<iI", self._data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
-        # Unknown is a covariance of zeros (REP-145); the template says that there is no acceleration.
-        values = (*sample.rate, *(0.0,) * 9, *sample.acceleration, 0.0)
-        struct.pack_into("<16d", self._data, self._at, *values)
-        return bytes(self._data)
+def encode_imu(template: ImuTemplate, stamp: int, sample: ImuSample) -> bytes:
+    """Return the Imu message of a sample, stamped in ns, with acceleration."""
+    struct.pack_into("<iI", template.bytes.data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
+    # Unknown is a covariance of zeros (REP-145); the template says that there is no acceleration.
+    values = (*sample.rate, *(0.0,) * 9, *sample.acceleration, 0.0)
+    struct.pack_into("<16d", template.bytes.data, template.at, *values)
+    return template.bytes.tobytes()

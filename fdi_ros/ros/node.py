@@ -23,7 +23,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -39,14 +39,14 @@ from fdi_ros.system.text import LINE, shown
 DEPTH = 256
 """Messages that a topic keeps, in and out, for a node that is busy for a moment: a quarter of a second at 1 kHz."""
 REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
-MOST_LINES = 20  # of one severity in one period: what anybody may cause with requests hides no declaration
-LOG_PERIOD = 1.0  # s
+MOST_LINES = 20  # of one severity in one such period: what anybody may cause with requests hides no declaration
 LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
 FLOOD_TIME = 5.0  # so long after a flood has begun it is not looked whether it is over, s
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
 MOST_PARAMETERS = 256  # in one request: several times what any node has
+OVERRIDABLE = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
 _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
     "depth": (),
@@ -112,7 +112,7 @@ class BoundedLog(logging.Handler):
     def begin_period(self) -> None:
         """Begin the next period if it is time, with a line on what was left out of the last one."""
         now = self._clock()
-        if now - self._since < LOG_PERIOD:
+        if now - self._since < REPORT_PERIOD:
             return
         left_out, self._since, self._left_out = self._left_out, now, 0
         self._lines.clear()
@@ -149,8 +149,8 @@ class InputQueue:
     def __init__(self, node: Node) -> None:
         self.subscriptions: dict[Subscription[Any], Callable[[bytes], None]] = {}  # each with what takes its messages
         self.flooded = False
-        self.taken = 0  # messages that came by an event of the executor in this turn
         self._node = node
+        self._taken = 0  # messages that came by an event of the executor in this turn
         self._waiting = 0  # events of messages that were drained
         self._until = 0.0  # until when it counts as flooded, steady time, s
 
@@ -158,15 +158,13 @@ class InputQueue:
         """Subscribe to the bytes of the messages of a topic."""
 
         def take_event(data: bytes) -> None:
-            self.taken += 1
+            self._taken += 1
             self.subscriptions[subscription](data)
 
         # A new QoS each time, as overrides are written into it.
-        qos = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
-        overriding = QoSOverridingOptions.with_default_policies()
-        subscription = self._node.create_subscription(
-            message_class(kind), topic, take_event, qos, qos_overriding_options=overriding, raw=True
-        )
+        qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        message = message_class(kind)
+        subscription = self._node.create_subscription(message, topic, take_event, qos, raw=True, **OVERRIDABLE)
         self.subscriptions[subscription] = take
 
     def close(self) -> None:
@@ -175,11 +173,8 @@ class InputQueue:
             self._node.destroy_subscription(one)
         self.subscriptions, self.flooded, self._waiting = {}, False, 0
 
-    def drain(self) -> int:
-        """Take what waits, in the order in which it arrived, and return how many messages that were.
-
-        What is not taken within `LONGEST`, or is more than two queues hold, stays for the next time.
-        """
+    def drain(self) -> None:
+        """Take what waits, in the order in which it arrived, for `LONGEST` at most, or what two queues hold."""
         takers = list(self.subscriptions.items())
         taken, end = 0, time.monotonic() + LONGEST
         heads = [_next(one) for one, _ in takers]
@@ -190,20 +185,18 @@ class InputQueue:
             taken += 1
             take(data)
         self._waiting += taken
-        return taken
 
-    def turn(self, now: float) -> None:
-        """Take what waits after a turn of an executor, at the steady time now, s, and see whether it is a flood."""
+    def turn(self) -> None:
+        """Take what waits after a turn of an EventsExecutor, and see whether it is a flood."""
         self.drain()
-        if self._waiting and not self.taken:
+        if self._waiting and not self._taken:
             # The turn has used up the event of a message that was drained, or was a timer's.
             self._waiting -= 1
-        self.taken = 0
+        self._taken, now = 0, time.monotonic()
         if not self.flooded and self._waiting > FLOOD:
             self.flooded, self._until = True, now + FLOOD_TIME
-            self._node.get_logger().warning(
-                "flooded with messages: inputs are polled while it lasts", throttle_duration_sec=10.0
-            )
+            words = "flooded with messages: inputs are polled while it lasts"
+            self._node.get_logger().warning(words, throttle_duration_sec=10.0)
         elif self.flooded and now >= self._until:
             self.flooded, self._waiting = False, 0
 
@@ -283,8 +276,7 @@ class CheckedNode(Node):
         They are handed over as bytes.
         """
         # A new QoS each time, as overrides are written into it.
-        qos = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
-        return self.create_publisher(message_class(kind), topic, qos, **options)
+        return self.create_publisher(message_class(kind), topic, QoSProfile(depth=DEPTH), **options)
 
     def create_diagnostics(self) -> Any:
         """Publish diagnostics; they are handed over as bytes."""

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -77,8 +77,6 @@ class PlayerNode(CheckedNode):
             while self._play_once(stop, spin) and self._loop:
                 self.log.info("the recording has ended: from its beginning")
                 spin(0.0)
-        except ExternalShutdownException:
-            return
         finally:
             executor.remove_node(self)
 

@@ -14,7 +14,6 @@ import importlib
 import re
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
@@ -56,13 +55,10 @@ def spin(node: Any, stop: Stop) -> None:
     flood of messages a SingleThreadedExecutor, which has no queue, takes over from the EventsExecutor.
     """
     import rclpy
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import SingleThreadedExecutor
 
-    try:
-        executor = make_executor(node)
-    except ExternalShutdownException:
-        return
-    single, flooded = isinstance(executor, SingleThreadedExecutor), False
+    executor, flooded = make_executor(node), False
+    single = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
     gc.freeze()
@@ -73,37 +69,26 @@ def spin(node: Any, stop: Stop) -> None:
                 if single:
                     node.inputs.drain()
                 else:
-                    node.inputs.turn(time.monotonic())
+                    node.inputs.turn()
                 if node.inputs.flooded != flooded:
                     flooded = not flooded
-                    executor = replace_executor(node, executor, flooded)
+                    executor.remove_node(node)
+                    # Nothing else empties its queue. What was announced to it, the next one finds itself.
+                    executor.shutdown()
+                    executor = _executor(node, events=not flooded)
                 node.keep_up()
-    except ExternalShutdownException:
-        return
     finally:
         executor.remove_node(node)
 
 
 @contextlib.contextmanager
 def guarded(node: Any) -> Iterator[None]:
-    """Log what is raised inside and go on, but for the end of ROS."""
-    from rclpy.executors import ExternalShutdownException
-
+    """Log what is raised inside, and go on."""
     try:
         yield
-    except ExternalShutdownException:
-        raise
     except Exception as error:
         words = f"left aside, as it cannot be worked: {type(error).__name__}: {' '.join(str(error).split())}"
         node.get_logger().error(words, throttle_duration_sec=1.0)
-
-
-def replace_executor(node: Any, executor: Any, flooded: bool) -> Any:
-    """Return the executor for a flood, or for after it; what was announced to the former one, this one finds itself."""
-    executor.remove_node(node)
-    # Nothing else empties its queue.
-    executor.shutdown()
-    return _executor(node, events=not flooded)
 
 
 def make_executor(node: Any, auto: str = "events") -> Any:

@@ -13,10 +13,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
@@ -26,7 +24,7 @@ from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
-from fdi_ros.ros.node import REPORT_PERIOD, BoundedLog, CheckedNode
+from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
 from fdi_ros.system.text import LINE, shown
 
 REMEMBERED = 4096  # samples whose latency is remembered
@@ -114,16 +112,13 @@ class InputTopic:
     def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
         self.topic = topic
         self._receiver, self._number = receiver, number
+        self._inlet = receiver.live["inlets"][0, number]
         self._name = receiver.source.names[number]
         self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._was_heard = self._was_unstamped = False
         self._sources = ""  # what is wrong with who publishes on it; empty: nothing
         self._rate, self._reported_at, self._reported_messages = 0.0, 0, 0
         self._reported_counts: dict[str, int] = {}
-
-    @property
-    def _inlet(self) -> Any:
-        return self._receiver.live["inlets"][0, self._number]
 
     @property
     def _received(self) -> int:
@@ -198,10 +193,8 @@ class Running:
 
     def __init__(self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None) -> None:
         self._node, self._state_file = node, state_file
-        overriding = QoSOverridingOptions.with_default_policies()
         self._outputs = {
-            output: node.create_output(output.topic.type, output.topic.name, qos_overriding_options=overriding)
-            for output in OUTPUTS
+            output: node.create_output(output.topic.type, output.topic.name, **OVERRIDABLE) for output in OUTPUTS
         }
         self._diagnostics = node.create_diagnostics()
         self._latencies: deque[int] = deque(maxlen=REMEMBERED)

@@ -23,8 +23,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from monitor.streams import swing as body_rate
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -35,8 +35,6 @@ from std_srvs.srv import Trigger
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.samples import Block
-from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import ChannelsSource, ImuSource
 
 ROOT = Path(__file__).parents[2]
@@ -58,8 +56,6 @@ TWO_IMUS = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced(
 )
 GEOMETRY = Geometry.from_triads(np.array(TWO_IMUS.imus.mounts).reshape(-1, 3, 3))
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
 PATIENCE = 60.0
 """How long something that must come is waited for, s: a machine that is busy with other things makes no test fail."""
 
@@ -72,6 +68,13 @@ def wait(until: Callable[[], object], seconds: float = PATIENCE) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+def rest(count: Callable[[], int]) -> None:
+    """Wait until nothing more comes."""
+    before = -1
+    while before != (before := count()):
+        time.sleep(0.3)
 
 
 def healthy(count: int, seed=0, size=0.5, rate=RATE, start=0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -89,22 +92,18 @@ def parameter_file(config: Config, folder: Path, **more: object) -> Path:
     return path
 
 
-def warmed(config: Config, before: int) -> Pipeline:
-    """A pipeline that has seen healthy samples up to a stamp, as the node's has."""
-    pipeline = Pipeline.from_config(config)
-    z = healthy(50, seed=99)[1]
-    pipeline.process(Block(before - 4_000_000 * np.arange(50, 0, -1), z))
-    return pipeline
-
-
 class Process:
-    """A node of ours in a process of its own."""
+    """A node of ours in a process of its own; in names of parameters two underscores stand for a dot."""
 
-    def __init__(self, name: str, *arguments: str) -> None:
+    def __init__(self, name: str, file: Path, *remaps: str, **parameters: object) -> None:
         self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1])
-        command = [sys.executable, "-m", "fdi_ros.ros.process", name, *arguments]
+        words = ["-m", "fdi_ros.ros.process", name, "--ros-args", "--params-file", str(file)]
+        words += [word for remap in remaps for word in ("-r", remap)]
+        for key, value in parameters.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            words += ["-p", f"{key.replace('__', '.')}:={text}"]
         with self.output.open("w") as output:
-            self.popen = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
+            self.popen = subprocess.Popen([sys.executable, *words], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
 
     def said(self) -> str:
         return self.output.read_text()
@@ -122,6 +121,18 @@ class Process:
         """Resident memory, MB."""
         pages = int(Path(f"/proc/{self.popen.pid}/statm").read_text().split()[1])
         return pages * 4096 / 1e6
+
+
+@contextlib.contextmanager
+def running(name: str, file: Path, *remaps: str, **parameters: object) -> Iterator[Process]:
+    """A node of ours that must end well when it is asked to."""
+    process = Process(name, file, *remaps, **parameters)
+    try:
+        yield process
+    finally:
+        code = process.end()
+    assert code == 0, process.said()
+    assert "Traceback" not in process.said()
 
 
 def assert_refused(name: str, starts: dict[str, str], *first: str) -> None:
@@ -169,20 +180,20 @@ class Listener(Node):
     def send_channels(self, values) -> None:
         self.outputs[0].publish(self._templates[1].fill(values))
 
-    def play(self, z: np.ndarray, triads=(0, 1), skew: int = 0, rate: float = RATE) -> np.ndarray:
-        """Publish samples of two IMUs at their pace, stamped with the time of now; the stamps."""
-        start, clock = time.monotonic(), time.time_ns()
-        stamps = clock + (np.arange(len(z)) * 1e9 / rate).astype(np.int64)
+    def play(self, z: np.ndarray, triads=(0, 1), skew: int = 0, start: int | None = None) -> np.ndarray:
+        """Publish samples of two IMUs at their pace, stamped with the time of now, or from a start on; the stamps."""
+        begun, start = time.monotonic(), time.time_ns() if start is None else start
+        stamps = start + (np.arange(len(z)) * 1e9 / RATE).astype(np.int64)
         for k, stamp in enumerate(stamps.tolist()):
-            time.sleep(max(0.0, start + k / rate - time.monotonic()))
+            time.sleep(max(0.0, begun + k / RATE - time.monotonic()))
             for j in triads:
                 self.send_imu(j, stamp + j * skew, z[k, 3 * j : 3 * j + 3].tolist())
         return stamps
 
-    def settle(self, seconds: float = PATIENCE) -> bool:
+    def settle(self) -> bool:
         """Feed healthy samples until the monitor has nothing against any channel."""
         begin = time.monotonic()
-        while (now := time.monotonic() - begin) < seconds:
+        while (now := time.monotonic() - begin) < PATIENCE:
             # One motion through all pauses, as of a vehicle: a delay is learned from it.
             last = self.play(healthy(25, int(1e3 * now), start=now)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
@@ -191,6 +202,12 @@ class Listener(Node):
                 return True
         print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
         return False
+
+    def calm(self) -> None:
+        """Have a monitor that has nothing against any channel, and forget what it said until then."""
+        assert self.settle()
+        time.sleep(0.1)
+        self.clear()
 
     def prime(self) -> None:
         """Publish a few samples at rest."""
@@ -218,6 +235,10 @@ class Listener(Node):
         """A figure of the last status of a name."""
         return {pair.key: pair.value for pair in self.status(name).values}[key]
 
+    def reports(self) -> list[dict[str, DiagnosticStatus]]:
+        """All statuses of each report, by name."""
+        return [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in list(self.diagnostics)]
+
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
         return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
@@ -230,39 +251,30 @@ class Listener(Node):
         print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
         return ""
 
-    def call(self, kind: type, service: str, request, seconds: float = PATIENCE):
+    def call(self, kind: type, service: str, **fields: object):
+        """What a service answers to a request with these fields."""
         client = self.create_client(kind, service)
-        assert client.wait_for_service(seconds), f"no service {service}"
-        future = client.call_async(request)
-        assert wait(future.done, seconds), f"no answer from {service}"
+        assert client.wait_for_service(PATIENCE), f"no service {service}"
+        future = client.call_async(kind.Request(**fields))
+        assert wait(future.done), f"no answer from {service}"
         self.destroy_client(client)
         return future.result()
 
     def trigger(self, service: str) -> Trigger.Response:
-        return self.call(Trigger, f"fdi_node/{service}", Trigger.Request())
+        return self.call(Trigger, f"fdi_node/{service}")
 
     def change(self, transition: int) -> bool:
         """Ask the monitor for a transition of its life cycle; whether it was done."""
-        request = ChangeState.Request(transition=Transition(id=transition))
-        return self.call(ChangeState, "fdi_node/change_state", request).success
+        return self.call(ChangeState, "fdi_node/change_state", transition=Transition(id=transition)).success
 
     def state(self) -> str:
         """State of the life cycle of the monitor."""
-        return self.call(GetState, "fdi_node/get_state", GetState.Request()).current_state.label
+        return self.call(GetState, "fdi_node/get_state").current_state.label
 
     def set(self, node: str = "fdi_node", **values: object):
         """Set parameters together; two underscores stand for a dot."""
         changes = [Parameter(name.replace("__", "."), value=value).to_parameter_msg() for name, value in values.items()]
-        request = SetParametersAtomically.Request(parameters=changes)
-        return self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
-
-    def get(self, name: str):
-        request = GetParameters.Request(names=[name])
-        return self.call(GetParameters, "fdi_node/get_parameters", request).values[0]
-
-    def described(self, name: str):
-        request = DescribeParameters.Request(names=[name])
-        return self.call(DescribeParameters, "fdi_node/describe_parameters", request).descriptors[0]
+        return self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", parameters=changes).result
 
 
 TRANSITIONS = {
@@ -286,12 +298,12 @@ def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
 
-    def spin() -> None:
-        with contextlib.suppress(ExternalShutdownException):
-            while not done.is_set():
-                executor.spin_once(timeout_sec=0.05)
-
     done = threading.Event()
+
+    def spin() -> None:
+        while not done.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
     thread = threading.Thread(target=spin, daemon=True)
     thread.start()
     try:
@@ -304,20 +316,14 @@ def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
 
 
 @contextlib.contextmanager
-def monitoring(config: Config, folder: Path, *arguments: str, prime=True, **parameters: object) -> Iterator[tuple]:
+def monitoring(config: Config, folder: Path, prime=True, **parameters: object) -> Iterator[tuple]:
     """The monitor in its own process, connected to a listener: (listener, process)."""
     kind = Imu if config.input == "imus" else Float64MultiArray
     file = parameter_file(config, folder, **parameters)
-    with listening(config.topics, kind) as listener:
-        process = Process("fdi_node", "--ros-args", "--params-file", str(file), *arguments)
-        try:
-            if parameters.get("autostart", True):
-                connect(listener, process, prime)
-            yield listener, process
-        finally:
-            code = process.end()
-        assert code == 0, process.said()
-        assert "Traceback" not in process.said()
+    with listening(config.topics, kind) as listener, running("fdi_node", file) as process:
+        if parameters.get("autostart", True):
+            connect(listener, process, prime)
+        yield listener, process
 
 
 def connect(listener: Listener, process: Process, prime: bool = True) -> None:

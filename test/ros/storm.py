@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms upon a monitor and its link to an autopilot, by python -m ros.storm KIND SECONDS SEED PORT.
+"""Storms upon a monitor and its link to an autopilot.
 
 `python benchmark/mavlink.py storms` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
@@ -10,29 +10,23 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import random
 import re
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions
 from mavlink.attack import KINDS as PACKETS
 from mavlink.attack import Attacker
 from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring
+from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -40,69 +34,56 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.settings import ALL_NODES, MONITOR
 from fdi_ros.core.messages import ImuTemplate
 
+KINDS = ("parameters", "services", "lifecycle", "links", "mavlink")
 STACK = ROOT / "config" / "px4.yaml"
 CONFIG = Config.from_file(STACK)
 NODES = ("fdi_node", "mavlink_node")
 
 OUTSTANDING = 8
 """Requests that wait for their answers: DDS keeps ten of a service."""
-LONGEST = 60.0
-"""An answer is waited for so long, s."""
 NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_values", "use_sim_time"]
 WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)
 WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
 
 
-class Storm(Node):
-    """Sends what one kind of storm is made of; port: of the link to the autopilot."""
+class Storm:
+    """Sends what one kind of storm is made of, by a listener that spins; port: of the link to the autopilot."""
 
-    def __init__(self, seed: int, port: int) -> None:
-        super().__init__(f"storm_{os.getpid()}")
-        self.draw = random.Random(seed)
-        self.attacker = Attacker(port, seed)
+    def __init__(self, listener: Listener, port: int, seed: int) -> None:
+        self.listener, self.draw, self.attacker = listener, random.Random(seed), Attacker(port, seed)
         self.sent = self.answered = 0
-        self._by_service: dict[str, Any] = {}
-        self._waiting: list[tuple[Any, float]] = []
-        """Requests without an answer, and until when one is waited for."""
-        self._turning = SingleThreadedExecutor()
-        self._turning.add_node(self)
+        self._clients: dict[str, Any] = {}
+        self._waiting: list[Any] = []
+        """Requests without an answer."""
 
-    def ask(self, kind: type, service: str, request: Any, node: str = NODES[0]) -> Any:
+    def rage(self, kind: str, seconds: float) -> None:
+        """Be a storm of a kind, and wait for all answers."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            getattr(self, f"send_{kind}")()
+        wait(lambda: not self._count_waiting())
+        while kind == "lifecycle" and (now := self.listener.state()) != "active":
+            self.listener.change({"unconfigured": 1, "inactive": 3}[now])
+        for client in self._clients.values():
+            self.listener.destroy_client(client)
+        self.attacker.close()
+
+    def ask(self, kind: type, service: str, request: Any, node: str = NODES[0]) -> None:
         """Send a request as soon as not too many wait."""
         service = f"/{node}/{service}"
-        if service not in self._by_service:
-            self._by_service[service] = self.create_client(kind, service)
-            assert self._by_service[service].wait_for_service(30.0), service
-        while len(self._waiting) >= OUTSTANDING:
-            self.turn()
-        future = self._by_service[service].call_async(request)
-        self._waiting.append((future, time.monotonic() + LONGEST))
+        if service not in self._clients:
+            self._clients[service] = self.listener.create_client(kind, service)
+            assert self._clients[service].wait_for_service(30.0), service
+        wait(lambda: self._count_waiting() < OUTSTANDING)
+        self._waiting.append(self._clients[service].call_async(request))
         self.sent += 1
-        self.turn(0.0)
-        return future
 
-    def turn(self, seconds: float = 0.05) -> None:
-        self._turning.spin_once(timeout_sec=seconds)
-        now = time.monotonic()
-        self.answered += sum(one.done() for one, _ in self._waiting)
-        self._waiting = [(one, until) for one, until in self._waiting if not one.done() and now < until]
-
-    def settle(self) -> None:
-        """Wait for all answers that may still come."""
-        while self._waiting:
-            self.turn()
-
-    def activate(self) -> None:
-        """Bring the monitor back to where it works."""
-        now = ""
-        while now != "active":
-            wanted = {"unconfigured": 1, "inactive": 3}.get(now, 0)
-            if wanted:
-                self.ask(ChangeState, "change_state", ChangeState.Request(transition=Transition(id=wanted)))
-            state = self.ask(GetState, "get_state", GetState.Request())
-            self.settle()
-            now = state.result().current_state.label
+    def _count_waiting(self) -> int:
+        left = [one for one in self._waiting if not one.done()]
+        self.answered += len(self._waiting) - len(left)
+        self._waiting = left
+        return len(left)
 
     # What storms are made of ------------------------------------------------------------------------------------------
 
@@ -166,7 +147,7 @@ class Storm(Node):
         """Publishers that come, say what is true, false, damaged or nothing, and go."""
         draw = self.draw
         topic = draw.choice(CONFIG.topics)
-        output = self.create_publisher(Imu, topic, DEEP)
+        output = self.listener.create_publisher(Imu, topic, DEEP)
         template = ImuTemplate("imu")
         kind = draw.choice(("true", "true", "noise", "damaged", "late", "flood"))
         for _ in range(draw.choice((0, 3, 100)) if kind != "flood" else 5000):
@@ -178,7 +159,7 @@ class Storm(Node):
             if kind != "flood":
                 time.sleep(0.002)
         self.answered = self.sent
-        self.destroy_publisher(output)
+        self.listener.destroy_publisher(output)
 
     def send_mavlink(self) -> None:
         """Packets of all kinds to the link."""
@@ -187,24 +168,6 @@ class Storm(Node):
             self.sent += self.attacker.burst(kind)
             time.sleep(0.02)
         self.answered = self.sent
-
-
-KINDS = ("parameters", "services", "lifecycle", "links", "mavlink")
-
-
-def rage(kind: str, seconds: float, seed: int, port: int) -> str:
-    """Be one storm; how many requests, messages or packets were sent, and how many requests answered."""
-    rclpy.init()
-    storm = Storm(seed, port)
-    act: Callable[[], None] = getattr(storm, f"send_{kind}")
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        act()
-    storm.settle()
-    sent, answered = storm.sent, storm.answered
-    if kind == "lifecycle":
-        storm.activate()
-    return f"{sent} {answered}"
 
 
 class Vehicle(NamedTuple):
@@ -230,30 +193,19 @@ def vehicle(folder: Path) -> Iterator[Vehicle]:
 
     with OverUdp(port, autopilot), monitoring(CONFIG, folder, prime=False) as (listener, monitor):
         listener.create_subscription(DiagnosticArray, "/diagnostics", hear, 100)
-        arguments = ("--params-file", str(STACK), "-p", f"url:=udpin:127.0.0.1:{port}")
-        link = Process("mavlink_node", "--ros-args", *arguments)
-        try:
+        with running("mavlink_node", STACK, url=f"udpin:127.0.0.1:{port}") as link:
             assert listener.says("monitor", "9 of 9 channels healthy")
             yield Vehicle(listener, monitor, link, port, reports)
-        finally:
-            code = link.end()
-        assert code == 0, link.said()
-        assert "Traceback" not in link.said()
 
 
 def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
     """Let one storm loose; what it cost."""
-    words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed), str(over.port)]
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     processes = {"monitor": over.monitor, "link": over.link}
     lines = {name: process.said().count("\n") for name, process in processes.items()}
-    begun = time.monotonic()
-    environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
+    begun, storm = time.monotonic(), Storm(over.listener, over.port, seed)
+    storm.rage(kind, seconds)
     end = time.monotonic()
-    sent, answered = map(int, done.stdout.split()[-2:])
-    told: dict[str, float] = {"sent": sent, "answered": answered}
+    told: dict[str, float] = {"sent": storm.sent, "answered": storm.answered}
     reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], "link": over.reports}
     for name, came in reports.items():
         times = [at for at in list(came) if begun - 2 <= at]
@@ -262,7 +214,3 @@ def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, fl
         told[f"{name}: lines of the log a second"] = (process.said().count("\n") - lines[name]) / (end - begun)
         told[f"{name}: memory, MB"] = process.memory()
     return told
-
-
-if __name__ == "__main__":
-    print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])))

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
-from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, wait
+from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -46,16 +46,20 @@ class Ears(Listener):
 
 
 @contextlib.contextmanager
-def linked(config: str, url: str, *arguments: str) -> Iterator[tuple[Ears, Process]]:
-    file = ROOT / "config" / f"{config}.yaml"
-    with listening(make=Ears) as ears:
-        process = Process("mavlink_node", "--ros-args", "--params-file", str(file), "-p", f"url:={url}", *arguments)
-        try:
-            yield ears, process
-        finally:
-            code = process.end()
-        assert code == 0, process.said()
-        assert "Traceback" not in process.said()
+def linked(stack: str, url: str, *remaps: str, **parameters: object) -> Iterator[tuple[Ears, Process]]:
+    """The node of a link, and what hears it."""
+    file = ROOT / "config" / f"{stack}.yaml"
+    with listening(make=Ears) as ears, running("mavlink_node", file, *remaps, url=url, **parameters) as process:
+        yield ears, process
+
+
+@contextlib.contextmanager
+def linked_over_udp(
+    *autopilots: Autopilot, remaps: tuple[str, ...] = (), **parameters: object
+) -> Iterator[tuple[Ears, Process]]:
+    port, stack = free_port(), autopilots[0].stack
+    with OverUdp(port, *autopilots), linked(stack, f"udpin:127.0.0.1:{port}", *remaps, **parameters) as pair:
+        yield pair
 
 
 def struck(autopilot: Autopilot, unit: int, axis: int) -> Callable[[], None]:
@@ -78,77 +82,68 @@ def boot() -> int:
 def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compiled) -> None:
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
     autopilot, other = (Autopilot("px4", system=system, boot=boot(), seed=system) for system in (2, 1))
-    strike, port = struck(autopilot, 1, 1), free_port()
-    words = ("-p", "named_values:=true", "-p", "mavlink_node:system_id:=2")
-    monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "px4.yaml"))
-    try:
-        with OverUdp(port, autopilot, other), linked("px4", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
-            assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
-            assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
-            assert not other.intervals
-            assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), process.said()
-            assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
-            # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
-            now = time.time_ns()
-            assert wait(lambda: len(ears.imu[0]) > 50)
-            assert abs(int(ears.stamps(0)[-1]) - now) < 30 * NS
-            assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
-            assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
-            strike()
-            told = (2, "FDI: imu_2.y faulty, left out")
-            assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
-            assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
-            assert autopilot.values["fdi_limit"] > 0
-            assert {command[0] for command in autopilot.commands} == {511}
-    finally:
-        assert monitor.end() == 0, monitor.said()
+    strike = struck(autopilot, 1, 1)
+    with (
+        running("fdi_node", ROOT / "config" / "px4.yaml") as monitor,
+        linked_over_udp(autopilot, other, named_values=True, system_id=2) as (ears, process),
+    ):
+        assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
+        assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
+        assert not other.intervals
+        assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), process.said()
+        assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
+        # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
+        now = time.time_ns()
+        assert wait(lambda: len(ears.imu[0]) > 50)
+        assert abs(int(ears.stamps(0)[-1]) - now) < 30 * NS
+        assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
+        assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
+        strike()
+        told = (2, "FDI: imu_2.y faulty, left out")
+        assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
+        assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
+        assert autopilot.values["fdi_limit"] > 0
+        assert {command[0] for command in autopilot.commands} == {511}
 
 
 def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain, compiled, tmp_path) -> None:
     """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
     autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
-    strike, port = struck(autopilot, 0, 1), free_port()
-    words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={tmp_path / 'out.json'}")
-    words += ("-r", "/fdi_node/integrity:=/verdict")
-    settings = ("--params-file", str(ROOT / "config" / "ardupilot.yaml"), "-r", "~/integrity:=/verdict")
-    monitor = Process("fdi_node", "--ros-args", *settings)
-    try:
-        with OverUdp(port, autopilot), linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
-            assert ears.says("failover", "ready"), process.said()
-            assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
-            stranger = ears.create_publisher(Imu, "imu_1/data_raw", 1)
-            assert ears.says("failover", "the monitor is in doubt"), "rates of another source"
-            ears.destroy_publisher(stranger)
-            assert ears.says("failover", "ready")
-            strike()
-            assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
-            assert wait(
-                lambda: any(text.startswith("FDI: IMU 1 (imu_1) out of use (gyro y") for _, text in autopilot.texts)
-            )
-            assert ears.says("failover", "out of use: IMU 1 (imu_1) of system 1")
-            assert ears.call(Trigger, "/mavlink_node/restore", Trigger.Request()).message == "IMU 1 (imu_1) is put back"
-            assert wait(lambda: autopilot.flies_with == 0)
-            assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
-            assert "failover over an unsigned link" in process.said()
-    finally:
-        assert monitor.end() == 0, monitor.said()
+    strike = struck(autopilot, 0, 1)
+    remaps, failover = ("/fdi_node/integrity:=/verdict",), {"failover": "ardupilot", "failover_file": tmp_path / "out"}
+    with (
+        running("fdi_node", ROOT / "config" / "ardupilot.yaml", "~/integrity:=/verdict") as monitor,
+        linked_over_udp(autopilot, remaps=remaps, **failover) as (ears, process),
+    ):
+        assert ears.says("failover", "ready"), process.said()
+        assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
+        stranger = ears.create_publisher(Imu, "imu_1/data_raw", 1)
+        assert ears.says("failover", "the monitor is in doubt"), "rates of another source"
+        ears.destroy_publisher(stranger)
+        assert ears.says("failover", "ready")
+        strike()
+        assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
+        told = "FDI: IMU 1 (imu_1) out of use (gyro y"
+        assert wait(lambda: any(text.startswith(told) for _, text in autopilot.texts))
+        assert ears.says("failover", "out of use: IMU 1 (imu_1) of system 1")
+        assert ears.call(Trigger, "/mavlink_node/restore").message == "IMU 1 (imu_1) is put back"
+        assert wait(lambda: autopilot.flies_with == 0)
+        assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
+        assert "failover over an unsigned link" in process.said()
 
 
 def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tmp_path) -> None:
-    autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
+    autopilot, file = Autopilot("ardupilot", boot=boot(), armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
-    file, port = tmp_path / "out.json", free_port()
     file.write_text('{"system_id": 1, "out_of_use": [2]}')
-    words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={file}")
-    with OverUdp(port, autopilot):
-        with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):
-            assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
-        assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
-        autopilot.armed = False
-        with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):
-            assert ears.says("link", "ArduPilot, system 1")
-        assert autopilot.parameters["INS_USE2"] == 1.0
-        assert wait(lambda: '"out_of_use": []' in file.read_text())
+    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (ears, _):
+        assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
+    assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
+    autopilot.armed = False
+    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (ears, _):
+        assert ears.says("link", "ArduPilot, system 1")
+    assert autopilot.parameters["INS_USE2"] == 1.0
+    assert '"out_of_use": []' in file.read_text()
 
 
 def test_ardupilot_over_a_serial_line_that_comes_late_with_garbage_cuts_and_a_restart(quiet_domain, tmp_path) -> None:

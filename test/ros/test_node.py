@@ -15,11 +15,15 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue, SetParametersResult
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters, SetParametersAtomically
 from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, healthy, monitoring, wait
 from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.ros.node import FLOOD_TIME, MOST_PARAMETERS
 from fdi_ros.sources import ImuSource
 
 FAULTY = int(ChannelState.FAULTY)
@@ -41,15 +45,13 @@ def listener(node) -> Listener:
     listener, process = node
     assert process.popen.poll() is None, process.said()
     assert listener.trigger("reset").success
-    assert listener.settle()
-    time.sleep(0.1)
-    listener.clear()
+    listener.calm()
     return listener
 
 
-def struck(count: int, start: int, channel: int = Y2, size: float = 0.3, seed: int = 1):
-    omega, z = healthy(count, seed)
-    z[start:, channel] += size
+def struck(count: int, start: int) -> tuple[np.ndarray, np.ndarray]:
+    omega, z = healthy(count, seed=1)
+    z[start:, Y2] += 0.3
     return omega, z
 
 
@@ -68,9 +70,8 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(lis
     listener.destroy_subscription(subscription)
     rates = listener.rates()
     assert [*rates] == stamps.tolist()
-    error = np.array([*rates.values()]) - omega
     # GDOP 1.4 with one channel lost.
-    assert np.abs(error).max() < 6 * 1.5 * SIGMA
+    assert np.abs(np.array([*rates.values()]) - omega).max() < 6 * 1.5 * SIGMA
     states = listener.states()
     assert (states[:200] == 0).all()
     assert np.flatnonzero(states[-1] == FAULTY).tolist() == [Y2]
@@ -83,8 +84,7 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(lis
     assert 2 <= sum(not first - 25 < at < first + 25 for at, _ in known) <= took + 2
     assert listener.says("imu_2.y", "isolated")
     # The last report with it: by now the silence may be told.
-    reports = [{s.name.removeprefix("fdi_node: "): s for s in message.status} for _, message in listener.diagnostics]
-    report = [one for one in reports if "isolated" in one["imu_2.y"].message][-1]
+    report = [one for one in listener.reports() if "isolated" in one["imu_2.y"].message][-1]
     status, whole = report["imu_2.y"], report["monitor"]
     assert (status.level, status.hardware_id) == (DiagnosticStatus.ERROR, "two_imus")
     values = {pair.key: pair.value for pair in status.values}
@@ -100,43 +100,33 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(lis
     assert listener.settle()
 
 
-@pytest.mark.parametrize("bad", [math.nan, 1e300])
-def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
+def test_no_message_stops_it_and_no_bad_value_reaches_the_output(listener) -> None:
     _, z = healthy(200)
-    z[50, 1] = z[100:103, Y2] = bad
-    listener.play(z)
-    assert wait(lambda: len(listener.fused) == 200)
-    assert np.isfinite(list(listener.rates().values())).all()
-    assert np.abs(list(listener.rates().values())).max() < 1
-    kind = "out of range" if bad == 1e300 else "non-finite"
-    assert wait(lambda: int(listener.value("imu_2.y", kind)) >= 3)
-
-
-def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
-    z = healthy(50)[1]
+    z[50, 1] = z[100:103, Y2] = math.nan
+    z[150:153, Y2] = 1e300
     stamps = listener.play(z)
     for stamp in (int(stamps[-1]), int(stamps[-5]), int(stamps[-1]) - 10**9):
         listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
-    listener.play(z)
-    assert wait(lambda: len(listener.fused) == 100)
-    got = [ImuSource.parse(data, 3)[0] for data in listener.fused]
-    assert got == sorted(set(got))
-    assert np.abs(list(listener.rates().values())).max() < 1
-    assert listener.says("input imu_1", "stamps going back")
-    for kind, least in (("backward", 2), ("duplicate", 1)):
-        assert wait(lambda kind=kind, least=least: int(listener.value("input imu_1", kind)) >= least)
-
-
-def test_stamps_at_the_ends_of_their_range_end_nothing(listener) -> None:
-    z = healthy(50)[1]
-    listener.play(z)
     for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
-        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
+        message = bytearray(ImuTemplate("imu").fill(0, (9.0, 9.0, 9.0), (0.0,) * 9))
         struct.pack_into("<iI", message, 4, sec, nanosec)
         for output in listener.outputs:
             output.publish(bytes(message))
-        listener.play(z)
-    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
+        listener.play(z[:50])
+    assert wait(lambda: len(listener.fused) >= 450), len(listener.fused)
+    got = [ImuSource.parse(data, 3)[0] for data in listener.fused]
+    assert got == sorted(set(got))
+    # NaN is not less.
+    assert np.abs(list(listener.rates().values())).max() < 1
+    for name, kind, least in (
+        ("imu_2.y", "non-finite", 3),
+        ("imu_2.y", "out of range", 3),
+        ("input imu_1", "backward", 2),
+        ("input imu_1", "duplicate", 1),
+        ("input imu_2", "malformed", 4),
+    ):
+        assert wait(lambda name=name, kind=kind, least=least: int(listener.value(name, kind)) >= least), kind
+    assert listener.says("input imu_1", "stamps going back")
     assert listener.says("input imu_2", "malformed")
 
 
@@ -156,12 +146,11 @@ def test_the_rate_reaches_subscribers_of_either_kind_and_those_that_come_and_go(
     listener.destroy_subscription(subscription)
 
 
-def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
+def test_one_dead_topic_does_not_silence_the_rest_and_when_all_is_silent_all_is_stale(listener) -> None:
     z = healthy(250)[1]
     listener.play(z[:50])
     listener.play(z, triads=[0])
-    reports = [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in listener.diagnostics]
-    told = [report for report in reports if "no data" in report["imu_2.x"].message]
+    told = [report for report in listener.reports() if "no data" in report["imu_2.x"].message]
     assert told
     assert all(r["imu_2.x"].level == r["input imu_2"].level == DiagnosticStatus.STALE for r in told)
     assert all(r["imu_1.x"].level != DiagnosticStatus.STALE for r in told)
@@ -169,9 +158,7 @@ def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
     assert wait(lambda: len(listener.fused) >= 299)
     assert listener.settle()
     assert wait(lambda: listener.status("input imu_2").level != DiagnosticStatus.STALE)
-
-
-def test_when_all_is_silent_all_is_stale(listener) -> None:
+    listener.clear()
     assert listener.says("monitor", "no sample for")
     assert {s.level for s in listener.diagnostics[-1][1].status} == {DiagnosticStatus.STALE}
 
@@ -188,59 +175,105 @@ def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
     assert wait(lambda: listener.value("monitor", "bias") == "learned")
 
 
-class TestParameters:
-    def test_each_has_a_description_a_unit_and_a_range(self, listener) -> None:
-        described = listener.described("detector.false_alarms_per_hour")
-        assert "[1/h]" in described.description
-        assert described.floating_point_range[0].to_value == 3.6e6
-        assert not described.read_only
-        assert listener.described("imus.timeout").read_only
-        assert "cusum, sequential" in listener.described("detector.name").additional_constraints
-        assert listener.described("decision.confirm_alarms").integer_range[0].from_value == 1
-
-    def test_detector_and_options_change_together(self, listener) -> None:
-        probability = {"detector__false_alarms_per_hour": 0.0, "detector__false_alarm_probability": 1e-7}
-        result = listener.set(detector__name="max_residual", **probability)
-        assert result.successful, result.reason
-        listener.play(struck(300, 100)[1])
-        assert listener.says("imu_2.y", "isolated")
-        assert listener.value("monitor", "detector") == "max_residual"
-        probability = {"detector__false_alarms_per_hour": 0.001, "detector__false_alarm_probability": 0.0}
-        assert listener.set(detector__name="likelihood_ratio", **probability).successful
-
-    def test_what_does_not_fit_is_refused_whole(self, node, listener) -> None:
-        before = listener.get("detector.name").string_value
-        assert before != "projector"
-        result = listener.set(detector__name="projector", detector__false_alarms_per_hour=-5.0)
-        assert not result.successful
-        assert listener.get("detector.name").string_value == before
-        for values, words in (
-            ({"detector__name": "nonsense"}, "nonsense"),
-            ({"excluded_channels": ["imu_9.x"]}, "imu_9.x"),
-            ({"detector__false_alarms_per_hour": 0.0}, "both 0"),
-            ({"imus__timeout": 0.5}, "read-only"),
-            ({"detector__nmae": "cusum"}, "did you mean 'detector.name'?"),
-        ):
-            result = listener.set(**values)
-            assert not result.successful
-            assert words in result.reason
-            line = f"parameters refused: {result.reason}"
-            # So many lines a second are logged; what was left out comes when it is asked for again.
-            assert wait(lambda line=line, values=values: line in node[1].said() or not listener.set(**values))
-
-    def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
-        assert listener.set(excluded_channels=["imu_1.z"]).successful
-        listener.play(healthy(100)[1])
-        assert listener.says("imu_1.z", "taken out by the operator")
-        assert listener.set(excluded_channels=[]).successful
-        assert listener.settle()
-
-
 def test_a_second_publisher_on_an_input_is_named_and_forgotten_when_it_is_gone(node, listener) -> None:
-    topic = listener.outputs[0].topic_name
-    second = listener.create_publisher(Imu, topic, DEEP)
+    second = listener.create_publisher(Imu, listener.outputs[0].topic_name, DEEP)
     assert listener.says("input imu_1", "2 publishers on /imu_1/data_raw, expected one: /listener, /listener")
     assert "2 publishers on /imu_1/data_raw" in node[1].said()
     listener.destroy_publisher(second)
     listener.clear()
     assert wait(lambda: "publishers" not in listener.status("input imu_1").message)
+
+
+def test_in_a_flood_inputs_are_polled_and_all_else_goes_on(node, listener) -> None:
+    damaged = bytes(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))[:20]
+
+    def flood() -> bool:
+        for _ in range(5000):
+            listener.outputs[0].publish(damaged)
+        return "flooded with messages: inputs are polled" in node[1].said()
+
+    assert wait(flood)
+    assert listener.trigger("reset").success
+    assert listener.settle()
+    assert node[1].memory() < 400
+    # And so it is when it is over.
+    time.sleep(FLOOD_TIME)
+    assert listener.trigger("reset").success
+    assert listener.settle()
+
+
+# Parameters ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_parameter_has_a_description_a_unit_and_a_range(listener) -> None:
+    names = ["detector.false_alarms_per_hour", "imus.timeout", "detector.name", "decision.confirm_alarms"]
+    answer = listener.call(DescribeParameters, "fdi_node/describe_parameters", names=names)
+    rate, timeout, detector, alarms = answer.descriptors
+    assert "[1/h]" in rate.description
+    assert rate.floating_point_range[0].to_value == 3.6e6
+    assert (rate.read_only, timeout.read_only) == (False, True)
+    assert "cusum, sequential" in detector.additional_constraints
+    assert alarms.integer_range[0].from_value == 1
+
+
+def test_what_changes_together_is_taken_over_whole_or_not_at_all(node, listener) -> None:
+    probability = {"detector__false_alarms_per_hour": 0.0, "detector__false_alarm_probability": 1e-7}
+    result = listener.set(detector__name="max_residual", **probability)
+    assert result.successful, result.reason
+    listener.play(struck(300, 100)[1])
+    assert listener.says("imu_2.y", "isolated")
+    assert listener.value("monitor", "detector") == "max_residual"
+    probability = {"detector__false_alarms_per_hour": 0.001, "detector__false_alarm_probability": 0.0}
+    assert listener.set(detector__name="likelihood_ratio", **probability).successful
+    for values, words in (
+        ({"detector__name": "projector", "detector__false_alarms_per_hour": -5.0}, "-5"),
+        ({"detector__name": "nonsense"}, "nonsense"),
+        ({"excluded_channels": ["imu_9.x"]}, "imu_9.x"),
+        ({"detector__false_alarms_per_hour": 0.0}, "both 0"),
+        ({"imus__timeout": 0.5}, "read-only"),
+        ({"detector__nmae": "cusum"}, "did you mean 'detector.name'?"),
+    ):
+        result = listener.set(**values)
+        assert not result.successful
+        assert words in result.reason
+        line = f"parameters refused: {result.reason}"
+        # So many lines a second are logged; what was left out comes when it is asked for again.
+        assert wait(lambda line=line, values=values: line in node[1].said() or not listener.set(**values))
+    (name,) = listener.call(GetParameters, "fdi_node/get_parameters", names=["detector.name"]).values
+    assert name.string_value == "likelihood_ratio"
+
+
+def test_an_operator_takes_a_channel_out_and_back(listener) -> None:
+    assert listener.set(excluded_channels=["imu_1.z"]).successful
+    listener.play(healthy(100)[1])
+    assert listener.says("imu_1.z", "taken out by the operator")
+    assert listener.set(excluded_channels=[]).successful
+    assert listener.settle()
+
+
+def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(node, listener) -> None:
+    def value(kind: int) -> ParameterValue:
+        return ParameterValue(type=kind, double_value=0.5, integer_value=1, string_value="x")
+
+    def ask(changes: list[ParameterMessage]) -> list[SetParametersResult]:
+        return listener.call(SetParameters, "fdi_node/set_parameters", parameters=changes).results
+
+    changes = [ParameterMessage(name="detector.false_alarms_per_hour", value=value(kind)) for kind in range(256)]
+    odd = [ParameterMessage(name="", value=value(3)), ParameterMessage(name="x" * 10**6, value=value(4))]
+    results = ask(changes[:MOST_PARAMETERS])
+    # 3 is PARAMETER_DOUBLE; 2, a whole number, does for it.
+    assert [k for k, result in enumerate(results) if result.successful] == [2, 3]
+    assert "has type 200, expected a name and a type of 1 to 9" in results[200].reason
+    results = ask(odd)
+    assert [result.successful for result in results] == [False, False]
+    assert max(len(result.reason) for result in results) < 5000
+    results = ask(changes + odd)
+    assert len(results) == 258
+    assert f"expected at most {MOST_PARAMETERS}" in results[-1].reason
+    service, mixed = "fdi_node/set_parameters_atomically", [changes[3], changes[200]]
+    result = listener.call(SetParametersAtomically, service, parameters=mixed).result
+    assert not result.successful
+    assert "has type 200" in result.reason
+    assert wait(lambda: "more lines, left out" in node[1].said(), 10.0)
+    assert max(map(len, node[1].said().splitlines())) < 5000
+    assert listener.set(detector__false_alarms_per_hour=TWO_IMUS.detector.false_alarms_per_hour).successful

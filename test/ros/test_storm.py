@@ -1,27 +1,32 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A moment of each storm upon a monitor; the long form, with the times, is benchmark/mavlink.py storms."""
+"""A moment of each storm, and the log of a node, bounded whatever causes its lines; changes of state in it.
+
+The long form of the storms, with the times, is benchmark/mavlink.py storms.
+"""
 
 from __future__ import annotations
 
-import time
-from types import SimpleNamespace
+from collections import Counter
 
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from ros.harness import TWO_IMUS, monitoring, wait
 from ros.storm import KINDS, vehicle, weather
 
-from fdi_ros.ros.node import LOG_PERIOD, MOST_LINES, MOST_PARAMETERS, BoundedLog
+from fdi_ros.monitor.output import ChannelState, Event, Reason
+from fdi_ros.monitor.status import ApartStatus
+from fdi_ros.ros.node import MOST_LINES, REPORT_PERIOD, BoundedLog
+from fdi_ros.ros.running import QUIET, ChangeLog
 
 SECONDS = 0.7
 THROTTLED = 10
 """Lines that are limited each by itself, at most so many a second together."""
+OK, UNCHECKED, SUSPECT = ChannelState.OK, ChannelState.UNCHECKED, ChannelState.SUSPECT
+AMBIGUOUS, FAULTY = ChannelState.AMBIGUOUS, ChannelState.FAULTY
+NAMES = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
 
 
 def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(tmp_path, compiled) -> None:
@@ -38,46 +43,86 @@ def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(t
         assert over.listener.says("monitor", "of 9 channels healthy")
 
 
-def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(tmp_path, compiled) -> None:
-    def value(kind: int) -> ParameterValue:
-        return ParameterValue(type=kind, double_value=0.5, integer_value=1, string_value="x")
-
-    changes = [Parameter(name="detector.false_alarms_per_hour", value=value(kind)) for kind in range(256)]
-    changes += [Parameter(name="", value=value(3)), Parameter(name="x" * 10**6, value=value(4))]
-    with monitoring(TWO_IMUS, tmp_path) as (listener, process):
-        request = SetParameters.Request(parameters=changes[:MOST_PARAMETERS])
-        results = listener.call(SetParameters, "fdi_node/set_parameters", request).results
-        assert len(results) == MOST_PARAMETERS
-        # 3 is PARAMETER_DOUBLE; 2, a whole number, does for it.
-        assert [k for k, result in enumerate(results) if result.successful] == [2, 3]
-        assert "has type 200, expected a name and a type of 1 to 9" in results[200].reason
-        odd = SetParameters.Request(parameters=changes[-2:])
-        results = listener.call(SetParameters, "fdi_node/set_parameters", odd).results
-        assert [result.successful for result in results] == [False, False]
-        assert max(len(result.reason) for result in results) < 5000
-        many = SetParameters.Request(parameters=changes)
-        results = listener.call(SetParameters, "fdi_node/set_parameters", many).results
-        assert len(results) == len(changes)
-        assert f"expected at most {MOST_PARAMETERS}" in results[-1].reason
-        atomically = SetParametersAtomically.Request(parameters=[changes[3], changes[200]])
-        result = listener.call(SetParametersAtomically, "fdi_node/set_parameters_atomically", atomically).result
-        assert not result.successful
-        assert "has type 200" in result.reason
-        assert wait(lambda: "more lines, left out" in process.said(), 10.0)
-        assert max(map(len, process.said().splitlines())) < 5000
+# The log -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_log_is_bounded_and_says_how_much_was_left_out() -> None:
-    now, lines = time.monotonic(), []
-    logger = SimpleNamespace(info=lines.append, warning=lines.append, error=lines.append)
-    bounded = BoundedLog(logger, lambda: now)
+class Paper:
+    """Takes lines of all severities, and has the time, s."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, str]] = []
+        self.now = 100.0
+
+    def __getattr__(self, severity: str):
+        return lambda words: self.lines.append((severity, words))
+
+
+@pytest.fixture
+def paper() -> Paper:
+    return Paper()
+
+
+def test_a_log_is_bounded_and_says_how_much_was_left_out(paper) -> None:
+    log = BoundedLog(paper, lambda: paper.now)
     for k in range(1000):
-        (bounded.info, bounded.warning, bounded.error)[k % 3](f"line {k}\n" + "x" * 10**5)
+        (log.info, log.warning, log.error)[k % 3](f"line {k}\n" + "x" * 10**5)
     # Each severity has its own room: requests without end hide no declaration.
-    assert len(lines) == 3 * MOST_LINES
-    assert all(len(line) <= 5000 and "\n" not in line for line in lines)
-    now += LOG_PERIOD
-    bounded.begin_period()
-    assert lines[3 * MOST_LINES :] == [f"and {1000 - 3 * MOST_LINES} more lines, left out"]
-    bounded.info("again")
-    assert lines[-1] == "again"
+    assert Counter(severity for severity, _ in paper.lines) == dict.fromkeys(("info", "warning", "error"), MOST_LINES)
+    assert all(len(line) <= 5000 and "\n" not in line for _, line in paper.lines)
+    paper.now += REPORT_PERIOD
+    log.begin_period()
+    log.info("again")
+    assert paper.lines[-2:] == [("warning", f"and {1000 - 3 * MOST_LINES} more lines, left out"), ("info", "again")]
+
+
+@pytest.fixture
+def changes(paper) -> ChangeLog:
+    return ChangeLog(paper, NAMES, lambda: paper.now)
+
+
+def events(before, after, *channels: int, why=Reason.NONE) -> list[Event]:
+    group = channels if after is AMBIGUOUS else ()
+    return [Event(12 * 10**9, channel, before, after, why, group or (channel,), 0.0) for channel in channels]
+
+
+def test_channels_that_change_alike_share_a_line(changes, paper) -> None:
+    changes.add(events(UNCHECKED, OK, 0, 1, 3) + events(OK, FAULTY, 2, why=Reason.DISAGREES), 2 * 10**9, None)
+    assert paper.lines == [
+        ("info", "imu_1.x, imu_1.y, imu_2.y: UNCHECKED -> OK at 10.000 s"),
+        ("error", f"imu_2.x: OK -> FAULTY at 10.000 s: {Reason.DISAGREES.value}"),
+    ]
+
+
+def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_counted(changes, paper) -> None:
+    for k in range(2000):
+        changes.add(events(OK, UNCHECKED, k % 4) if k % 2 else events(UNCHECKED, OK, k % 4), 0, None)
+        changes.check()
+        paper.now += 0.01
+    # 100 changes a second for 20 s: one line a channel in 5 s.
+    assert len(paper.lines) <= len(NAMES) * (20 / QUIET + 1)
+    paper.now += QUIET
+    changes.check()
+    (last,) = [line for _, line in paper.lines[-2:] if "imu_2.y" in line]
+    assert "UNCHECKED now, after" in last
+    assert "more changes" in last
+    count = len(paper.lines)
+    paper.now += 10 * QUIET
+    changes.check()
+    assert len(paper.lines) == count
+
+
+def test_what_becomes_worse_is_said_at_once(changes, paper) -> None:
+    pair = ApartStatus(("imu_1.x", "imu_2.x"), "the x axis of imu_1 or imu_2,", 0.1, 0.002)
+    before = OK
+    for after, channels in ((UNCHECKED, (0,)), (SUSPECT, (0,)), (OK, (0,)), (SUSPECT, (0,)), (AMBIGUOUS, (0, 2))):
+        changes.add(events(before, after, *channels), 0, pair)
+        before = after
+        paper.now += 0.05
+    changes.add(events(AMBIGUOUS, FAULTY, 0), 0, None)
+    assert [line.split(" at ")[0] for _, line in paper.lines] == [
+        "imu_1.x: OK -> UNCHECKED",
+        "imu_1.x: UNCHECKED -> SUSPECT",
+        "imu_1.x, imu_2.x: SUSPECT -> AMBIGUOUS",
+        "imu_1.x: AMBIGUOUS -> FAULTY",
+    ]
+    assert "the x axis of imu_1 or imu_2, 0.100 +- 0.002 rad/s apart" in paper.lines[2][1]
