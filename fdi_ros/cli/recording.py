@@ -17,9 +17,15 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.findings import candidates, findings_figures, needs, recording_findings, verdict_of
 from fdi_ros.setup.inspect import TopicReport, inspect, recording_figures, recording_text, topics_text
-from fdi_ros.setup.starting_config import starting_config
+from fdi_ros.setup.starting_config import (
+    candidates,
+    findings_figures,
+    needs,
+    recording_findings,
+    starting_config,
+    verdict_of,
+)
 from fdi_ros.system.files import whole
 from fdi_ros.system.text import LINE, shown
 

@@ -29,8 +29,7 @@ from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary, as_json
 from fdi_ros.replay.words import failures, parse_check, sample_rate_notes, summary_text, verdict
 from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.findings import refuse_degrees
-from fdi_ros.setup.starting_config import assumed_config
+from fdi_ros.setup.starting_config import assumed_config, refuse_degrees
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text
 from fdi_ros.system.text import shown, storable

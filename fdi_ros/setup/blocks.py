@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.model.samples import Array, Block, Int, Mask
+from fdi_ros.setup.noise import projector
 
 WINDOW = 0.25  # length of the windows that are at rest or not, faulty or not, s
 LEAST_SECONDS = 1.0  # shorter runs of one value are chance, s
@@ -78,12 +79,11 @@ def prepare(block: Block, max_rate: Array) -> Data:
 
 def spikes(z: Array, axes: Array) -> Mask:
     """Find single values of z (N, n), rad/s, far off what both neighbours and all other channels say; axes (n, 3)."""
-    found = np.zeros(z.shape, dtype=bool)
-    projector = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
+    found, apart = np.zeros(z.shape, dtype=bool), projector(axes)
     # What is usual changes with the vibration.
     for first in range(0, max(len(z) - 2, 0), SPIKE_PORTION):
         part = z[first : first + SPIKE_PORTION + 2]
-        size = np.abs((part[1:-1] - 0.5 * (part[2:] + part[:-2])) @ projector)
+        size = np.abs((part[1:-1] - 0.5 * (part[2:] + part[:-2])) @ apart)
         whole = size[np.isfinite(size).all(axis=1)]
         if len(whole) < SPIKE_PORTION // 4:
             continue

@@ -1,17 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a recording of the channels to the settings of the monitor: axes, biases, noise, and their standard errors.
+"""From the samples of a recording to the settings of the monitor: axes, biases, noise, and their standard errors.
 
-`calibrate` takes samples; ``fdi setup`` and ``fdi calibrate`` read them from a recording and write the settings. Method
-and formulas are in docs/calibration.md.
+Method and formulas are in docs/calibration.md.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,10 +28,11 @@ from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement
 from fdi_ros.setup.blocks import NOT_SHIFTED, Data, flag_runs, prepare, resampled, spikes
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
-from fdi_ros.setup.result import Calibration, Span, StampDelay
+from fdi_ros.setup.noise import projector
 from fdi_ros.sources import source_of
 
-UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere
+UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere: the root of a third
+UNMEASURED = SCALE_STD / 2  # uncertainty of the axes along a direction of the body from which they are not measured
 UNKNOWN_AXES = 0.1  # the same of an array; axes from the motion alone are taken if they are off by more
 REFERENCE_STD = 1e-6  # of channels that are taken for as configured
 LEAST_DURATION = 10.0  # s
@@ -46,6 +47,70 @@ LEAD = 1.0  # s before a declaration that a fault may have begun
 LEAST_SKEW = 5e-5  # what imus.max_skew is at least where delays smaller than it are to be taken off, s
 WAITS = 2.5  # what imus.timeout is at least, in differences of the delays of units
 REPLACED = ("imus.mounts", "geometry.cone_channels")  # parameters that say nothing any more beside geometry.axes
+
+
+class StampDelay(NamedTuple):
+    """By how much the stamps of a unit are late against those of the first."""
+
+    channels: tuple[int, ...]
+    value: float  # s; positive: their stamps are late, what they stand for was measured earlier; as imus.delays has it
+    error: float  # s
+
+    @property
+    def shown(self) -> bool:
+        """Whether the data show one."""
+        return abs(self.value) > SHOWN * self.error
+
+
+class Span(NamedTuple):
+    """Channels, one of which at least is faulty from one time to another, s from the start of the part used."""
+
+    channels: tuple[int, ...]
+    start: float
+    end: float
+
+
+@dataclass
+class Calibration:
+    """Result for the channels in use; all that is per channel is in their order."""
+
+    names: tuple[str, ...]
+    nominal: Array  # (n, 3) as configured
+    estimate: StateEstimate
+    timing: float  # what is not known of the sampling instants, s, as written
+    delays: tuple[StampDelay, ...]  # of all units but the first
+    faults: tuple[Span, ...]
+    unusable: dict[str, Int]  # (n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes
+    duration: float  # of the recording, s
+    settings: dict[str, object]  # parameters to be changed, ``{"section.field": value}``
+    spectrum: Spectrum  # of what channels differ by from the fused rate with these settings
+
+    def __post_init__(self) -> None:
+        found, n = self.estimate, len(self.names)
+        self.axes = axes = found.axes  # (n, 3)
+        self.axes_std = np.sqrt(np.diag(found.axes_covariance)).reshape(-1, 3)
+        self.bias_std = np.sqrt(np.diag(found.bias_covariance))  # (n,) of the mean biases, rad/s
+        self.scale = found.disagreement()  # scale error left between channels, as written, and its uncertainty
+        # (n,) angle between calibrated and nominal axes, rad, and its standard error in each of two directions.
+        sine = np.linalg.norm(np.cross(axes, self.nominal), axis=1)
+        self.angle = np.arctan2(sine, (axes * self.nominal).sum(axis=1))
+        length = np.linalg.norm(axes, axis=1)
+        each, along = found.axes_covariance.reshape(n, 3, n, 3), axes / length[:, None]
+        # (n,) scale factor relative to nominal, and its standard error.
+        self.factor = length / np.linalg.norm(self.nominal, axis=1)
+        square = np.einsum("ia,iab,ib->i", along, each[range(n), :, range(n)], along)
+        self.factor_error = np.sqrt(np.maximum(square, 0))
+        across = (self.axes_std**2).sum(axis=1) - self.factor_error**2
+        self.angle_error = np.sqrt(np.maximum(across, 0) / 2) / length
+        # (3,) uncertainty of the disagreement of axes along x, y and z of the body.
+        apart = projector(axes)
+        squares = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
+        self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
+        # (n,) channels whose scale factor the recording shows, against the others.
+        self.measured = np.sqrt(along**2 @ self.axis_errors**2) < UNMEASURED
+        # Places of the channels of each unit; of an array without units each channel is alone.
+        unit_of = [name.rpartition(".")[0] or name for name in self.names]
+        self.units = [[i for i, one in enumerate(unit_of) if one == unit] for unit in dict.fromkeys(unit_of)]
 
 
 def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:

@@ -11,17 +11,23 @@ window says
 
 at rest with the rate known to be zero. It is iterated, with the delays taken off the samples and the scale errors put
 into the axes, until both stay; what the recording does not show stays at its prior.
+
+Groups of windows say ``N x = r`` of the states x; biases b walk from group to group, all others c are constant. Written
+for the biases of all groups the system is banded, with the constants as its border: ``B b + C c = h, C' b + T c = g``.
+The biases are eliminated (banded Cholesky), and the marginal likelihood of the walk falls out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
+from fdi_ros.estimator.blocks import LIVED, QUIET, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     ERROR_KINDS,
     ONE,
@@ -34,25 +40,23 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.monitor.pipeline import UNIT_DELAY
 from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
-from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment
-from fdi_ros.setup.smoother import NormalEquations, RandomWalk, Smoothed, find_random_walk, smooth
+from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment, projector
 
 SCALE_STD = 0.008  # of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
 SETTLED = 2e-5  # s of delays, and share of the rate of axes: what changes less has settled
-NEAR_DELAY = 50 * SETTLED  # s; delays that move by less are no reason to look for the walk of the biases again
+SHOWN_DELAY = 0.001  # s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that moves no bias
 LARGEST_DELAY = PARAMETERS["imus.delays"].high  # s
-STEP_DELAY = 0.03  # by how much a delay changes in one pass at most, s: a slope is that of the motion only so far
+STEP_DELAY = 2.0 * UNIT_DELAY  # by how much a delay changes in one pass at most, s: a slope is that of the motion near
 MOST_STEPS = 400  # windows are joined until there are no more than this
 ABSENT = 1e12  # variance of a channel that is not there, (rad/s)^2
-QUIET = 3.0  # at rest the variance of single samples is at most so many times that of the quietest windows
-ALIKE = 5.0  # means of the windows at rest are at most so many of their standard deviations apart
-LEAST_REST = 2.0  # s; less is chance
+ALIKE = 5.0  # means of the windows at rest are at most so many of their standard deviations apart: hardly one by chance
 USUAL_WALK = 2e-5  # rad/s/sqrt(s); of biases that show none
-WIDER = 1.5  # axes that are farther off than expected by so much are known less beforehand
+WIDER = 1.5  # axes that are farther off than expected by so much are known less: once in 60 by chance, of two units
 LEAST_BLOCKS = SUBS = 5  # of a window that tells its noise, and of windows that tell its colour by longer means
 BASE = 7  # one, the rate, the angular acceleration
 ESTIMATED = ("bias", "scale", "delay")  # kinds of error states, whose signals are linear in these
@@ -100,25 +104,24 @@ class StateEstimate:
 
         What all channels have in common is a turn or a scale of the body frame: no channel contradicts it.
         """
-        n = len(self.axes)
-        apart = np.kron(np.eye(n) - self.axes @ np.linalg.pinv(self.axes), np.eye(3))
+        apart = np.kron(projector(self.axes), np.eye(3))
         left = apart @ self.axes_covariance @ apart
-        count = 3 * (n - 3)
-        square = max(float(np.trace(left)) / count, 1e-18)
-        return float(np.sqrt(square)), float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * np.sqrt(square)))
+        count = 3 * (len(self.axes) - 3)
+        rms = float(np.sqrt(max(float(np.trace(left)) / count, 1e-18)))
+        return rms, float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * rms))
 
 
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
     motion = 3 * n + units - 1  # of the constants, the first are those that motion shows
-    axes, biases, colour, prior_scale = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n)), sensors.scale_std
+    axes, biases, colour, priors = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n)), sensors
     taken, moved = np.zeros(units), np.inf  # delays that are off the blocks, and by how much they were to be others
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
     for number in range(PASSES):
-        one = _Pass(blocks, sensors, axes, taken, biases, number > 1, colour, prior_scale)
-        if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
+        one = _Pass(blocks, priors, axes, taken, biases, number > 1, colour)
+        if number > 1 and (number == PASSES - 1 or (walk is None and moved < SHOWN_DELAY)):
             walk = find_random_walk(one.evidence)
         usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
         shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
@@ -139,7 +142,9 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         apart = off - axes @ (np.linalg.pinv(axes) @ off)
         size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
         times = size / max(float(np.median(sensors.scale_std)), 1e-9)
-        prior_scale = sensors.scale_std * (times if times > WIDER and number >= TRUSTING else 1.0)
+        priors = replace(
+            sensors, scale_std=sensors.scale_std * (times if times > WIDER and number >= TRUSTING else 1.0)
+        )
     assert walk is not None
     covariance = found.constant_covariance * _misfit(one.careful, shown)
     # No less is known than before.
@@ -148,7 +153,6 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
     # What interpolation has taken of white noise is given back to what is left once the motion is out.
     kept = np.sqrt(blocks.white)
-    moment = np.sqrt(of_the_moment(blocks.samples, one.sampled, axes)) / kept
     return StateEstimate(
         axes,
         covariance[: 3 * n, : 3 * n],
@@ -160,7 +164,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         one.times,
         walk,
         replace(one.floor, std=one.floor.std / kept, error=one.floor.error / kept),
-        moment,
+        np.sqrt(of_the_moment(blocks.samples, one.sampled, axes)) / kept,
         blocks,
         one.rest,
         one.rate,
@@ -171,14 +175,13 @@ class _Pass:
     """One linearisation: rest, rate and noise of every window with the states so far, and what they say of the states.
 
     Of blocks with delays (units,) s taken off, axes (n, 3), and biases (K, n) rad/s of joined windows; whether these
-    are from a pass before; colour (2, n), the variance of longer means over that of white noise, at rest and in motion;
-    and scale (n,), the standard deviation of each component of the axes beforehand.
+    are from a pass before; and colour (2, n), the variance of longer means over that of white noise, at rest and in
+    motion.
     """
 
     def __init__(
-        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, known: bool, colour: Array,
-        scale: Array,
-    ) -> None:  # fmt: skip
+        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, known: bool, colour: Array
+    ) -> None:
         self.blocks, self.axes, self.window = blocks, axes, blocks.window
         finite = np.isfinite(blocks.mean)
         present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * blocks.size[:, None]
@@ -214,7 +217,7 @@ class _Pass:
         self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
         self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
         self.times = blocks.time[0] + self.middle - self.middle[0]  # (K,) of the joined windows, s from the first
-        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration * inside[:, None], scale)
+        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration * inside[:, None])
 
     def curve_of(self, found: Smoothed) -> Array:
         """Biases (K, n) over time, rad/s."""
@@ -246,17 +249,17 @@ class _Pass:
             return found
         mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
         limit = ALIKE * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
-        found &= (np.abs(mean - np.median(mean[found], axis=0)) < np.maximum(limit, 0.0)).all(axis=1)
+        found &= (np.abs(mean - np.median(mean[found], axis=0)) < limit).all(axis=1)
         # Beside motion its beginning is hidden by the noise.
         found &= np.append(True, found[:-1]) & np.append(found[1:], True)
-        return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LEAST_REST)
+        return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LIVED)
 
     def _find_evidence(
-        self, sensors: Priors, delay: Array, y: Array, acceleration: Array, scale: Array
+        self, sensors: Priors, delay: Array, y: Array, acceleration: Array
     ) -> tuple[NormalEquations, NormalEquations]:
         """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
         blocks, axes, variance, rest, n = self.blocks, self.axes, self.variance, self.rest, len(self.axes)
-        coefficients, prior = coefficients_of(sensors, axes, scale)
+        coefficients, prior = coefficients_of(sensors, axes)
         moving = (~rest[self.window])[:, None]
         base = np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving]) * self.used[:, None]
         # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
@@ -339,25 +342,28 @@ def _at_rest(variance: Array, axes: Array) -> Array:
     return np.asarray(np.eye(len(axes)) / variance[..., :, None] - weighted @ solved)
 
 
-def coefficients_of(sensors: Priors, axes: Array, scale: Array) -> tuple[Array, Array]:
+def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
     """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
-    n, units = len(axes), sensors.units
-    layouts = allocate(Layout)
-    priors: dict[str, float | Array] = {"bias": sensors.bias_std, "scale": scale, "delay": sensors.delay_std}
-    prepare_layout(layouts[0], sensors.unit, units, priors, {"bias": 0.0})
+    n, (layout,) = len(axes), allocate(Layout)
+    priors: dict[str, float | Array] = {
+        "bias": sensors.bias_std,
+        "scale": sensors.scale_std,
+        "delay": sensors.delay_std,
+    }
+    prepare_layout(layout, sensors.unit, sensors.units, priors, {"bias": 0.0})
     # Each of the base alone: rates, and accelerations along the channels.
     signals = np.zeros((BASE, n, SIGNALS))
     rates, accelerations = np.eye(BASE, 3, -1), np.hstack([np.zeros((n, 4)), axes]).T.copy()
     for k in range(BASE):
-        fill_signals(layouts[0], rates[k], accelerations[k], signals[k])
-    signals[1:, :, layouts[0]["by"] == ONE] = 0.0
-    shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
+        fill_signals(layout, rates[k], accelerations[k], signals[k])
+    signals[1:, :, layout["by"] == ONE] = 0.0
+    shown = [p for kind in ESTIMATED for places in places_of(kind, n, sensors.units) for p in places]
     order = {place: k for k, place in enumerate(shown)}
     coefficients = np.zeros((len(shown), n, BASE))
     for i, k in np.ndindex(n, SIGNALS):
-        if (place := int(layouts[0]["place"][i, k])) in order:
+        if (place := int(layout["place"][i, k])) in order:
             coefficients[order[place], i] += signals[:, i, k]
-    return coefficients, np.asarray(layouts[0]["prior"][shown])
+    return coefficients, np.asarray(layout["prior"][shown])
 
 
 def _misfit(of: NormalEquations, found: Smoothed) -> float:
@@ -369,3 +375,122 @@ def _misfit(of: NormalEquations, found: Smoothed) -> float:
     shown = float(np.einsum("ki,ij,kj->", residual, covariance, residual))
     expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], covariance))
     return max(shown / max(expected, 1e-12), 1.0)
+
+
+# All windows at once --------------------------------------------------------------------------------------------------
+
+
+WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
+NO_WALK = 1e-7  # rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
+SHOWN_GAIN = 4.0  # log-likelihood that a walk must gain over none to be shown: one of 200 without a walk does
+POSSIBLE = 2.0  # what one may lose against the best and be possible: one of 20 true ones loses more
+
+
+class NormalEquations:
+    """What the groups say of the states, the biases (n) first; kept in units of their standard deviations before.
+
+    In units of their own, information on them would be apart by more than what rounding leaves of a number. ``normal``,
+    ``right``: N (K, s, s) and r (K, s). ``apart`` (K,): time to the next group, s; the last is not read. ``prior``,
+    ``start`` (s,): standard deviations, of all biases the same, and means before.
+    """
+
+    def __init__(self, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> None:
+        self.n, self.apart, self.prior = n, apart, prior
+        self.normal, self.right, self.start = normal * np.outer(prior, prior), right * prior, start / prior
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Estimate of all states."""
+
+    constant: Array  # (m,) the states that stay
+    constant_covariance: Array  # (m, m) of them
+    curve: Array  # (K, n) biases over time, rad/s
+    mean: Array  # (n,) their mean over the recording
+    mean_covariance: Array  # (n, n) of it
+
+
+class RandomWalk(NamedTuple):
+    """How the biases walk, rad/s/sqrt(s)."""
+
+    value: float  # 0: none shown
+    possible: float  # the largest that the recording does not rule out
+
+
+def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:
+    """Eliminate the biases, of such a walk.
+
+    Returns B^-1 (K n, n + m + 1) of the mean of the biases, of C and of h, which gives the biases if all constants were
+    zero; information (m, m) on the constants and its right-hand side (m,); and the log of the marginal likelihood.
+    """
+    n, count = of.n, len(of.normal)
+    stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
+    blocks = of.normal[:, :n, :n].copy()
+    diagonal = np.einsum("kii->ki", blocks)
+    diagonal[0] += 1.0
+    diagonal[:-1] += stiffness
+    diagonal[1:] += stiffness
+    band = np.zeros((n + 1, count, n))
+    for below in range(n):
+        band[below, :, : n - below] = np.diagonal(blocks, -below, 1, 2)
+    band[n, :-1] = -stiffness
+    border, h = of.normal[:, :n, n:].reshape(count * n, -1), of.right[:, :n].copy()
+    h[0] += of.start[:n]
+    factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
+    mean = np.tile(np.eye(n) / count, (count, 1))
+    solved = cho_solve_banded((factor, True), np.column_stack([mean, border, h.ravel()]))
+    from_constants, alone = solved[:, n:-1], solved[:, -1]
+    information = np.eye(border.shape[1]) + of.normal[:, n:, n:].sum(axis=0) - border.T @ from_constants
+    information = 0.5 * (information + information.T)
+    side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
+    fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
+    volume = 2.0 * np.log(factor[0]).sum() - n * np.log(stiffness).sum() + np.linalg.slogdet(information)[1]
+    return solved, information, side, 0.5 * (fits - float(volume))
+
+
+def find_random_walk(of: NormalEquations) -> RandomWalk:
+    """Find the walk of the biases by its marginal likelihood."""
+    if len(of.normal) < 3:
+        return RandomWalk(0.0, float(WALKS[-1]))
+    none, *logs = (_eliminate(of, walk)[-1] for walk in (0.0, *WALKS))
+    best = int(np.argmax(logs))
+    # Between the walks tried, by a parabola.
+    shift = 0.0
+    if 0 < best < len(WALKS) - 1:
+        a, b, c = logs[best - 1 : best + 2]
+        shift = float(np.clip(0.5 * (a - c) / min(a - 2 * b + c, -1e-9), -0.5, 0.5))
+    value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
+    likely = np.array(logs) > max(logs[best], none) - POSSIBLE
+    possible = float(WALKS[likely].max(initial=0.0))
+    return RandomWalk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
+
+
+def smooth(of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
+    """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
+
+    Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
+    they count as uncertain as they are (Schmidt 1966).
+    """
+    n, (solved, information, side, _) = of.n, _eliminate(of, walk)
+    if known is None:
+        covariance = np.linalg.inv(information)
+        constant = covariance @ side
+    else:
+        k = len(known[0])
+        first, p = known[0] / of.prior[n : n + k], known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
+        free = np.linalg.inv(information[k:, k:])
+        by = -free @ information[k:, :k]
+        constant = np.concatenate([first, free @ side[k:] + by @ first])
+        covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
+    curve = (solved[:, -1] - solved[:, n:-1] @ constant).reshape(-1, n)
+    # The mean of the biases by itself, and by the constants.
+    mean = solved.reshape(len(curve), n, -1).mean(axis=0)
+    alone, each = mean[:, :n], mean[:, n:-1]
+    unit = of.prior[n:]
+    return Smoothed(
+        constant * unit,
+        covariance * np.outer(unit, unit),
+        curve * of.prior[0],
+        curve.mean(axis=0) * of.prior[0],
+        (alone + each @ covariance @ each.T) * of.prior[0] ** 2,
+    )

@@ -191,7 +191,7 @@ def gains(variance: Array, axes: Array) -> Array:
 
 def variances(covariance: Array, axes: Array) -> Array:
     """Variance (W, n) of every channel in every window, from covariances (W, n, n) of its values, (rad/s)^2."""
-    start = np.einsum("wab,ab->w", covariance, _projector(axes)) / (len(axes) - 3)
+    start = np.einsum("wab,ab->w", covariance, projector(axes)) / (len(axes) - 3)
     v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
     for _ in range(STEPS):
         a = information(v, axes)
@@ -203,7 +203,8 @@ def variances(covariance: Array, axes: Array) -> Array:
     return v
 
 
-def _projector(axes: Array) -> Array:
+def projector(axes: Array) -> Array:
+    """Work out S = I - H pinv(H)."""
     return np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
 
 
@@ -249,9 +250,8 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
     """
     residual = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
-        projector = _projector(axes[columns])
-        part = covariance[np.ix_(rows, columns, columns)]
-        residual[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", projector, part, projector, optimize=True)
+        part, apart = covariance[np.ix_(rows, columns, columns)], projector(axes[columns])
+        residual[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", apart, part, apart, optimize=True)
     known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
     if known.any():

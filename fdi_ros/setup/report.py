@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fdi_ros.model.noise import summary_line
+from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
@@ -23,20 +23,37 @@ from fdi_ros.report.layout import (
     drawn,
     escape,
     figures_of,
+    first_of,
     page,
     section_lines,
     time_layout,
     told,
 )
+from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.findings import Finding, Role, copy_words, findings_figures, lines_of, topic_findings, verdict_of
+from fdi_ros.setup.calibrate import UNMEASURED, Calibration
+from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.inspect import topic_columns
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.result import Calibration, calibration_figures, calibration_findings, channel_columns
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, times_words
+from fdi_ros.setup.starting_config import (
+    Finding,
+    Role,
+    copy_words,
+    findings_figures,
+    lines_of,
+    topic_findings,
+    verdict_of,
+)
 from fdi_ros.sources import source_of
 from fdi_ros.system.text import LINE, shown
 
+SHOWN_AXES = UNMEASURED / 2  # uncertainty of the axes along a direction of the body from which they are not well shown
+LEAST_SHARE = 0.2  # part of a recording that supports its noise
+LARGE_SWING = float(np.radians(0.03))  # change of a bias within a recording that is worth a look, rad/s
+LARGE_BIAS = 0.2  # rad/s
+LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05  # axes that far from nominal are worth a look
+MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
 LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
 MOST_POINTS = 2000  # of a curve on the page
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
@@ -45,6 +62,115 @@ NOISE_HINT = (
     " vibration adds is measured by the monitor as it goes."
 )
 BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
+
+
+def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADIANS) -> Iterator[Finding]:
+    """List what was found, what is not known, and what to look at."""
+    yield from _found(result, unit)
+    yield from _unknown(result, body_frame, unit)
+    yield from _warnings(result, unit)
+
+
+def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
+    """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
+    found, name, factor = result.estimate, unit.name, unit.factor
+    rest, walk, floor, usual = found.rest_seconds, found.bias_walk, found.floor, np.median(found.moment, axis=0)
+    words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
+    yield Finding(Role.FOUND, "time at rest", words, value=rest)
+    (least, most), (low, high) = ((std.min() * factor, std.max() * factor) for std in (floor.std, usual))
+    words = f"noise_std {least:.2g} to {most:.2g} {name}, from the quietest {floor.share:.0%} of the recording; usually"
+    words += f" {low:.2g} to {high:.2g}"
+    largest = int(floor.std.argmax())
+    yield Finding(Role.FOUND, "noise", words, (), float(floor.std[largest]), float(floor.error[largest]))
+    words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
+    if walk.value:
+        words += f"biases walk {walk.value * factor:.2g} {name} per sqrt(s)"
+    else:
+        words += f"no walk of the biases shown, below {walk.possible * factor:.2g} {name} per sqrt(s)"
+    yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
+    for delay in result.delays:
+        names = [result.names[i] for i in delay.channels]
+        side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+        taken = "taken off" if delay.shown else "not taken off: it may be none"
+        if "imus.delays" not in result.settings:
+            taken = "not taken off: one message"
+        words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
+        words += f" the first unit, {taken}"
+        yield Finding(Role.FOUND, "delay", words, names, delay.value, delay.error, SHOWN * delay.error)
+
+
+def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
+    """List what is not observed, what is taken instead, and how to get it."""
+    found, share = result.estimate, result.estimate.floor.share
+    if not found.rest_seconds:
+        common = float(np.sqrt(np.mean(result.bias_std**2)))
+        words = (
+            "nowhere at rest: what all biases have in common looks like a rotation"
+            f" (+-{common * unit.factor:.2g} {unit.name}); noise_std is the lower envelope in motion. Let the vehicle"
+            " stand still for 10 s, motors off"
+        )
+        yield Finding(Role.UNKNOWN, "rest", words, error=common)
+    elif share <= LEAST_SHARE:
+        words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
+        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
+    error, rms = result.axis_errors, np.std(found.rate, axis=0) * unit.factor
+    if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
+        which = " and ".join(unmeasured)
+        along, about = ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
+        words = (
+            f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near those"
+            " configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
+        )
+        yield Finding(Role.UNKNOWN, "scale factors", words, unmeasured, None, float(error.max()), UNMEASURED)
+    if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
+        turns = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor)
+        words = (
+            f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
+            " Turn it back and forth about them, some 1 rad/s"
+        )
+        yield Finding(Role.UNKNOWN, "axes", words, ["xyz"[a] for a in poor], None, float(error[poor].max()), SHOWN_AXES)
+    if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
+        names = list(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
+        worst = max(d.error for d in late)
+        words = f"delays of {', '.join(names)} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth"
+        yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
+
+
+def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
+    """List what to look at before the settings are trusted: faults, values lost, and channels beyond a bound."""
+    found, names = result.estimate, result.names
+    if result.faults:
+        spans = [f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s" for who, a, b in result.faults]
+        words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
+        struck = sorted({i for span in result.faults for i in span.channels})
+        yield Finding(Role.WARNING, "declared", words, [names[i] for i in struck], headline="USABLE, BUT LOOK")
+    lost = [
+        f"{int(count.sum())} {'frozen' if why == 'repeated' else why.replace('_', ' ')}"
+        f" ({'every channel' if count.all() else ', '.join(names[i] for i in np.flatnonzero(count))})"
+        for why, count in result.unusable.items()
+        if count.max() > (MANY * found.blocks.count.sum() if why in ("missing", "spikes") else 0)
+    ]
+    if lost:
+        yield Finding(Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}")
+    moving = np.median(found.moment, axis=0)
+    for when, noise, headline in (("in motion", moving, "USABLE, BUT LOOK"), ("at rest", found.floor.std, "")):
+        if noisy := much_noisier(noise, result.units):
+            words = noisier_words(names, noise, result.units, unit.name, unit.factor)
+            words += f" {when}: loose, badly isolated, of another make, or faulty"
+            worst, beside = max(noisy, key=lambda one: noise[one[0]])
+            who = [names[i] for i, _ in noisy]
+            yield Finding(Role.WARNING, "noise", words, who, float(noise[worst]), None, beside, headline)
+    rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
+    for what, values, bound, form, factor in (
+        ("axes turned from their nominal ones", result.angle, LARGE_ANGLE, "{:.1f} deg", np.degrees(1.0)),
+        ("scale factors off their nominal ones", result.factor - 1.0, LARGE_SCALE, "{:+.1%}", 1.0),
+        ("biases moved within the recording", swing, LARGE_SWING, rate, unit.factor),
+        ("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
+    ):
+        if len(beyond := np.flatnonzero(np.abs(values) > bound)):
+            words = f"{what}: {', '.join(f'{names[i]} by {form.format(values[i] * factor)}' for i in beyond)}"
+            largest = float(values[np.abs(values).argmax()])
+            yield Finding(Role.WARNING, what, words, [names[i] for i in beyond], largest, None, bound)
 
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
@@ -61,7 +187,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         yield from calibration_findings(result, found.config.body_frame, unit)
     noise = (mounting.noise, mounting.false_alarm_probability, unit.name, unit.factor)
     yield Finding(Role.FOUND, "mounting", summary_line(g, *noise, agree=not found.disagree))
-    yield from _unknown(found, unit)
+    yield from _not_shown(found, unit)
     if words := copy_words(found.reports):
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
     yield from topic_findings(found.chosen, unit)
@@ -105,7 +231,7 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED")
 
 
-def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
+def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     """List what the recording does not show, what is taken instead, and how to get it."""
     yield from (Finding(Role.UNKNOWN, "damage", line) for line in found.damage)
     named = zip(found.config.imu_names, found.mounts, strict=False)
@@ -138,6 +264,63 @@ def _unknown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     if others := [report.topic.name for report in possible if report not in found.chosen]:
         words = f"topics that were not used, though they could be gyros: {', '.join(others)}"
         yield Finding(Role.UNKNOWN, "topics", words, others)
+
+
+def calibration_figures(result: Calibration) -> dict[str, object]:
+    """Return all figures by name, SI units: for programs."""
+    names, found, rest = result.names, result.estimate, result.estimate.rest_seconds
+    return {
+        "seconds": {"all": result.duration, "rest": rest, "motion": result.duration - rest},
+        "channels": figures_of(channel_columns(result)),
+        "noise": {
+            "share_of_recording": found.floor.share,
+            "scale_std": result.scale[0],
+            "scale_std_error": result.scale[1],
+            "timing_std_s": result.timing,
+            "bias_walk": found.bias_walk.value or None,
+            "bias_walk_possible": found.bias_walk.possible,
+        },
+        "delays": [
+            {"channels": [names[i] for i in d.channels], "late_s": d.value, "std_s": d.error, "shown": d.shown}
+            for d in result.delays
+        ],
+        "faults": [
+            {"channels": [names[i] for i in span.channels], "start_s": span.start, "end_s": span.end}
+            for span in result.faults
+        ],
+        "settings": result.settings,
+    }
+
+
+def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
+    """Figures of every channel, one row each."""
+    found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
+
+    def measured(values: Array, form: str) -> list[str]:
+        return [
+            f"{value:{form}}" if shown else "not measured" for value, shown in zip(values, result.measured, strict=True)
+        ]
+
+    lost = [{why: count[i] for why, count in result.unusable.items()} for i in range(len(result.names))]
+    return [
+        Column("name", result.names, ("channel",)),
+        Column("axis", result.axes, ("axis x", "y", "z"), ".5f"),
+        Column("axis_std", result.axes_std),
+        Column("scale", result.factor),
+        Column("scale_std", result.factor_error),
+        Column("scale_measured", result.measured),
+        Column("", measured(result.factor, ".5f"), ("scale",)),
+        Column("", measured(100 * result.factor_error, ".3f"), ("+-%",)),
+        Column("off_nominal_rad", result.angle, ("off nominal deg",), ".3f", degrees),
+        Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
+        Column("bias", found.bias, ("bias rad/s",), ".6f", rate),
+        Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
+        Column("noise_std", found.floor.std, ("noise rad/s",), ".5f", rate),
+        Column("noise_std_error", found.floor.error, ("+-",), ".5f", rate),
+        Column("noise_median", np.median(found.moment, axis=0), ("usually rad/s",), ".5f", rate),
+        Column("noise_largest", found.moment.max(axis=0)),
+        Column("not_used", lost, ("not used",), lambda counts: str(sum(counts.values()))),
+    ]
 
 
 def _mounts(found: SetupResult) -> list[Column]:

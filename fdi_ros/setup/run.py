@@ -29,12 +29,17 @@ from fdi_ros.replay.sweep import Baseline, Plan, Subject, monitor_of, parse_swep
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, calibrate, reference_channels
-from fdi_ros.setup.findings import candidates, clocks_apart, copy_words, needs, refuse_degrees
+from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, Calibration, calibrate, reference_channels
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.setup.result import Calibration
-from fdi_ros.setup.starting_config import starting_config
+from fdi_ros.setup.starting_config import (
+    candidates,
+    clocks_apart,
+    copy_words,
+    needs,
+    refuse_degrees,
+    starting_config,
+)
 from fdi_ros.sources import source_of
 from fdi_ros.system.text import shown
 

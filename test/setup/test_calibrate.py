@@ -20,9 +20,9 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.findings import Role, lines_of
-from fdi_ros.setup.result import Calibration, calibration_findings
+from fdi_ros.setup.calibrate import Calibration, calibrate
+from fdi_ros.setup.report import calibration_findings
+from fdi_ros.setup.starting_config import Role, lines_of
 
 CONFIG = Path(__file__).parents[2] / "config"
 

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.setup.smoother import NormalEquations, find_random_walk, smooth
+from fdi_ros.setup.estimate import NormalEquations, find_random_walk, smooth
 
 
 @settings(max_examples=30, deadline=None)
