@@ -19,15 +19,16 @@ import numpy as np
 
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
-from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.geometry import ROUNDING, Geometry, spans_space
 from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import WINDOW, Data
 
-LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s
+LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s: biases are mostly less
 LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
-FOLLOWS = 0.9  # correlation from which a channel shows the rotation, if on another scale
 LEAST_WINDOWS = 20  # in motion; with fewer, units are not compared, and no mount is estimated
-SHARED, SAME = 0.7, 0.9  # share of rotation in common: less contradicts, more shows by which axes it would not
+SHARED, SAME = 0.7, 0.9
+"""Share of rotation in common, or correlation: less contradicts, more shows the rotation, if along other axes or on
+another scale. Vibration and late stamps take some of it."""
 SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
@@ -158,7 +159,7 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
             return []
         response = float(gain @ square[three, i]) / seen**2
         small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
-        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > FOLLOWS * size
+        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > SAME * size
         if not small and not large:
             return []
         found.append((response, seen))
@@ -168,10 +169,8 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 # How the units are turned against each other --------------------------------------------------------------------------
 
 
-LEAST_RATE = 0.01  # rotation about some axis, root mean square, below which the recording is at rest, rad/s
+LEAST_RATE = LEAST_ROTATION / 5  # rotation about some axis, root mean square, below which nothing turns, rad/s
 LARGEST_ERROR = np.radians(2.0)  # a mount less certain than this, in any direction, is not shown
-ROUNDING = 1e-9  # share of a rotation, about the axis that sees least of it, that is none
-LEAST_SHARED = 0.5  # share of the rotation of a unit that a mount must explain
 SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
 SQUARE = np.radians(10.0)  # a mount this close to axes along axes is taken for that: the rest is misalignment
 
@@ -236,7 +235,8 @@ def _against(first: Array, unit: Array) -> Mount:
     shared, error = 1.0 - missed, math.sqrt(float(np.mean(square)) * uncertainty)
     if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
         return Mount("NOT KNOWN: mirrored against the first unit", shared, contradicts=True, mirrored=True)
-    if shared < LEAST_SHARED:
+    # Then most of what it shows is not of this rotation.
+    if shared < 0.5:
         words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
         return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:

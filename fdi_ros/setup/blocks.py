@@ -20,13 +20,9 @@ from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
-WINDOW = 0.25  # length of the windows that are at rest or not, faulty or not, s
-LEAST_SECONDS = 1.0  # shorter runs of one value are chance, s
-LEAST_SAMPLES = 50  # so are those of fewer samples
-COARSE = 3.0  # gyros that show no more values in a quiet while are so coarse that one value is rest
-QUIETEST = 10.0  # percentile of the spans that are a quiet while
-SPIKE = 25.0  # usual sizes beyond which a value is a spike
-SPIKE_PORTION, RARE = 256, 0.1  # samples looked at at once, and share of them that may be spikes or beside one
+WINDOW = 0.25  # over which rates are averaged to compare units, s: turns by hand stay, noise goes
+SPIKE = 25.0  # usual sizes beyond which a value is a spike: vibration has tails, too
+SPIKE_PORTION = 256  # samples looked at at once
 MEDIAN_TO_RMS = 1.4826  # of normal errors: standard deviation over median absolute deviation
 
 
@@ -90,7 +86,8 @@ def spikes(z: Array, axes: Array) -> Mask:
         level = MEDIAN_TO_RMS * np.median(whole, axis=0)
         ratio = np.nan_to_num(size / np.maximum(level, 1e-9))
         far = ratio.max(axis=1) > SPIKE
-        if far.mean() < RARE:
+        # What comes more often is no spike.
+        if far.mean() < 0.1:
             found[first + 1 + np.flatnonzero(far), ratio[far].argmax(axis=1)] = True
     return found
 
@@ -102,8 +99,8 @@ def flag_runs(flags: Mask) -> Int:
 
 
 def least_run(step: float) -> int:
-    """Return the samples from which a run of one value is long, at a time from sample to sample, s; 0: not known."""
-    return max(LEAST_SAMPLES, round(LEAST_SECONDS / step)) if step > 0 else LEAST_SAMPLES
+    """Return the samples from which a run of one value is no chance, of samples every `step` s; 0: not known."""
+    return max(50, round(1.0 / step)) if step > 0 else 50
 
 
 def run_lengths(values: Array) -> NDArray[np.int64]:
@@ -122,7 +119,7 @@ def repeated(z: Array, step: float) -> Mask:
             spans = np.sort(others[: len(others) // least * least].reshape(-1, least), axis=1)
             different = (np.diff(spans, axis=1) > 0).sum(axis=1) + 1
             # Where all values hardly change when it is quiet, one that stays is rest.
-            coarse = len(spans) > 0 and np.percentile(different, QUIETEST) <= COARSE
+            coarse = len(spans) > 0 and np.percentile(different, 10.0) <= 3.0
             found[:, k] = long & (not coarse)
     return found
 
@@ -148,10 +145,9 @@ class Repeats:
 
 
 POINTS = 6  # of the interpolation
-HOLE = 1.5  # neighbours farther apart than so many of their usual intervals are not interpolated between
-PRESENT = 0.8  # share of a window that a channel gives to count in it
+PRESENT = 0.8  # share of a window that a channel gives to count in it: one message in ten may be lost, and an edge
 PORTION = 100_000  # samples worked on at once, about
-NOT_SHIFTED = 1e-6  # s; smaller delays are none
+NOT_SHIFTED = 1e-6  # s; smaller delays are none: of 100 rad/s^2 they make 1e-4 rad/s
 
 
 @dataclass
@@ -231,7 +227,8 @@ def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
         return np.full(len(x), -1), np.zeros((len(x), POINTS))
     first = np.clip(np.searchsorted(knots, x) - POINTS // 2, 0, len(knots) - POINTS)
     around = knots[first[:, None] + np.arange(POINTS)]
-    there = (np.ptp(around, axis=1) < (POINTS - 2 + HOLE) * usual) & (around[:, 0] <= x) & (x <= around[:, -1])
+    # With a sample missing they span one interval more.
+    there = (np.ptp(around, axis=1) < (POINTS - 0.5) * usual) & (around[:, 0] <= x) & (x <= around[:, -1])
     # Each with itself gives the factor 1.
     apart = around[:, :, None] - around[:, None, :] + np.eye(POINTS)
     from_x = np.where(np.eye(POINTS, dtype=bool), 1.0, (x[:, None] - around)[:, None, :])

@@ -35,15 +35,14 @@ UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere: th
 UNMEASURED = SCALE_STD / 2  # uncertainty of the axes along a direction of the body from which they are not measured
 UNKNOWN_AXES = 0.1  # the same of an array; axes from the motion alone are taken if they are off by more
 REFERENCE_STD = 1e-6  # of channels that are taken for as configured
-LEAST_DURATION = 10.0  # s
-LEAST_SAMPLES, LONGEST_STEP = 100, 1.0  # samples, and s from one to the next
+LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = 10.0, 100, 1.0  # s, samples, and s from one to the next
 LEAST_USABLE = 0.3  # share of its samples that a channel must give
 MOST_FAULTY = 0.35  # share of the recording; of a channel faulty for longer it cannot be said which is right
 MOST_LEFT_OUT = 1 / 3  # share of the channels of a set that is left out: of a larger one nobody knows which are right
 LOUDER = 4.0
 """A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
 would not believe, as the motion begins, that it is vibration."""
-LEAD = 1.0  # s before a declaration that a fault may have begun
+LEAD = 1.0  # s before a declaration that a fault may have begun: most are declared sooner
 LEAST_SKEW = 5e-5  # what imus.max_skew is at least where delays smaller than it are to be taken off, s
 WAITS = 2.5  # what imus.timeout is at least, in differences of the delays of units
 REPLACED = ("imus.mounts", "geometry.cone_channels")  # parameters that say nothing any more beside geometry.axes

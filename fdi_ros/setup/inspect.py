@@ -24,7 +24,6 @@ from fdi_ros.sources import Source, source_of_type
 from fdi_ros.system.text import date_of, shown
 
 GAP = 3.0  # intervals longer than this many usual ones are gaps
-_INTERVALS = 1_000_000  # intervals of a topic that are kept at most
 FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
 RECENT = 256  # messages in a row in which copies are looked for
 BELIEVED = 1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
@@ -48,7 +47,7 @@ class TopicReport:
     channels: int = 0  # values in a message, of what could be gyros; else 0
     announced: int = 0  # values that a message says it has: whatever its bytes claim
     largest: float = math.nan  # largest value that can be a rate, rad/s; NaN: there is none
-    intervals: list[Array] = field(default_factory=list)  # s, of the first messages
+    intervals: list[Array] = field(default_factory=list)  # s, of the first million messages
     copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
 
     def __post_init__(self) -> None:
@@ -113,7 +112,7 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
         report.interval = report.interval or float(np.median(steps))
         report.gaps += int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
         report.longest = max(report.longest, float(steps.max()))
-        if report.received - len(rows) < _INTERVALS:
+        if report.received - len(rows) < 1_000_000:
             report.intervals.append(steps)
     kind, messages = report.kind, (batch.buffer, batch.offset[rows], batch.length[rows])
     if kind is None or report.topic.encoding != "cdr":

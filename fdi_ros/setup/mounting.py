@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,8 +37,8 @@ from fdi_ros.report.layout import (
 )
 
 WAITS = (0.02, 0.1, 0.5, 2.0)  # times within which a fault may be found, s
-VIBRATION = 5.0  # times by which vibration raises the noise, where noise_std is that at rest
-LEAST_SAMPLES = 1.5  # below so many samples a mean delay is not computed: it depends on single samples
+VIBRATION = 5.0  # times by which vibration raises the noise, where noise_std is that at rest: an example
+ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
@@ -48,12 +48,12 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
     than two samples. White noise averages out in time. What scale and timing errors make of a turn does not while the
     turn lasts: they stay the same from sample to sample and add to the variance of the mean.
     """
-    limits, white, V = config.integrity, noise.noise_std**2, geometry.parity
+    limits, V, white = config.integrity, geometry.parity, noise.noise_std**2
     turning = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
 
     def found_within(wait: float, white: Array, lasting: Array | float) -> Array:
         samples = wait * config.sample_rate
-        if samples < LEAST_SAMPLES:
+        if samples < 1.5:
             return np.full(geometry.n, np.nan)
         inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
         gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
@@ -88,9 +88,6 @@ def smallest_shift(samples: float, run_length: float) -> float:
     return shift
 
 
-ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it
-
-
 class Loss(NamedTuple):
     """What is left after some channels are lost."""
 
@@ -117,25 +114,18 @@ class Mounting:
         # Pairs of channels that cannot be told apart, and those that can with effort.
         self.alike = np.argwhere(rho > SAME_DIRECTION).tolist()
         self.similar = np.argwhere((rho > ALIKE) & (rho <= SAME_DIRECTION)).tolist()
-
-    def lost(self, *numbers: int) -> list[Loss]:
-        """Losses of these numbers of channels."""
-        return [one for one in self.losses if len(one.lost) in numbers]
+        self.single = [one for one in self.losses if len(one.lost) < 2]
+        self.double = [one for one in self.losses if len(one.lost) == 2]
 
 
 def assess(config: Config) -> Mounting:
     """Assess the mounting of a configuration; `FdiError` if the settings do not fit each other."""
     geometry = build_geometry(config)
     noise, probability = build_noise(config, geometry.n), alarm_probability(config)
-    sets = itertools.chain.from_iterable(itertools.combinations(range(geometry.n), lost) for lost in range(3))
-    return Mounting(
-        geometry,
-        noise,
-        probability,
-        smallest_detectable(geometry, noise, probability),
-        waiting(config, geometry, noise),
-        tuple(loss(geometry, noise, lost) for lost in sets),
-    )
+    smallest, waited = smallest_detectable(geometry, noise, probability), waiting(config, geometry, noise)
+    sets = [lost for count in range(3) for lost in itertools.combinations(range(geometry.n), count)]
+    losses = tuple(loss(geometry, noise, lost) for lost in sets)
+    return Mounting(geometry, noise, probability, smallest, waited, losses)
 
 
 def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
@@ -182,17 +172,17 @@ def _size(value: float) -> str:
 def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[Column]:
     """Figures of losses."""
     names = result.geometry.channel_names
-    lost, seen, isolated = (
-        [[names[i] for i in numbers] for numbers in each]
-        for each in zip(*((one.lost, one.detectable, one.isolable) for one in losses), strict=True)
-    )
+
+    def named(channels: Callable[[Loss], Sequence[int]]) -> list[list[str]]:
+        return [[names[i] for i in channels(one)] for one in losses]
 
     def words(found: list[list[str]]) -> list[str]:
         left = [len(names) - len(one.lost) for one in losses]
         return ["all" if len(one) == most else _or_none(one) for one, most in zip(found, left, strict=True)]
 
+    seen, isolated = named(lambda one: one.detectable), named(lambda one: one.isolable)
     return [
-        Column("lost", lost, ("lost",), _or_none),
+        Column("lost", named(lambda one: one.lost), ("lost",), _or_none),
         Column("gdop", [one.gdop for one in losses], ("GDOP",), lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate"),
         Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), lambda v: number(v, ".5f"), unit.factor),
         Column("detectable", seen),
@@ -243,9 +233,9 @@ def pair_lines(result: Mounting) -> list[str]:
 
 def _double_words(result: Mounting) -> str:
     """Summary of the losses of two channels."""
-    double, names = result.lost(2), result.geometry.channel_names
-    spanning = sorted((loss for loss in double if np.isfinite(loss.gdop)), key=lambda loss: loss.gdop)
-    words = f"two lost: {len(spanning)} of {len(double)} pairs leave a rate"
+    names = result.geometry.channel_names
+    spanning = sorted((loss for loss in result.double if np.isfinite(loss.gdop)), key=lambda loss: loss.gdop)
+    words = f"two lost: {len(spanning)} of {len(result.double)} pairs leave a rate"
     if not spanning:
         return words
     best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
@@ -302,7 +292,7 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     rho = np.abs(g.rho)
     heat = {"type": "heatmap", "z": np.round(rho, 4).tolist(), "x": list(names), "y": list(names), "zmin": 0, "zmax": 1}
     drawn_rho = {"data": [heat], "layout": {"title": RHO_TITLE}}
-    losses = told(_losses(result, result.lost(0, 1), unit), unit)
+    losses = told(_losses(result, result.single, unit), unit)
     return [
         *fault_sections(result, unit),
         Section("Covariance of the rate", f"({unit.name})^2, at rest.", _matrix("xyz", covariance, ".3e")),
@@ -339,6 +329,6 @@ def mounting_page(result: Mounting, title: str, unit: Unit = RADIANS) -> str:
     sections = [
         Section("Axes", turned, "", [{"data": arrows, "layout": {"height": 560}}]),
         *mounting_sections(result, unit),
-        Section("After two", "", told(_losses(result, result.lost(2), unit), unit)),
+        Section("After two", "", told(_losses(result, result.double, unit), unit)),
     ]
     return page(f"fdi_ros: mounting of {title}", summary_lines(result, unit), sections)

@@ -11,7 +11,7 @@ itself is the lower envelope: the segments or windows that are about as quiet as
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,17 +20,16 @@ import numpy as np
 from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.errors import CalibrationError
 from fdi_ros.estimator.blocks import REST_STD, rests
-from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.estimator.noise import THREE_SIGMA
+from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
+from fdi_ros.estimator.noise import QUIETEST, THREE_SIGMA
 from fdi_ros.model.samples import Array, Int, Mask
 
-LENGTH = 1.0  # of a segment, s; longer where so few samples are in it that it could not be cut into blocks
+LENGTH = BLOCK_TIME * REST_BLOCKS  # of a segment, s; longer where so few samples are in it that blocks were empty
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-FEWEST, PART = 3, 100  # of the quietest segments so many, or one in so many, tell the noise at rest
-AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest is as quiet; rounds in which these are found
-QUIET = SLOWER = 2.0  # more noise is vibration; what is slower than a block may be so many times the other
-LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
+AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest, which chance makes, is as quiet; rounds of it
+LOUDER = 2.0  # noise this many times that of rest is vibration, and slower noise no more than it of the other
+LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has: 6 deg/s, beyond every data sheet of MEMS
 MOST = 4096  # segments kept; of a longer recording every second one, and so on: memory does not grow with its length
 
 
@@ -41,7 +40,7 @@ class NoiseSegment(NamedTuple):
     means: Array  # (`REST_BLOCKS`, c) of blocks, rad/s
     std: Array  # (c,) of the samples about their mean, rad/s: at rest their noise, also where a filter has smoothed it
     noise: Array  # (c,) of a sample, rad/s: what no smooth motion reaches; 0: the values never change
-    block_noise: Array  # (c,) of the blocks, with slower noise that is no more than `SLOWER` times as large
+    block_noise: Array  # (c,) of the blocks, with slower noise that is no more than `LOUDER` times as large
 
 
 class NoiseSegments:
@@ -91,7 +90,7 @@ class NoiseSegments:
         least, block = _least_noise(segments)
         known = np.full(self.channels, largest_bias**2 / THREE_SIGMA)
         rest = [
-            bool((one.noise <= QUIET * least).all())
+            bool((one.noise <= LOUDER * least).all())
             and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
             for one in segments
         ]
@@ -125,7 +124,7 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     for column in (*noise.T, *block.T):
         if column.any():
             column[column == 0.0] = np.median(column[column > 0.0])
-    quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
+    quiet = np.argsort((noise**2).sum(axis=1))[: max(3, len(noise) // 100)]
     for _ in range(ROUNDS):
         alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
         if len(alike) <= len(quiet):
@@ -137,12 +136,11 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
 def _segment(values: Array, first: int) -> NoiseSegment:
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
     least, std = _noise(means), values.std(axis=0)
-    return NoiseSegment(first, means, std, _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
+    return NoiseSegment(first, means, std, _noise(values), np.clip(means.std(axis=0), least, LOUDER * least))
 
 
 def _noise(values: Array) -> Array:
-    inside = len(SMOOTH) // 2
-    smooth = np.column_stack([np.convolve(column, SMOOTH, mode="valid") for column in values.T])
+    inside, smooth = len(SMOOTH) // 2, np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T])
     # Of white noise the parabola takes its share with it.
     noise = np.sqrt(np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside]))
     return np.where(noise > LEAST_NOISE, noise, 0.0)
@@ -151,12 +149,8 @@ def _noise(values: Array) -> Array:
 # Of windows -----------------------------------------------------------------------------------------------------------
 
 
-STEPS = 25
-LEAST_VARIANCE = 1e-18  # (rad/s)^2; of what shows no noise at all
-LEAST_SHARE = 0.1  # of the usual variance in a window: less for one channel is a split that nothing decides
-QUIETEST = 0.05  # quantile of the windows that is about the quietest
-LEAST_WINDOWS = 4
-MEMORY = 2  # windows on both sides that the noise of the moment is averaged over
+LEAST_VARIANCE = LEAST_NOISE**2  # (rad/s)^2; of what shows no noise at all
+MEMORY = 2  # windows on both sides that the noise of the moment is averaged over: 5 s, in which vibration stays
 
 
 @dataclass(frozen=True)
@@ -193,13 +187,14 @@ def variances(covariance: Array, axes: Array) -> Array:
     """Variance (W, n) of every channel in every window, from covariances (W, n, n) of its values, (rad/s)^2."""
     start = np.einsum("wab,ab->w", covariance, projector(axes)) / (len(axes) - 3)
     v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
-    for _ in range(STEPS):
+    for _ in range(25):
         a = information(v, axes)
         t = np.einsum("wij,wjk,wki->wi", a, covariance, a, optimize=True)
         checked = np.einsum("wii->wi", a) * v
         ratio = np.where(checked > 1e-6, t * v / np.maximum(checked, 1e-6), 1.0)
         v = v * np.clip(ratio, 0.1, 10.0)
-        v = np.maximum(v, np.maximum(LEAST_SHARE * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE))
+        # Less than the monitor believes of one channel is a split that nothing decides.
+        v = np.maximum(v, np.maximum(QUIETEST * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE))
     return v
 
 
@@ -221,18 +216,29 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
         same = (there == beside[shift : shift + len(there)]).all(axis=1)
         total += np.where(same[:, None, None], near[shift : shift + len(there)], 0.0)
         weight += same
-    averaged = total / np.maximum(weight, 1)[:, None, None]
-    found = np.full(there.shape, np.nan)
-    for rows, columns in patterns_of(there):
-        part = averaged[np.ix_(rows, columns, columns)]
-        found[np.ix_(rows, columns)] = variances(part, axes[columns])
+    found = _by_pattern(variances, total / np.maximum(weight, 1)[:, None, None], there, axes)
     known = np.isfinite(found)
     if not known.any():
         raise CalibrationError("more than three channels never give values at the same time: none checks another")
     some = known.any(axis=0)
-    usual = np.full(len(some), np.median(np.nanmedian(found[:, some], axis=0)))
-    usual[some] = np.nanmedian(found[:, some], axis=0)
+    medians = np.nanmedian(found[:, some], axis=0)
+    usual = np.full(found.shape[1], np.median(medians))
+    usual[some] = medians
     return np.where(known, found, usual)
+
+
+def _by_pattern(of: Callable[[Array, Array], Array], covariance: Array, there: Mask, axes: Array) -> Array:
+    """Work out a figure (W, n) of windows of the same channels, from covariances and axes; NaN: too few are there."""
+    found = np.full(there.shape, np.nan)
+    for rows, columns in patterns_of(there):
+        found[np.ix_(rows, columns)] = of(covariance[np.ix_(rows, columns, columns)], axes[columns])
+    return found
+
+
+def _residual_variances(covariance: Array, axes: Array) -> Array:
+    """Variance (W, n) of what the rate does not explain of each channel."""
+    apart = projector(axes)
+    return np.asarray(np.einsum("ia,wab,bi->wi", apart, covariance, apart, optimize=True))
 
 
 def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
@@ -248,10 +254,7 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
 
     The geometric mean of the channels: one that is always noisy hides nothing.
     """
-    residual = np.full(there.shape, np.nan)
-    for rows, columns in patterns_of(there):
-        part, apart = covariance[np.ix_(rows, columns, columns)], projector(axes[columns])
-        residual[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", apart, part, apart, optimize=True)
+    residual = _by_pattern(_residual_variances, covariance, there, axes)
     known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
     if known.any():
@@ -263,17 +266,15 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
 def _quietest(level: Array, count: Int) -> Mask:
     """Windows (W,) of finite level that are about as quiet as the quietest; all the same where there are few."""
     known = int(np.isfinite(level).sum())
-    order = np.argsort(level)[:known]
-    least = order[: max(LEAST_WINDOWS, round(QUIETEST * known))]
+    least = np.argsort(level)[:known][: max(4, round(0.05 * known))]
     quiet = np.zeros(len(level), dtype=bool)
     quiet[least] = True
     # The quietest of many are quiet by chance, too: the mean of all that are as quiet is not.
     for _ in range(ROUNDS if known else 0):
-        pooled = np.average(level[quiet], weights=count[quiet])
-        more = level < AS_QUIET * pooled
+        more = level < AS_QUIET * np.average(level[quiet], weights=count[quiet])
         if (more == quiet).all():
             break
-        quiet = more | (quiet & (level < AS_QUIET * pooled))
+        quiet = more
         quiet[least] = True
     return quiet
 
@@ -283,8 +284,7 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
 
     Of covariances (W, n, n) of so many (W,) samples in every window, (rad/s)^2.
     """
-    level, n = levels(covariance, there, axes), len(axes)
-    sums, precision, weight = np.zeros(n), np.zeros(n), np.zeros(n)
+    level, (sums, precision, weight) = levels(covariance, there, axes), np.zeros((3, len(axes)))
     windows = np.zeros(len(level), dtype=bool)
     # A unit that comes late has quiet windows of its own.
     for pattern in np.unique(there, axis=1).T:
@@ -292,16 +292,15 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
         windows |= quiet
         alike = (there == pattern[:, None]).all(axis=0)
         for rows, columns in patterns_of(there & quiet[:, None]):
-            samples = count[rows].sum()
-            v = variances(
-                np.average(covariance[np.ix_(rows, columns, columns)], axis=0, weights=count[rows])[None], axes[columns]
-            )[0]
+            samples, part = count[rows].sum(), covariance[np.ix_(rows, columns, columns)]
+            (v,) = variances(np.average(part, axis=0, weights=count[rows])[None], axes[columns])
             # Of A_ii v_i of the variance the redundancy shows; the rest is as the others have it.
             shown = np.maximum(np.diag(information(v, axes[columns])) * v, 0.1)
             chosen = alike[columns]
-            sums[columns[chosen]] += samples * v[chosen]
-            precision[columns[chosen]] += samples * shown[chosen] ** 2
-            weight[columns[chosen]] += samples
+            which = columns[chosen]
+            sums[which] += samples * v[chosen]
+            precision[which] += samples * shown[chosen] ** 2
+            weight[which] += samples
     known = weight > 0
     variance = sums / np.maximum(weight, 1)
     variance[~known] = np.median(variance[known]) if known.any() else LEAST_VARIANCE

@@ -50,12 +50,10 @@ from fdi_ros.system.text import LINE, shown
 
 SHOWN_AXES = UNMEASURED / 2  # uncertainty of the axes along a direction of the body from which they are not well shown
 LEAST_SHARE = 0.2  # part of a recording that supports its noise
-LARGE_SWING = float(np.radians(0.03))  # change of a bias within a recording that is worth a look, rad/s
-LARGE_BIAS = 0.2  # rad/s
-LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05  # axes that far from nominal are worth a look
+LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05  # of axes against nominal, that are worth a look
+LARGE_SWING, LARGE_BIAS = float(np.radians(0.03)), 0.2  # of biases, within a recording and at all, rad/s
 MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
 LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
-MOST_POINTS = 2000  # of a curve on the page
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"
@@ -445,7 +443,7 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
         return Section(title, hint, "", [{"data": curves, "layout": layout}])
 
     def curves(names: Sequence[str], x: Array, y: Array, **more: object) -> list[dict[str, object]]:
-        step = max(len(x) // MOST_POINTS, 1)
+        step = max(len(x) // 2000, 1)
         at, look = np.round(x[::step], 3).tolist(), {"type": "scatter", "mode": "lines", **more}
         lines = [{"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look} for i, name in enumerate(names)]
         values = [list(map(drawn, column * unit.factor)) for column in y[::step].T]

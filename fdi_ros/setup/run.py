@@ -45,10 +45,7 @@ from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
 WITHIN, TIMES = 4.0, 2  # s in which they are to be isolated, and how often each is tried
-CHANCE = 1  # biases fewer isolated are chance
-LESS_JUDGED = 0.02  # less in the share of samples judged is one at the edge of a gap
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0  # part kept aside, and its bounds, s: all biases have room
-MOST_NAMED = 12  # topics that an error names
 LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
 
 
@@ -96,9 +93,11 @@ class Proof:
             return f"it judges nothing: {after.note}"
         if new:
             return f"it declares {times_words(new)}"
-        if before.judged - after.judged > LESS_JUDGED:
+        # Less is one at the edge of a gap.
+        if before.judged - after.judged > 0.02:
             return f"{after.judged:.0%} of the samples are judged instead of {before.judged:.0%}"
-        if tried_before == tried and was - now > CHANCE:
+        # One fewer is chance.
+        if tried_before == tried and was - now > 1:
             return f"{now} of {tried} biases are isolated instead of {was}"
         return ""
 
@@ -203,7 +202,7 @@ def set_up(
             f"{shown(one.topic.name)} ({shown(one.topic.type or 'unknown')}, {one.received} messages)"
             for one in reports
         ]
-        words = first_of(topics, MOST_NAMED, "; ") or "none"
+        words = first_of(topics, 12, "; ") or "none"
         raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {words}")
     if lacking:
         raise BagError(f"{bag} needs {lacking}; mend the driver")

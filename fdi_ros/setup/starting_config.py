@@ -3,8 +3,8 @@
 
 """What a recording is fit for (gyros enough, in rad/s, of one clock, each by itself), and a config to start from.
 
-These are the findings of ``fdi inspect``, and refusals that inspection, set-up, calibration, replay and fleet share. All
-that is found stands in one table: of it come the verdict, the lines for people and the figures in JSON.
+These are the findings of ``fdi inspect``, and refusals that inspection, set-up, calibration, replay and fleet share.
+All that is found stands in one table: of it come the verdict, the lines for people and the figures in JSON.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import DEGREES, RADIANS, Severity, Unit, Verdict, first_of
-from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, SQUARE, angle_of, find_turn
+from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, SHARED, SQUARE, angle_of, find_turn
 from fdi_ros.setup.blocks import WINDOW
-from fdi_ros.setup.inspect import BELIEVED, FASTEST, TopicReport, inspect, troubles
+from fdi_ros.setup.inspect import BELIEVED, FASTEST, GAP, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
 from fdi_ros.sources import SOURCES, input_of
 from fdi_ros.system.text import LINE, shown
@@ -225,9 +225,7 @@ def _copied(report: TopicReport) -> str:
 
 NEAR = 0.2  # a factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less
 QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)  # of the rates of a unit, that are compared with those of another
-FAST_SHARE, FAST_TIME, FAST_RANGE = 0.01, 0.5, 2.0
-"""Share of the time, or s, beyond every gyro's range: less is a shock or damage. What is deg/s exceeds it by no more
-than so many times the factor of a degree."""
+FAST_SHARE, FAST_TIME = 0.01, 0.5  # share of the time, or s, beyond every gyro's range: less is a shock or damage
 STILL, NOISIEST = 0.3, 0.02  # share of a recording that lies still; noise there, rad/s, that no gyro at rest has
 
 
@@ -262,7 +260,8 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     """Whether rates, less than a shock or damage makes, are beyond the range of gyros for long."""
     largest = np.abs(report.segments.means).max(axis=1)
     beyond = largest > largest_rate
-    lasting = beyond & (largest < FAST_RANGE * DEGREES.factor * largest_rate)
+    # Of what is deg/s no gyro shows more than twice its range.
+    lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
     seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())
     return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
 
@@ -292,12 +291,8 @@ def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
 
 _NUMBERED = re.compile(r"/imu_[0-9]{1,3}")  # topics of flight logs, which name units as a config does
 _REST = 3.0  # time at the start over which the bias could be learned, s
-_MOSTLY = 0.5  # share of a recording in motion from which its noise is that in motion
 _TIMEOUT = float(PARAMETERS["imus.timeout"].default)  # s; that of health.stale_timeout is the same
 _BRIDGED = 1.1 / MAX_BRIDGE  # message intervals in a timeout: so that alignment draws a line from one to the next
-_EXPLAINED = 0.3  # a rotation must bring the difference between two units down to this share: a fault stays
-_USUAL = 0.999  # share of the intervals that a timeout must bear
-_SILENT = 3.0  # message intervals without a value after which a channel may be called silent
 
 
 @dataclass(frozen=True)
@@ -364,7 +359,8 @@ def _turned_units(path: Path, config: Config) -> str:
     turned = []
     for name, rate in zip(names[1:], others, strict=True):
         rotation = find_turn(first, rate)[0]
-        explained = np.std(rate @ rotation.T - first) < _EXPLAINED * np.std(rate - first)
+        # A fault stays, whatever the rotation.
+        explained = np.std(rate @ rotation.T - first) < (1.0 - SHARED) * np.std(rate - first)
         if explained and angle_of(rotation) > SQUARE:
             turned.append(f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}")
     return ", ".join(turned)
@@ -418,7 +414,7 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         )
         known["channels.topic"], known["geometry.preset"] = (topics[0], ""), ("cone", words)
         known["geometry.cone_channels"] = chosen[0].channels, ""
-    if silent := _longer(chosen, _SILENT, 60.0):
+    if silent := _longer(chosen, GAP, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
     parameters = {name: value for name, (value, _) in known.items()}
     return StartingConfig(shown(bag.name), parameters, {name: words for name, (_, words) in known.items() if words})
@@ -429,7 +425,7 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     noise = [report.segments.noise() for report in chosen]
     share, levels = min(one.share for one in noise), np.concatenate([one.moving for one in noise])
     words = f"in motion ({share:.0%} of the recording), vibration included"
-    if not (share > _MOSTLY and np.isfinite(levels).all() and (levels > 0).all()):
+    if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
         quiet = np.concatenate([one.quiet for one in noise])
         usable = np.isfinite(quiet) & (quiet > 0)
         if not usable.any():
@@ -442,7 +438,7 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
 
 def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
     """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
-    nearly_all = [float(np.quantile(np.concatenate(one.intervals), _USUAL)) for one in chosen if one.intervals]
+    nearly_all = [float(np.quantile(np.concatenate(one.intervals), 0.999)) for one in chosen if one.intervals]
     needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
     return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
 
