@@ -169,13 +169,13 @@ def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
 
 def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> None:
     one, other = Autopilot("px4", system=3), Autopilot("px4", system=7, seed=9)
-    talk = Conversation(one, other, kind="SCALED_IMU")
+    talk = Conversation(one, other)
     stranger = mavlink.MAVLink(None, 9, 1)
     beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(stranger))
     # A heartbeat that comes first takes nothing from who has gyros, and later ones change nothing.
     talk.inject(beat)
     other.step, steps = lambda now: [], other.step
-    talk.run(7.0)
+    talk.run(9.0)
     check_flight(talk, one, since=2.0)
     for _ in range(20):
         talk.inject(beat)
@@ -183,8 +183,8 @@ def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> N
     check_flight(talk, one)
     one.step, other.step = other.step, steps
     one.take = lambda data, now: []
-    talk.run(14.0)
-    assert talk.vehicle.system == 7
+    talk.run(17.0)
+    assert (talk.vehicle.system, talk.vehicle.kind) == (7, "SCALED_IMU")
     check_flight(talk, other)
 
 
