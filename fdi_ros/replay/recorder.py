@@ -146,9 +146,11 @@ class Recorder:
         standing = [self._ended(one, None) for one in self._open]
         kept = [*self._episodes, *(one for one in standing if one is not None and (one.declares or one.start_s <= end))]
         parts = [*self._stretches, *([] if self._part is None else [self._part])]
-        times = [{name: round(getattr(one, name), 9) for name in ("start_s", "end_s", "watched_s")} for one in parts]
-        stretches = tuple(replace(one, **own) for one, own in zip(parts, times, strict=True))
-        return Story(stretches, tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
+        stretches = [
+            Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))
+            for one in parts
+        ]
+        return Story(tuple(stretches), tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
         """Return what the states (N, n) say; what hides nothing says nothing."""
@@ -333,7 +335,7 @@ class Recorder:
         if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
             return None
         geometry, names = self._geometry, self._geometry.channel_names
-        sizes = {i: one.batches[i,].size(one.since) for i in one.members if (i,) in one.batches}
+        sizes = {key[0]: batches.size(one.since) for key, batches in one.batches.items() if len(key) == 1}
         candidates = [Candidate(names[i], axis_words(geometry, i), sizes.get(i)) for i in sorted(one.members)]
         episode = Episode(
             stretch=len(self._stretches) + 1,

@@ -32,7 +32,7 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.monitor.status import ChannelStatus
-from fdi_ros.replay.episodes import GAP, Episode, pieces
+from fdi_ros.replay.episodes import GAP, pieces
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
@@ -213,9 +213,12 @@ class Judge(Walk):
             protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
         )
-        story = self._recorder.story(end)
-        episodes = tuple(replace(one, injected=self._explaining(one)) for one in story.episodes)
-        return Judgement(status.detector, evaluation.scores(), monitor, replace(story, episodes=episodes))
+        story, episodes = self._recorder.story(end), []
+        for one in story.episodes:
+            known = [followed.fault for followed in evaluation.faults if followed.explains(one.start_s, one.ever)]
+            injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
+            episodes.append(replace(one, injected=injected))
+        return Judgement(status.detector, evaluation.scores(), monitor, replace(story, episodes=tuple(episodes)))
 
     def _channels(self, end: float, statuses: Sequence[ChannelStatus]) -> Iterator[ChannelResult]:
         """Yield each channel as it was at a time near the end, s, with what its status at the end says beside."""
@@ -230,11 +233,6 @@ class Judge(Walk):
                 state, reason = changes[0].before, ""
             drift, noise = status.drift, status.noise or None
             yield ChannelResult(status.name, state, since, reason, drift, noise, unchecked, rms)
-
-    def _explaining(self, one: Episode) -> tuple[str, ...]:
-        """Name the injected faults that explain an episode."""
-        known = [followed.fault for followed in self.evaluation.faults if followed.explains(one.start_s, one.ever)]
-        return tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
 
     @property
     def _end(self) -> float:

@@ -87,8 +87,8 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     `FaultError` if it is not of that form, or a number does not fit its kind.
     """
     items = key_values(text)
-    for name in items.keys() & {"channel", "start", "stop", "seed"}:
-        raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
+    if chosen := [name for name in items if name in ("channel", "start", "stop", "seed")]:
+        raise FaultError(f"fault {text!r}: {chosen[0]} is chosen by the sweep")
     kind = items.pop("kind", "")
     if kind in FAULT_KINDS and FAULT_KINDS[kind].whole_unit:
         raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
@@ -119,16 +119,11 @@ class Baseline:
     """What the monitor says of a recording as it is, nothing injected."""
 
     judgement: Judgement
-    is_judged: Mask  # (N,)
+    judged: float  # share of the samples
     doubtful: Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
     speed: Array  # (N,) fused rate, rad/s; NaN: none.
     begins: float  # when it first judges, s; NaN: never.
     duration: float  # from the first sample to the last, s
-
-    @property
-    def judged(self) -> float:
-        """Share of the samples that are judged."""
-        return float(self.is_judged.mean())
 
     @property
     def declared(self) -> list[StateChange]:
@@ -164,7 +159,7 @@ def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
     judged, doubtful, speed = kept.columns
     seconds = _seconds(block)
     begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
-    return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
+    return Baseline(judge.judgement(), float(judged.mean()), doubtful, speed, begins, float(seconds[-1]))
 
 
 def _seconds(block: Block) -> Array:

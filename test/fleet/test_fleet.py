@@ -239,7 +239,7 @@ def test_what_is_there_is_not_judged_again(fleet, tmp_path, monkeypatch):
     run(tmp_path / "o", *given)
     before = both(tmp_path / "o")
 
-    def none(*_):
+    def none(*_, **__):
         raise AssertionError("judged again")
 
     with monkeypatch.context() as patched:
