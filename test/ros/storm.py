@@ -12,6 +12,7 @@ import contextlib
 import math
 import random
 import re
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,9 +22,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions
-from mavlink.attack import KINDS as PACKETS
-from mavlink.attack import Attacker
 from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring, running, wait
@@ -45,6 +45,50 @@ NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_value
 WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)
 WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
+
+
+PACKETS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
+BURST, FLOOD = 20, 2000  # packets sent at once
+NUMBERS = sorted(number for number in dialect.mavlink_map if number >= 0)
+
+
+class Attacker:
+    """Sends hostile packets, in kinds, to a MAVLink port of this machine; seed: of all choices."""
+
+    def __init__(self, port: int, seed: int = 0) -> None:
+        self._port, self._draw = port, np.random.default_rng(seed)
+        self._own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._codec = dialect.MAVLink(None)
+
+    def burst(self, kind: str) -> int:
+        """Send some packets of a kind; how many."""
+        if kind == "strangers":
+            # Each from a port of its own.
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+                return self._send(stranger, [self._packet(kind)])
+        made = [self._packet(kind) for _ in range(BURST if kind != "flood" else FLOOD // 10)]
+        return self._send(self._own, made if kind != "flood" else 10 * made)
+
+    def close(self) -> None:
+        self._own.close()
+
+    def _send(self, source: socket.socket, packets: list[bytes]) -> int:
+        for packet in packets:
+            with contextlib.suppress(OSError):
+                source.sendto(packet, ("127.0.0.1", self._port))
+        return len(packets)
+
+    def _packet(self, kind: str) -> bytes:
+        """Make any message of the dialect, with any payload, of a system; or what is none."""
+        draw, codec = self._draw, self._codec
+        if kind == "garbage":
+            return draw.bytes(int(draw.integers(1, 400)))
+        message = dialect.mavlink_map[int(draw.choice(NUMBERS))]
+        payload = draw.bytes(message.unpacker.size) if draw.random() < 0.7 else bytes(message.unpacker.size)
+        codec.srcSystem = 1 if kind in ("any message in its name", "strangers") else int(draw.integers(2, 256))
+        codec.srcComponent, codec.seq = int(draw.choice([1, 1, 1, draw.integers(256)])), int(draw.integers(256))
+        data = bytes(dialect.MAVLink_message(message.id, message.msgname)._pack(codec, message.crc_extra, payload))
+        return data[: int(draw.integers(1, len(data)))] if kind == "cut messages" else data
 
 
 class Storm:
