@@ -23,7 +23,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class CsvLog(FlightLog):
     magic = b""
     refusal = "is no table of text (.csv)"
     kinds = (KIND,)
-    settings: ClassVar = {"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"}
+    settings = f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"
     one_imu = "this table has one IMU ({}): nothing to compare it with"
     slowest = 5.0
 

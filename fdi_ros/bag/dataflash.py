@@ -26,7 +26,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +66,6 @@ _SUBSYSTEMS: dict[Any, str] = (
     | {18: "barometer", 25: "thrust loss", 29: "vibration failsafe", 30: "internal error"}
 )
 """Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
-_FIRMWARE = re.compile(r"(?i)(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Blimp|AntennaTracker)\b.* V[0-9]")
-"""What a MSG record says of the vehicle, as in ``APM:Copter V3.2`` or ``ArduPlane V4.5.7``."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
 _FIX = 3  # GPS status from which on the time is known: a fix in three dimensions
@@ -123,10 +121,9 @@ class DataflashLog(FlightLog):
     magic = b"\xa3\x95"
     refusal = "is no log of ArduPilot"
     kinds = tuple(_VALUES)
-    settings: ClassVar = {
-        "Copter": "ArduCopter: LOG_BITMASK bit 18, Fast IMU",
-        "": "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros",
-    }
+    settings = (
+        "ArduPilot: LOG_BITMASK bit 18, Fast IMU (ArduCopter), or bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros"
+    )
     one_imu = (
         "this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
         " INS_ENABLE_MASK names"
@@ -203,11 +200,9 @@ class DataflashLog(FlightLog):
                     self._lacking[number] = str(error)
 
     def _take_texts(self, name: str, rows: Rows) -> None:
-        """Take in what records (k,) say, and what of that names the vehicle."""
+        """Take in what records (k,) say."""
         if name == "MSG":
             texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
-            vehicles = (match[1].title() for one in texts if (match := _FIRMWARE.match(one)))
-            self.vehicle = self.vehicle or next(vehicles, "")
         else:
             texts = list(map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist()))
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):

@@ -163,8 +163,7 @@ class FlightLog(BagFile):
     """
 
     kinds: ClassVar[tuple[str, ...]]  # messages that samples of every IMU are logged in
-    settings: ClassVar[Mapping[str, str]]
-    """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
+    settings: ClassVar[str]  # line of the documentation by which all IMUs are logged fast enough
     one_imu: ClassVar[str]  # sentence for a log of a single IMU, with a place for what of it is logged
     slowest: ClassVar[float] = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
@@ -173,16 +172,11 @@ class FlightLog(BagFile):
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: ClassVar[str] = ""
     """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
-    most: ClassVar[int] = 0  # bytes of a log that is read whole; 0: it is read in portions, and may have any size
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
         super().__init__(path, damage, most)
         self.end = self.size  # the log is read up to there, bytes
         try:
-            if self.most and self.end > self.most:
-                raise BagError(
-                    f"{path} has {self.end >> 20} MB, expected at most {self.most >> 20}: such a log is read whole"
-                )
             while not self._survey():
                 pass
             self._sources = self._choose()
@@ -199,7 +193,6 @@ class FlightLog(BagFile):
         """Begin a walk: what one before it has found counts no more."""
         self.unread: dict[str, str] = {}  # messages of IMUs that are there and cannot be read, by name, and why
         self.counts: Counter[str] = Counter()  # records of every message, by name
-        self.vehicle = ""  # kind of vehicle by the name of its firmware; empty: not known
         self.start_utc: int | None = None  # UTC of the start of the autopilot, us since 1970; None: not known.
         self.said: list[LogText] = []  # what the autopilot said up to the place that was read, us
 
@@ -357,7 +350,7 @@ class FlightLog(BagFile):
             there.append(f"{self.selected} of the one selected IMU {alone[0].figures}")
         if unread and not there:
             return f" has of IMUs only {', '.join(unread)}: {MESSAGES}"
-        setting = f"{self.settings.get(self.vehicle, self.settings[''])} ({SETTINGS})"
+        setting = f"{self.settings} ({SETTINGS})"
         if not there:
             most = ", ".join(f"{count} {shown(name, 32)}" for name, count in self.counts.most_common(_MOST_NAMES))
             return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}: {setting}"

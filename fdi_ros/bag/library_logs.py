@@ -71,11 +71,15 @@ Columns = Mapping[str, NDArray[Any]]
 class LibraryLog(FlightLog):
     """An open log, read whole."""
 
+    most: ClassVar[int]  # bytes that it may have
     together: ClassVar[int]  # messages of a source handed on at once, about
 
     def begin(self) -> None:
         """Begin a walk, and read the log up to `end`."""
         super().begin()
+        if self.size > self.most:
+            sizes = f"{self.size >> 20} MB, expected at most {self.most >> 20}"
+            raise BagError(f"{self.path} has {sizes}: such a log is read whole")
         self.file.seek(0)
         self._columns = self.load(self.file.read(self.end))
 
@@ -146,7 +150,7 @@ class Ulog(LibraryLog):
     magic = b"ULog\x01\x12\x35"
     refusal = "is no log of PX4"
     kinds = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo")
-    settings: ClassVar = {"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"}
+    settings = "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"
     one_imu = (
         "this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
         f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n"
@@ -352,7 +356,7 @@ class Tlog(LibraryLog):
     magic = b"\0"
     refusal = "is no log of a ground station (.tlog)"
     kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
-    settings: ClassVar = {"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"}
+    settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
     one_imu = (
         "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
         " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"

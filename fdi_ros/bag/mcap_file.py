@@ -112,9 +112,7 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
 T = TypeVar("T")
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-_FIRST, _RUN = 1 << 16, 1 << 22
-"""Messages outside chunks are read in runs of at most this many bytes; tried with fewer first."""
-_STOPS = tuple(bytes([opcode]) for opcode in (CHUNK, STATISTICS, FOOTER))
+_RUN = 1 << 18  # messages outside chunks are read in runs of at most this many bytes
 _TOGETHER = 1 << 16  # pieces are handed on together until they hold so many bytes: each batch has its cost
 
 
@@ -230,12 +228,7 @@ class McapFile(BagFile):
         if end - position > CHUNK_BYTES:
             self.note(f"the message at byte {position} is too long and was left out")
             return end
-        for size in (_FIRST, _RUN):
-            data = self._read(position, max(size, end - position))
-            found, topics, stop = walk(data, outside=True)
-            # The run may go on behind the bytes that were read.
-            if position + len(data) == self.size or data[stop : stop + 1] in _STOPS:
-                break
+        found, topics, stop = walk(self._read(position, max(_RUN, end - position)), outside=True)
         if len(found):
             self._found.append(Piece(max(0, int(found.log_time.min())), position, stop, stop))
         for opcode, content in topics:

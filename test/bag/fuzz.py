@@ -242,7 +242,6 @@ def recording(draw, folder):
     odd = ("../config.yaml", "/dev/zero", "\x00", "../bag/bag_0.mcap", "x" * 5000, ".")
     names += draw.choices(odd, k=draw.random() < 0.75)
     about = {"version": 9, "relative_file_paths": names, "topics_with_message_count": []}
-    about["compression_mode"] = draw.choice(("", "MESSAGE", "FILE"))
     if draw.random() < 0.9:
         write(bag / "metadata.yaml", odd_yaml(draw, json.dumps({"rosbag2_bagfile_information": about}, indent=1)))
     return bag

@@ -84,7 +84,7 @@ def format_record(number, name, form, columns):
     return HEAD + struct.pack("<BBB4s16s64s", 128, number, size, name.encode(), form.encode(), columns.encode())
 
 
-def write_dataflash(path, units, kind="IMU", gps=True, vehicle=b"ArduCopter V4.5.7", extra=b""):
+def write_dataflash(path, units, kind="IMU", gps=True, extra=b""):
     """A log as ArduPilot writes it; kind IMU or GYR (with instances), or one of `INSTANCES`."""
     old = kind in ("TimeMS", "GYR1")
     described = {"PARM": MESSAGES["PARM"], "GPS": OLD_GPS if old else MESSAGES["GPS"], "MSG": MESSAGES["MSG"]}
@@ -99,7 +99,7 @@ def write_dataflash(path, units, kind="IMU", gps=True, vehicle=b"ArduCopter V4.5
         format_record(number, name, form, columns) for name, (number, form, columns) in (described | sensors).items()
     ]
     out.append(HEAD + struct.pack("<BQ16sff", 64, 1_000_000, b"LOG_BITMASK", 180_222.0, 176_126.0))
-    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, vehicle))
+    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, b"ArduCopter V4.5.7"))
     out.append(extra)
     samples = np.concatenate([_samples(unit, k, tuple(sensors.values())) for k, unit in enumerate(units)])
     time = "TimeMS" if old else "TimeUS"

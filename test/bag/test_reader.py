@@ -87,14 +87,6 @@ def test_a_part_is_read_by_seconds_from_the_first_message(tmp_path):
     np.testing.assert_array_equal(values, z[100:200])
 
 
-def test_a_topic_that_stops_leaves_the_other_one(tmp_path):
-    messages, z = flight(SAMPLES)
-    stops = [m for m in messages if m[0] == TOPICS[0] or m[1] < START + 100 * STEP]
-    _, values, _ = read(write_mcap(tmp_path / "bag.mcap", stops))
-    z[100:, 3:] = np.nan
-    np.testing.assert_array_equal(values, z)
-
-
 def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     z = np.random.default_rng(0).normal(size=(50, 6))
     times = START + np.array([0, 0, 0, *range(3, 50)]) * STEP
@@ -255,9 +247,6 @@ def test_a_database_that_another_program_damaged_is_read_as_far_as_it_goes(tmp_p
     assert samples.recording.damage.report()
     known = np.isin(stamp, START + STEP * np.arange(3000)) & np.isfinite(values).all(axis=1)
     np.testing.assert_array_equal(values[known], z[(stamp[known] - START) // STEP])
-
-
-# Records in a run of bytes: those that a plain reading of the format finds, however the bytes are damaged ------------
 
 
 def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
