@@ -432,8 +432,3 @@ def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
 def finite(value: float) -> float | None:
     """Return a value, or None where it is not finite."""
     return value if math.isfinite(value) else None
-
-
-def settled(value: float) -> float:
-    """Value to nine digits: what linear algebra gives alike on all machines."""
-    return float(f"{value:.9g}")

@@ -261,6 +261,7 @@ def page(
     from, ns; None: not known.
     """
     looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
+    links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
     for section in (_speaking(section, store) for section in sections):
@@ -269,7 +270,7 @@ def page(
     parts = {
         "TITLE": escape(title),
         "VERDICT": "".join(f"<li{look}>{escape(line)}</li>" for look, line in zip(looks, summary, strict=False)),
-        "CONTENTS": _contents(sections),
+        "CONTENTS": f'<nav aria-label="contents">{links}</nav>' if len(sections) >= FEWEST_LINKED else "",
         "BODY": "\n".join(part for part in body if part),
         "STYLE": _resource("page.css"),
         "DATA": _safe_json(
@@ -283,12 +284,6 @@ def page(
     }
     # In one pass: what is put in is not searched for places.
     return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
-
-
-def _contents(sections: Sequence[Section]) -> str:
-    """Lay out links to the sections."""
-    links = (f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
-    return f'<nav aria-label="contents">{"".join(links)}</nav>' if len(sections) >= FEWEST_LINKED else ""
 
 
 def _anchor(section: Section) -> str:
