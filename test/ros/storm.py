@@ -39,8 +39,7 @@ STACK = ROOT / "config" / "px4.yaml"
 CONFIG = Config.from_file(STACK)
 NODES = ("fdi_node", "mavlink_node")
 
-OUTSTANDING = 8
-"""Requests that wait for their answers: DDS keeps ten of a service."""
+OUTSTANDING = 8  # requests that wait for their answers: DDS keeps ten of a service
 NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_values", "use_sim_time"]
 WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)

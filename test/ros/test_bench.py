@@ -148,9 +148,6 @@ def test_what_cannot_be_played_is_said_in_one_line() -> None:
     assert_refused("player_node", refused, "--ros-args", "--params-file", str(FILE))
 
 
-# Faults on the way ----
-
-
 @pytest.fixture(scope="module")
 def injector(tmp_path_factory):
     """(listener, what came out of each topic, the injector's last status)."""

@@ -28,8 +28,7 @@ from fdi_ros.sources import ImuSource
 
 FAULTY = int(ChannelState.FAULTY)
 DECLARED = (FAULTY, int(ChannelState.AMBIGUOUS))
-Y2 = 4
-"""Channel imu_2.y."""
+Y2 = 4  # channel imu_2.y
 
 
 @pytest.fixture(scope="module")

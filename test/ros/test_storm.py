@@ -22,8 +22,7 @@ from fdi_ros.ros.node import MOST_LINES, REPORT_PERIOD, BoundedLog
 from fdi_ros.ros.running import QUIET, ChangeLog
 
 SECONDS = 0.7
-THROTTLED = 10
-"""Lines that are limited each by itself, at most so many a second together."""
+THROTTLED = 10  # lines that are limited each by itself, at most so many a second together
 OK, UNCHECKED, SUSPECT = ChannelState.OK, ChannelState.UNCHECKED, ChannelState.SUSPECT
 AMBIGUOUS, FAULTY = ChannelState.AMBIGUOUS, ChannelState.FAULTY
 NAMES = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
