@@ -223,11 +223,7 @@ class Callback:
 
 def callback(*records: type) -> Callable[[Callable[..., None]], Callback]:
     """Make a function over records one that `call` reaches through its address."""
-
-    def decorate(function: Callable[..., None]) -> Callback:
-        return Callback(_quiet(function) if INTERPRETED else function, records)
-
-    return decorate
+    return lambda function: Callback(_quiet(function) if INTERPRETED else function, records)
 
 
 def as_input(values: Any, kind: Any) -> NDArray[Any]:

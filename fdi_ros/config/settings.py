@@ -67,38 +67,34 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
     A list may be given as its only item, a number as text (PyYAML reads 1e-3, without a point, as text; ROS reads it as
     the number it is).
     """
-    if field.kind not in ("numbers", "texts"):
-        return _check_one(field, field.kind, value, name, error)
-    # ROS hands an empty array over as an empty byte array: it has no type of its own.
-    items = list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else [value]
-    kind = "float" if field.kind == "numbers" else "text"
-    return tuple(_check_one(field, kind, item, name, error) for item in items)
-
-
-_EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}
-
-
-def _check_one(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> Any:
-    if kind in ("int", "float"):
-        return _check_number(field, kind, value, name, error)
-    if not isinstance(value, bool if kind == "bool" else str):
-        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}")
+    if field.kind in ("numbers", "texts"):
+        # ROS hands an empty array over as an empty byte array: it has no type of its own.
+        items = list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else [value]
+        one = dataclasses.replace(field, kind="float" if field.kind == "numbers" else "text")
+        return tuple(check(one, item, name, error) for item in items)
+    if field.kind in ("int", "float"):
+        return _check_number(field, value, name, error)
+    if not isinstance(value, bool if field.kind == "bool" else str):
+        raise error(f"{name} is {value!r}, expected {_EXPECTED[field.kind]}")
     if field.choices and value not in field.choices:
         raise error(f"{name} is {value!r}, expected one of: {', '.join(field.choices)}")
     return value
 
 
-def _check_number(field: Field, kind: str, value: Any, name: str, error: type[FdiError]) -> float:
+_EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}
+
+
+def _check_number(field: Field, value: Any, name: str, error: type[FdiError]) -> float:
     unit = field.unit_suffix
     try:
         number = float("no number" if isinstance(value, bool) else value)
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{name} is {value!r}, expected {_EXPECTED[kind]}") from None
+        raise error(f"{name} is {value!r}, expected {_EXPECTED[field.kind]}") from None
     if not field.low <= number <= field.high:
         raise error(f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")
-    if kind == "int" and not number.is_integer():
+    if field.kind == "int" and not number.is_integer():
         raise error(f"{name} is {number:g}{unit}, expected a whole number")
-    return int(number) if kind == "int" else number
+    return int(number) if field.kind == "int" else number
 
 
 # Sections of the settings: a frozen dataclass each, a ROS parameter a field -------------------------------------------

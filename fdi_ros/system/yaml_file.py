@@ -22,6 +22,9 @@ except ImportError:  # PyYAML built without libyaml
 class _Refused(yaml.YAMLError):  # type: ignore[misc]
     """The text is YAML, and beyond what is taken."""
 
+    def __init__(self, mark: Any, words: str) -> None:
+        super().__init__(f"line {mark.line + 1}: {words}")
+
 
 _KINDS = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
 _TAG = "tag:yaml.org,2002:"
@@ -44,14 +47,14 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
         """Value of a number."""
         text = self.construct_scalar(node)
         if len(text) > YAML_DIGITS:
-            raise _refused(node.start_mark, f"a number of {len(text)} characters, expected at most {YAML_DIGITS}")
+            raise _Refused(node.start_mark, f"a number of {len(text)} characters, expected at most {YAML_DIGITS}")
         kind = node.tag.removeprefix(_TAG)
         try:
             value: int | float = self.construct_yaml_int(node) if kind == "int" else self.construct_yaml_float(node)
         except (ValueError, IndexError, OverflowError) as error:
-            raise _refused(node.start_mark, f"{text!r} is no {kind}") from error
+            raise _Refused(node.start_mark, f"{text!r} is no {kind}") from error
         if kind == "int" and not -(2**63) <= value < 2**64:
-            raise _refused(node.start_mark, f"{text} does not fit into 64 bits")
+            raise _Refused(node.start_mark, f"{text} does not fit into 64 bits")
         return value
 
     def truth(self, node: yaml.Node) -> bool:
@@ -59,16 +62,12 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
         try:
             return bool(self.construct_yaml_bool(node))
         except KeyError as error:
-            raise _refused(node.start_mark, f"{node.value!r} is neither true nor false") from error
+            raise _Refused(node.start_mark, f"{node.value!r} is neither true nor false") from error
 
 
 _Loader.add_constructor(f"{_TAG}int", _Loader.number)
 _Loader.add_constructor(f"{_TAG}float", _Loader.number)
 _Loader.add_constructor(f"{_TAG}bool", _Loader.truth)
-
-
-def _refused(mark: Any, words: str) -> _Refused:
-    return _Refused(f"line {mark.line + 1}: {words}")
 
 
 def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
@@ -122,7 +121,7 @@ def _check_size(text: str) -> None:
             anchor, before = event.anchor, count
             alias = isinstance(event, yaml.AliasEvent)
             if alias and event.anchor not in sizes:
-                raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
+                raise _Refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
             count += sizes[event.anchor] if alias else 1
         else:
             continue
@@ -131,6 +130,6 @@ def _check_size(text: str) -> None:
         elif anchor:
             sizes[anchor] = count - before
         if len(outer) > YAML_DEPTH:
-            raise _refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
+            raise _Refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
         if count > YAML_NODES:
-            raise _refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
+            raise _Refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
