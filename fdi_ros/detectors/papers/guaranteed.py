@@ -3,14 +3,9 @@
 
 """Guaranteeing (set-membership) detection: bounded errors, no statistics, up to two arbitrary channels.
 
-It rests on the circuits of the sensitivity axes: smallest sets of channels that check one another. A circuit is a set
-of channels whose axes are linearly dependent while those of every proper subset are not: two parallel axes, three in a
-plane, four in space. It carries exactly one check ``nu . z`` that no body rate moves. Every statement about bounded
-errors follows from the circuits alone (vertices of the dual linear programmes):
-
-- bounds b hold for a set of channels iff ``|nu . z| <= sum b |nu|`` for every circuit inside the set;
-- the error of channel i lies within ``(nu . z +- sum_{j != i} b_j |nu_j|) / nu_i`` for every circuit whose other
-  members keep their bounds, and the tightest of these is the whole truth.
+It rests on the circuits of the sensitivity axes: smallest sets of channels with dependent axes, two parallel ones,
+three in a plane, four in space. Each carries exactly one check ``nu . z`` that no body rate moves, and every statement
+about bounded errors follows from these alone, as docs/methods.md#guaranteed has it.
 """
 
 from __future__ import annotations

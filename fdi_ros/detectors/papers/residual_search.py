@@ -29,16 +29,10 @@ TOLERANCES = ("calibrated", "paper")
 
 
 class ResidualSearch(SingleFaultDetector):
-    """Search for the channel that disagrees, by one of four criteria; then its tolerance.
+    """Search for the channel that disagrees, by one of four criteria of Gorelov et al. 2019; then its tolerance.
 
-    With G_i the least-squares inverse of H without row i, and G_ij without rows i and j (Gorelov et al. 2019):
-
-    - ``mean_abs_residual``, eqs. (4)-(7): mean over j of ``|z_j - h_j G_ij z|``; the least is the worst channel.
-    - ``mean_square_residual``, eqs. (10)-(11): mean of the squares; least.
-    - ``rate_deviation``, eqs. (12)-(16): mean over j and x, y, z of ``(G_i z - G_ij z)^2``; least.
-    - ``max_residual``, eqs. (17)-(19): ``|z_i - z_ip|``, ``z_ip = h_i G_i z``; greatest.
-
-    ``scores`` are these figures, rad/s or its square; with 4 channels the first three do not exist and are NaN.
+    G_i is the least-squares inverse of H without row i, G_ij without rows i and j, ``z_ip = h_i G_i z``. ``scores`` are
+    the figures of the criterion, rad/s or its square; with 4 channels only that of `MaxResidual` exists, else NaN.
     Tolerance ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s of the worst channel, threshold ``3 sqrt(sigma_0^2 +
     sigma_k^2 z_ip^2)``. ``calibrated``: that statistic over its standard deviation, prediction included; threshold that
     the largest of them over all channels exceeds with the false-alarm probability asked for. docs/methods.md has when
@@ -86,7 +80,7 @@ class ResidualSearch(SingleFaultDetector):
 
 
 class MeanAbsResidual(ResidualSearch):
-    """Mean absolute residual of the others when a channel is left out, eqs. (4)-(7)."""
+    """The channel i without which the mean over j of ``|z_j - h_j G_ij z|`` is least, eqs. (4)-(7)."""
 
     name = "mean_abs_residual"
 
@@ -99,7 +93,7 @@ class MeanAbsResidual(ResidualSearch):
 
 
 class MeanSquareResidual(ResidualSearch):
-    """Mean squared residual of the others when a channel is left out, eqs. (10)-(11)."""
+    """The channel i without which the mean over j of ``(z_j - h_j G_ij z)^2`` is least, eqs. (10)-(11)."""
 
     name = "mean_square_residual"
     criterion_squares = True
@@ -109,7 +103,7 @@ class MeanSquareResidual(ResidualSearch):
 
 
 class RateDeviation(ResidualSearch):
-    """Mean squared change of the rate when a second channel is left out, eqs. (12)-(16)."""
+    """The channel i with the least mean over j and x, y, z of ``(G_i z - G_ij z)^2``, eqs. (12)-(16)."""
 
     name = "rate_deviation"
     criterion_squares = True
@@ -122,7 +116,7 @@ class RateDeviation(ResidualSearch):
 
 
 class MaxResidual(ResidualSearch):
-    """Each channel against its prediction from all others, eqs. (17)-(19)."""
+    """The channel i of the largest ``|z_i - z_ip|``, each against its prediction from all others, eqs. (17)-(19)."""
 
     name = "max_residual"
     criterion_largest = True
