@@ -56,17 +56,13 @@ class Source(ABC):
     What needs no settings is on the class: the messages of a recording are read before there are any.
     """
 
-    type: ClassVar[str]
-    """Of its messages: ``sensor_msgs/msg/Imu``."""
+    type: ClassVar[str]  #: of its messages: ``sensor_msgs/msg/Imu``
     stamped: ClassVar[bool]
     """Whether messages carry the stamp of their measurement, and those of several units are aligned by it; else they
     are stamped when they arrive, and each is a sample of all channels."""
-    topic_counts: ClassVar[range]
-    """Numbers of topics that a monitor takes."""
-    value_counts: ClassVar[range]
-    """Numbers of values that a message may have to be the gyros of a monitor."""
-    called: ClassVar[str]
-    """A message in words: ``an Imu``."""
+    topic_counts: ClassVar[range]  #: numbers of topics that a monitor takes
+    value_counts: ClassVar[range]  #: numbers of values that a message may have to be the gyros of a monitor
+    called: ClassVar[str]  #: a message in words: ``an Imu``
 
     # Compiled, per kind -------------------------------------------------------------------------------------------
 
@@ -135,23 +131,17 @@ class Source(ABC):
 
     # Settings -----------------------------------------------------------------------------------------------------
 
-    names: tuple[str, ...]
-    """What each topic brings, as an operator sees it."""
+    names: tuple[str, ...]  #: what each topic brings, as an operator sees it
     units: tuple[str, ...] = ()
     """Names of the three-axis units that the channels belong to; empty: which of them share one is not known."""
-    timeout: float
-    """Time after which a topic is silent, s."""
-    max_lag = math.inf
-    """How far the stamps of a topic may stay behind the others, s."""
-    delays: tuple[float, ...] = ()
-    """By how much the stamps of each unit are late, as set, s."""
-    mounts: Sequence[Array] = ()
-    """Mount rotation (3, 3) of each unit."""
+    timeout: float  #: time after which a topic is silent, s
+    max_lag = math.inf  #: how far the stamps of a topic may stay behind the others, s
+    delays: tuple[float, ...] = ()  #: by how much the stamps of each unit are late, as set, s
+    mounts: Sequence[Array] = ()  #: mount rotation (3, 3) of each unit
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.topics = config.topics
-        """The input topics."""
+        self.topics = config.topics  #: the input topics
 
     @property
     def alignment(self) -> Alignment:

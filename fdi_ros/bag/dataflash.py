@@ -47,8 +47,7 @@ _TYPES = (
 )
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
-_TYPES_OF = {"Message": "Z", "I": "B"}
-"""Columns that are read and may not be any number, and their types."""
+_TYPES_OF = {"Message": "Z", "I": "B"}  # columns that are read and may not be any number, and their types
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
 _VALUES = {
@@ -134,8 +133,7 @@ class DataflashLog(FlightLog):
         """Read the log from its start up to `end`."""
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
-        self._layouts: dict[int, np.dtype[np.void]] = {}
-        """Columns that are read of records of each message."""
+        self._layouts: dict[int, np.dtype[np.void]] = {}  # columns that are read of records of each message
         self._lacking: dict[int, str] = {}  # of messages that cannot be read: why
         offset = lost = 0
         while True:

@@ -58,8 +58,7 @@ _WRONG = (
 """What rosbags and the unpacking libraries raise of a damaged bag."""
 _UNPACKERS = {bz2.decompress: bz2.BZ2Decompressor, lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor}
 """By the functions that rosbags takes, which have no bound."""
-Message = tuple[int, int, bytes]
-"""Number of its topic in the file, time of recording, ns, and content."""
+Message = tuple[int, int, bytes]  # number of its topic in the file, time of recording, ns, and content
 
 
 class LibraryBag(BagFile):

@@ -56,8 +56,7 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.damage = Damage()
-        self._left = 0
-        """Bytes that may still be unpacked."""
+        self._left = 0  # bytes that may still be unpacked
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[BagFile] = []
         paths = find_files(self.path, self.damage)

@@ -22,26 +22,21 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.sources import source_of
 
-_TOGETHER = 16384
-"""Messages handed on together: enough that calls do not count, little enough for the cache."""
-_HELD = 1 << 20
-"""Messages that wait for earlier ones at most."""
+_TOGETHER = 16384  # messages handed on together: enough that calls do not count, little enough for the cache
+_HELD = 1 << 20  # messages that wait for earlier ones at most
 RATE_TOLERANCE = 0.2
 """Share by which a recording may be faster or slower than configured: beyond, every threshold and time is wrong."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
 """Samples from which the rate of a recording is told, and steps between samples that this takes at least."""
-Rows = NDArray[Any]
-"""Decoded messages, by field."""
-Tap = Callable[[Batch, Int], None]
-"""Is shown each batch and the numbers of the messages in it that are used."""
+Rows = NDArray[Any]  #: decoded messages, by field
+Tap = Callable[[Batch, Int], None]  #: is shown each batch and the numbers of the messages in it that are used
 
 
 class Newest(NamedTuple):
     """How far a topic has come."""
 
     received: int = 0
-    log_time: int = 0
-    """Of its last message, ns; 0 before the first."""
+    log_time: int = 0  #: of its last message, ns; 0 before the first
     stamp: int = 0
 
 
@@ -86,8 +81,7 @@ class Samples:
         recording.require(self.topics, self.source.type)
         self.alignment = Alignment(*self.source.alignment)
         first = self.source.channels_of(0, channels)
-        self._width = first.stop - first.start
-        """Values in a message."""
+        self._width = first.stop - first.start  # values in a message
         columns = [("topic", "i8"), ("log_time", "i8"), ("stamp", "i8"), ("values", "f8", (self._width,))]
         self._row = np.dtype(columns)
         """Of a decoded message: index of the input topic, times, ns (the time of recording where it carries no stamp),
@@ -96,19 +90,14 @@ class Samples:
         self._tap = tap
         self.period = period
         self._configured = config.sample_rate
-        self._first: list[Int] | None = []
-        """Stamps of the first samples, ns; None: their rate was checked."""
+        self._first: list[Int] | None = []  # stamps of the first samples, ns; None: their rate was checked.
         self._last = -1
         self.origin: int | None = None
         """Stamp of the first message, ns: the times of faults, start and end count from here."""
-        self.messages = 0
-        """Used so far."""
-        self.malformed = dict.fromkeys(self.topics, 0)
-        """Messages of each topic that do not hold what they should."""
-        self.disordered = 0
-        """Messages without a stamp recorded before one that was handed on already: left out."""
-        self.progress = 0.0
-        """Share of the recording read so far."""
+        self.messages = 0  #: used so far
+        self.malformed = dict.fromkeys(self.topics, 0)  #: messages of each topic that do not hold what they should
+        self.disordered = 0  #: messages without a stamp recorded before one that was handed on already: left out
+        self.progress = 0.0  #: share of the recording read so far
         self.newest = [Newest() for _ in self.topics]
         """Last message of each topic in the blocks so far; kept only where blocks are cut by period."""
 

@@ -87,8 +87,7 @@ SHARED: Mapping[str, Options] = {
 """Arguments of several verbs."""
 PART: Mapping[str, Options] = {"--start": {}, "--end": {}}
 WORKERS: Mapping[str, Options] = {"--workers": {}, "--scheduler": {}}
-RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}
-"""What every verb takes that has results."""
+RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}  # what every verb takes that has results
 _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
     **PART,

@@ -55,8 +55,7 @@ from fdi_ros.system.files import OTHERS, DistrustError, check_ancestor, check_tr
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
-INTERPRETED = bool(numba.config.DISABLE_JIT)
-"""Whether everything runs as plain Python."""
+INTERPRETED = bool(numba.config.DISABLE_JIT)  #: whether everything runs as plain Python
 LOG = logging.getLogger("fdi_ros")
 # A function over a record takes records that begin with the same fields, too; Numba warns that this is new to it.
 warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
@@ -71,8 +70,7 @@ MAX_UNITS = 4
 
 Real = Annotated[float, "f8"]
 Whole = Annotated[int, "i8"]
-Mask = Annotated[int, "i8"]
-"""A set of channels, one bit each."""
+Mask = Annotated[int, "i8"]  #: a set of channels, one bit each
 Small = Annotated[int, "u1"]
 Flag = Annotated[bool, "u1"]
 Vector = Annotated[NDArray[np.float64], "f8", (3,)]
@@ -124,8 +122,7 @@ _IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[
 _NAME = "fdi_ros"
 _dispatchers: list[Any] = []
 _callbacks: list[Callback] = []
-_parts: set[Path] = set()
-"""Marks of parts whose callers have not been kept yet."""
+_parts: set[Path] = set()  # marks of parts whose callers have not been kept yet
 
 
 class Part(CompilerBase):  # type: ignore[misc,unused-ignore]

@@ -183,10 +183,8 @@ def check_lengths(config: Config, per: str, count: int) -> None:
             raise ConfigError(f"{name} has {len(values[name])} values, expected {expected}")
 
 
-MIN_LEARNED = 10
-"""Samples that a bias is learned from at a start at rest."""
-MAX_SPAN = 1000
-"""Samples over which the angular acceleration is taken at most."""
+MIN_LEARNED = 10  #: samples that a bias is learned from at a start at rest
+MAX_SPAN = 1000  #: samples over which the angular acceleration is taken at most
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
 _TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
 

@@ -39,18 +39,13 @@ class Verdict(NamedTuple):
     no alarm: not judged is not healthy.
     """
 
-    statistic: Array
-    """(N,) the figure compared with the threshold."""
-    threshold: Array
-    """(N,) alarm where the statistic reaches it."""
-    alarm: Mask
-    """(N,) at least one channel is faulty."""
-    suspects: Mask
-    """(N, n) the channels that may be faulty; none without alarm."""
+    statistic: Array  #: (N,) the figure compared with the threshold
+    threshold: Array  #: (N,) alarm where the statistic reaches it
+    alarm: Mask  #: (N,) at least one channel is faulty
+    suspects: Mask  #: (N, n) the channels that may be faulty; none without alarm
     isolated: Mask
     """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the evidence cannot tell which."""
-    error: Array
-    """(N, n) estimated error of each suspect, rad/s; 0 elsewhere."""
+    error: Array  #: (N, n) estimated error of each suspect, rad/s; 0 elsewhere
     scores: Array
     """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a channel not judged."""
 
@@ -84,8 +79,7 @@ class Detector(ABC):
     judge: Callback
     takes_any: ClassVar[bool] = False
     """One row of constants and one memory serve all sets of channels; else each set has its own."""
-    sample_rate = 100.0
-    """Hz, of samples without stamps."""
+    sample_rate = 100.0  #: Hz, of samples without stamps
     accumulates: ClassVar[bool] = False
     """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
@@ -95,12 +89,10 @@ class Detector(ABC):
         self.geometry = geometry
         self.noise = noise.for_channels(geometry.n)
         self.options = options
-        self.constants = allocate(self.Constants)
-        """The method's constants for all channels, (1,)."""
+        self.constants = allocate(self.Constants)  #: the method's constants for all channels, (1,)
         describe_sensors(self.constants["sensors"][0], geometry, self.noise)
         self._fewer: dict[int, Detector | None] = {}
-        self.refusals: dict[int, str] = {}
-        """Why the method cannot run on a set of channels, by its bits."""
+        self.refusals: dict[int, str] = {}  #: why the method cannot run on a set of channels, by its bits
 
     @classmethod
     def refuses(cls, n: int) -> str:

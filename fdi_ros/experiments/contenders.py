@@ -164,8 +164,7 @@ class CommonRate(TrialProtocol[Cell]):
     asked for.
     """
 
-    streams: ClassVar[bool] = False
-    """Trials are streams, which all methods can judge."""
+    streams: ClassVar[bool] = False  # trials are streams, which all methods can judge
     schema: ClassVar[Schema] = {
         "geometries": Field("geometries", ["two_triad_cone"]),
         "detectors": Field("detectors", "all", choices=tuple(METHODS)),

@@ -211,8 +211,7 @@ def geometry_of(spec: Any) -> Geometry:
 
 # Running one ----------------------------------------------------------------------------------------------------------
 
-PREPARING, TRIALS = 0, 1
-"""The first stage prepares what the trials of the second need: thresholds, limits."""
+PREPARING, TRIALS = 0, 1  # the first stage prepares what the trials of the second need: thresholds, limits
 FORMAT = 1  # of the JSON
 
 

@@ -30,10 +30,8 @@ from fdi_ros.system.yaml_file import read_yaml
 class Fault:
     """One fault; `FaultError` if a value is out of range."""
 
-    channel: str
-    """A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas."""
-    kind: FaultKind
-    """What it does, with its options."""
+    channel: str  #: a channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas
+    kind: FaultKind  #: what it does, with its options
     start: float = setting(0.0, "from here on, since the first sample", "s", 0.0, 1e12)
     stop: float = setting(math.inf, "and before this", "s", 0.0)
     seed: int = setting(0, "of the random kinds", "", 0)

@@ -25,20 +25,14 @@ from fdi_ros.model.samples import Array, Mask
 class ChannelSamples(NamedTuple):
     """N samples of the c channels that a fault strikes; it changes z and received in place."""
 
-    time: Array
-    """(N,) since the first sample of the stream, s."""
-    since: Array
-    """(N,) since the start of the fault, s."""
-    active: Mask
-    """(N,) whether the fault is active."""
-    z: Array
-    """(N, c) rad/s."""
-    received: Mask
-    """(N, c)"""
+    time: Array  #: (N,) since the first sample of the stream, s
+    since: Array  #: (N,) since the start of the fault, s
+    active: Mask  #: (N,) whether the fault is active
+    z: Array  #: (N, c) rad/s
+    received: Mask  #: (N, c)
 
 
-Memory = dict[str, Any]
-"""What a fault keeps of the samples before; empty at the start of a stream."""
+Memory = dict[str, Any]  #: what a fault keeps of the samples before; empty at the start of a stream
 
 
 def check_fields(owner: Any, called: str) -> None:
@@ -51,8 +45,7 @@ def check_fields(owner: Any, called: str) -> None:
             object.__setattr__(owner, name, check(field, value, f"{called}: {name}", FaultError))
 
 
-FAULT_KINDS: dict[str, type[FaultKind]] = {}
-"""Every kind of fault by name."""
+FAULT_KINDS: dict[str, type[FaultKind]] = {}  #: every kind of fault by name
 
 
 class FaultKind(ABC):
@@ -61,8 +54,7 @@ class FaultKind(ABC):
     name: ClassVar[str]
     study_size: ClassVar[float | None] = None
     """Size in simulated flights unless they set one: well above the noise, well below what needs no monitor."""
-    whole_unit: ClassVar[bool] = False
-    """Whether it strikes the three channels of a unit, and nothing less."""
+    whole_unit: ClassVar[bool] = False  #: whether it strikes the three channels of a unit, and nothing less
 
     def __init_subclass__(cls) -> None:
         if "name" in vars(cls):

@@ -30,10 +30,8 @@ class Block:
         If the arrays do not fit each other.
     """
 
-    stamp: NDArray[np.int64]
-    """Time of each sample, (N,) int64 nanoseconds, strictly increasing."""
-    z: NDArray[np.float64]
-    """Measured channels, (N, n) float64 rad/s."""
+    stamp: NDArray[np.int64]  #: time of each sample, (N,) int64 nanoseconds, strictly increasing
+    z: NDArray[np.float64]  #: measured channels, (N, n) float64 rad/s
     received: NDArray[np.bool_] | None = None
     """(N, n) bool: the channel delivered a value for this sample, whatever the value. None: all did. A value that
     was delivered but is NaN or infinite is a defect of the sensor; one that was not delivered is silence. The two

@@ -73,8 +73,7 @@ class Unit(NamedTuple):
     """A unit of angular rate."""
 
     name: str
-    factor: float
-    """Of it in one rad/s."""
+    factor: float  #: of it in one rad/s
 
     def words(self, value: float | None, digits: int = 6) -> str:
         """Return a rate, rad/s, in this unit, or a dash."""
@@ -106,16 +105,11 @@ def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
 class Column(NamedTuple):
     """A figure of all that a table has rows of: by name for programs, in SI units, and in words for people."""
 
-    name: str
-    """Empty: for people alone."""
-    values: Sequence[Any] | NDArray[Any]
-    """One for each row; of several heads one for each of them."""
-    heads: Sequence[str] = ()
-    """Empty: for programs alone."""
-    say: str | Callable[[Any], str] = ""
-    """Words of a value, or the format that makes them."""
-    factor: float = 1.0
-    """Of what people are told over the SI unit."""
+    name: str  #: empty: for people alone
+    values: Sequence[Any] | NDArray[Any]  #: one for each row; of several heads one for each of them
+    heads: Sequence[str] = ()  #: empty: for programs alone
+    say: str | Callable[[Any], str] = ""  #: words of a value, or the format that makes them
+    factor: float = 1.0  #: of what people are told over the SI unit
 
 
 def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
@@ -194,8 +188,7 @@ class Section:
     title: str
     hint: str = ""
     content: Content = ""
-    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
-    """Each a `Figure`."""
+    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)  #: each a `Figure`
 
 
 def section_lines(section: Section) -> list[str]:

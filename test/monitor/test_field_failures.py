@@ -119,6 +119,61 @@ def test_one_bad_unit_shifts_the_mean_and_the_right_one_is_blamed(size):
     assert error.max() < 5 * SIGMA
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_one_axis_turns_non_finite_for_one_sample(value):
+    pipeline = Pipeline(parallel(2))
+    block = stream(pipeline.geometry, 500)
+    block.z[250, 4] = value
+    output = pipeline.process(block)
+    assert output.valid.all()
+    assert np.isfinite(output.rate).all()
+    assert declarations(pipeline, output) == []
+    assert pipeline.status().channels[4].counts["non-finite"] == 1
+    assert output.state[250, 4] == ChannelState.SUSPECT
+    assert output.state[251, 4] == ChannelState.OK
+
+
+def test_a_brief_fault_comes_and_goes_three_times_with_a_clean_time():
+    pipeline = Pipeline(parallel(3, decision__latch=False, decision__clean_time=5.0))
+    _, output = run(pipeline, 2500, *BRIEF)
+    assert declarations(pipeline, output) == [("imu_1.z", "FAULTY")]
+    back = next(e for e in output.events if e.before == ChannelState.FAULTY)
+    assert back.after == ChannelState.UNCHECKED
+    assert output.state[-1, 2] == ChannelState.OK
+    assert 16.98 <= seconds(back) <= 17.2
+
+
+@pytest.mark.parametrize("hours", [0.0, 10.0])
+def test_a_fault_after_hours_of_good_flight_is_declared_as_fast(hours):
+    pipeline = Pipeline(config())
+    block = stream(pipeline.geometry, 5000)
+    shift = round(hours * 3600e9)
+    if hours:
+        pipeline.process(block)
+        # Time passes; the same thousand healthy samples stand for any number of them.
+        for k in range(20):
+            pipeline.process(Block(block.stamp + 60_000_000_000 * (k + 1), block.z))
+    late = Block(block.stamp + shift + 3_600_000_000_000, block.z.copy())
+    late.z[1000:, 3] += 0.03
+    output = pipeline.process(late)
+    declared = [e for e in output.events if e.declares]
+    assert [(e.channel, e.after) for e in declared] == [(3, ChannelState.FAULTY)]
+    assert (declared[0].stamp - late.stamp[1000]) / 1e9 == pytest.approx(0.03, abs=0.011)
+
+
+def test_a_unit_that_gives_nothing_is_stale_and_what_an_operator_took_out_is_excluded():
+    pipeline = Pipeline(parallel(3, excluded_channels=["imu_1.x"]))
+    _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=5")
+    assert (output.state[-1, 6:] == ChannelState.STALE).all()
+    status = [(c.state, c.reason) for c in pipeline.status().channels]
+    assert set(status[6:]) == {(ChannelState.STALE, Reason.NO_DATA)}
+    assert status[0] == (ChannelState.EXCLUDED, Reason.OPERATOR)
+    first_stale = int((output.state[:, 6] == ChannelState.STALE).argmax())
+    assert first_stale / RATE == pytest.approx(5.1, abs=0.02)
+    assert declarations(pipeline, output) == []
+    assert output.valid.all()
+
+
 def test_two_parallel_units_disagree_and_which_is_wrong_stays_open_even_alone():
     pipeline = Pipeline(parallel(2))
     faults = ["channel=imu_2.y kind=bias size=0.2 start=3", "channel=imu_1 kind=triad_loss start=6"]
