@@ -38,10 +38,8 @@ from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, Ros1Writ
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.montecarlo import load_study
 
 MOST_SECONDS, MOST_GROWTH = 20.0, 700 << 20
-ROOT = Path(__file__).parents[2]
 NUMBERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 VALUES = (0.0, -0.0, 1e-320, 1e-8, 0.5, 1e6, 1e154, 1.7e308, -1.7e308, math.inf, -math.inf, math.nan)
 NAMES = (
@@ -334,13 +332,7 @@ def parameters(draw):
 
 def words_of(draw, folder):
     """Make the files of a case, and the command line that reads them."""
-    verb = draw.choice(
-        (*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, *["convert"] * 2, "geometry")
-    )
-    if verb == "study":
-        studies = sorted((ROOT / "config" / "studies").iterdir())
-        write(folder / "study.yaml", odd_yaml(draw, draw.choice(studies).read_text()))
-        return [verb, str(folder / "study.yaml")]
+    verb = draw.choice((*["replay"] * 27, *["inspect"] * 18, *["calibrate"] * 2, *["convert"] * 2, "geometry"))
     source = recording(draw, folder) if verb != "geometry" else Path()
     of_config = parameters(draw if verb == "geometry" or draw.random() < 0.2 else SOUND)
     if source.suffix in (".bin", ".csv", ".tlog", ".ulg"):
@@ -397,7 +389,7 @@ def run_case(number, seed="fdi"):
         with warnings.catch_warnings(record=True) as warned, redirect_stdout(out), redirect_stderr(err):
             warnings.simplefilter("always")
             try:
-                code, wrong = verb(words), ""
+                code, wrong = command_line.main(words), ""
             except BaseException:
                 code, wrong = -1, traceback.format_exc()
         seconds, growth = time.process_time() - begun, peak() - before
@@ -405,7 +397,7 @@ def run_case(number, seed="fdi"):
         wrong = (
             wrong
             or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
-            or look(folder, words, code, said, errors)
+            or look(folder, code, said, errors)
             or ("" if inputs(folder) == given else f"changed what it read: {given}, now {inputs(folder)}")
             or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
             or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
@@ -426,27 +418,15 @@ def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def verb(words):
-    if words[0] != "study":
-        return command_line.main(words)
-    try:
-        load_study(words[1], 1, 0)
-        return 0
-    except FdiError as error:
-        print(f"fdi: {error}".replace("\n", " "), file=sys.stderr)
-        return 2
-
-
-def look(folder, words, code, said, errors):
+def look(folder, code, said, errors):
     """What is wrong with what a case said and left; empty if nothing."""
     made = sorted(os.listdir(folder / "out"))
-    shown = said + (errors if words[0] != "study" else "")
     one_line = errors.startswith("fdi: ") and errors.count("\n") == 1
     for text, well in (
         (f"exit code {code}: {errors}", code in (0, 2, 3, 4)),
         (f"refused in other than one line: {errors!r}", code != 2 or one_line),
         (f"success with words of trouble: {errors!r}", code != 0 or not errors),
-        (f"prints what a terminal obeys: {shown!r}", all(line.isprintable() for line in shown.split("\n"))),
+        (f"prints what a terminal obeys: {said + errors!r}", (said + errors).replace("\n", "").isprintable()),
         (f"refused, and left {made}", code != 2 or not made),
     ):
         if not well:
@@ -467,7 +447,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=math.inf)
     given = parser.parse_args()
     # A case that does not end is shown, and ends the run.
     faulthandler.register(signal.SIGPROF, chain=True)
@@ -485,8 +464,6 @@ def main():
         took = time.monotonic() - begun
         if done % 1000 == 0:
             print(f"{done} cases, {wrong} wrong, {took:.0f} s", flush=True)
-        if took > 60 * given.minutes:
-            break
     signal.setitimer(signal.ITIMER_PROF, 0.0)
     print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {peak() >> 20} MB, {took:.0f} s")
     return int(wrong > 0)
