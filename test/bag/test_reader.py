@@ -131,7 +131,7 @@ def crashed(tmp_path):
         yield base, z, crash
 
 
-def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(crashed):
+def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(crashed, tmp_path, monkeypatch):
     base, z, crash = crashed
     base.execute("PRAGMA journal_mode = WAL")
     rows = list(base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (SAMPLES,)))
@@ -142,14 +142,15 @@ def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(
     base.commit()
     # The second half is in the log alone.
     folder, before = crash("-wal")
-    temporary = set(os.listdir(tempfile.gettempdir()))
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     np.testing.assert_array_equal(read(folder)[1], z)
     assert contents(folder) == before
     (folder / "bag.db3-wal").unlink()
     _, values, samples = read(folder / "bag.db3")
     np.testing.assert_array_equal(values, z[: SAMPLES // 2])
     assert os.listdir(folder) == ["bag.db3"]
-    assert not {name for name in set(os.listdir(tempfile.gettempdir())) - temporary if name.startswith("fdi_bag_")}
+    assert not os.listdir(tmp_path / "temporary")
     assert samples.recording.damage.report() == ()
 
 
