@@ -100,17 +100,12 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     raise DisagreementError(words)
 
 
-_REVERSED = (  # what is seen of a unit whose x, y or z axis is reversed; x forward, y left, z up
-    "shows a roll to the right as one to the left",
-    "shows nose up as nose down",
-    "shows a left turn as a right turn",
-)
-
-
 def _wrong_axes(signed: Array) -> str:
     """Say what a unit shows whose channels are these rows (3, 3) of its axes as configured."""
+    # x forward, y left, z up.
+    seen = ("a roll to the right as one to the left", "nose up as nose down", "a left turn as a right turn")
     if (np.diag(signed) != 0.0).all():
-        return " and ".join(_REVERSED[a] for a in range(3) if signed[a, a] < 0.0)
+        return " and ".join(f"shows {seen[a]}" for a in range(3) if signed[a, a] < 0.0)
     kind = "has mirrored axes" if np.linalg.det(signed) < 0 else "has swapped axes"
     return f"{kind}: its channels x, y, z are {', '.join(_axes_of(signed))} of its mount as configured"
 
@@ -145,9 +140,9 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
 
 
 def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, float]]:
-    """Share of the rotation that channel i shows, and the rotation, rad/s rms, as every three others see it.
+    """Share of the rotation that channel i shows, and the rotation, rad/s rms, by every three others; empty: not all.
 
-    By mean products (n, n) of the channels, (rad/s)^2; empty: not all contradict it.
+    ``square``: mean products (n, n) of the channels, (rad/s)^2.
     """
     size, found = float(np.sqrt(square[i, i])), []
     for three in map(list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)):

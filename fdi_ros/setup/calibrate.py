@@ -187,10 +187,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
 
 
 def reference_channels(config: Config, geometry: Geometry, name: str) -> list[int]:
-    """Return the places of the reference channels among those in use; none: all are alike.
-
-    `ConfigError` if these are no three channels in use that span space.
-    """
+    """Return the places of the reference channels among those in use; none: all are alike."""
     names, units = geometry.channel_names, source_of(config).units
     if not name:
         threes = map(list, itertools.combinations(range(geometry.n), 3))

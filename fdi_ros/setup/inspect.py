@@ -71,6 +71,11 @@ class TopicReport:
         return list(self.kind.value_names(self.channels)) if self.kind is not None else []
 
     @property
+    def copied(self) -> str:
+        """That it gives the values of another topic, in words."""
+        return f"gives the values of {shown(self.copy_of)}"
+
+    @property
     def could_be_gyros(self) -> bool:
         """Whether it carries angular rates, or as many numbers as there may be channels."""
         return self.channels > 0 and (self.complete or bool((self.not_finite + self.beyond).any()))
@@ -227,7 +232,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
     words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
-    words += [f"gives the values of {shown(report.copy_of)}"] if report.copy_of else []
+    words += [report.copied] if report.copy_of else []
     words += [f"in motion for {report.segments.noise().share:.0%}"] if report.complete else []
     return ", ".join([*words, *troubles(report, unit)])
 

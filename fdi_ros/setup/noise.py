@@ -115,16 +115,14 @@ class Noise(NamedTuple):
 
 
 def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
-    """Noise (c,) of a sample and of a block when quietest, rad/s.
-
-    The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
-    """
+    """Noise (c,) of a sample and of a block when quietest, rad/s."""
     noise, block = np.array([one.noise for one in segments]), np.array([one.block_noise for one in segments])
     # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
     for column in (*noise.T, *block.T):
         if column.any():
             column[column == 0.0] = np.median(column[column > 0.0])
     quiet = np.argsort((noise**2).sum(axis=1))[: max(3, len(noise) // 100)]
+    # The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
     for _ in range(ROUNDS):
         alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
         if len(alike) <= len(quiet):
@@ -204,10 +202,7 @@ def projector(axes: Array) -> Array:
 
 
 def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
-    """Variance (W, n) of every channel that is there (W, n), averaged over neighbouring windows.
-
-    Of covariances (W, n, n) of the values in each window, (rad/s)^2; of channels that are not there it says nothing.
-    """
+    """Variance (W, n) of channels that are there (W, n), by covariances (W, n, n) of windows and their neighbours."""
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
     near, beside = np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))), np.pad(there, ((MEMORY, MEMORY), (0, 0)))
     total, weight = np.zeros_like(filled), np.zeros(len(filled))
@@ -250,15 +245,13 @@ def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
 
 
 def levels(covariance: Array, there: Mask, axes: Array) -> Array:
-    """How noisy every window is (W,), against the usual one; infinite where nothing tells.
-
-    The geometric mean of the channels: one that is always noisy hides nothing.
-    """
+    """How noisy every window is (W,), against the usual one; infinite where nothing tells."""
     residual = _by_pattern(_residual_variances, covariance, there, axes)
     known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
     if known.any():
         logs = np.log(np.maximum(residual[known][:, np.isfinite(residual).any(axis=0)], LEAST_VARIANCE))
+        # The geometric mean of the channels: one that is always noisy hides nothing.
         found[known] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
     return found
 
@@ -280,10 +273,7 @@ def _quietest(level: Array, count: Int) -> Mask:
 
 
 def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor:
-    """Find the lower envelope of the noise of single samples, of the channels (W, n) that are there.
-
-    Of covariances (W, n, n) of so many (W,) samples in every window, (rad/s)^2.
-    """
+    """Find the lower envelope of the noise, by covariances (W, n, n) of so many (W,) samples of channels (W, n)."""
     level, (sums, precision, weight) = levels(covariance, there, axes), np.zeros((3, len(axes)))
     windows = np.zeros(len(level), dtype=bool)
     # A unit that comes late has quiet windows of its own.

@@ -81,10 +81,8 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     largest = int(floor.std.argmax())
     yield Finding(Role.FOUND, "noise", words, (), float(floor.std[largest]), float(floor.error[largest]))
     words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
-    if walk.value:
-        words += f"biases walk {walk.value * factor:.2g} {name} per sqrt(s)"
-    else:
-        words += f"no walk of the biases shown, below {walk.possible * factor:.2g} {name} per sqrt(s)"
+    words += "biases walk" if walk.value else "no walk of the biases shown, below"
+    words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
@@ -102,11 +100,9 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
     found, share = result.estimate, result.estimate.floor.share
     if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
-        words = (
-            "nowhere at rest: what all biases have in common looks like a rotation"
-            f" (+-{common * unit.factor:.2g} {unit.name}); noise_std is the lower envelope in motion. Let the vehicle"
-            " stand still for 10 s, motors off"
-        )
+        words = f"nowhere at rest: what all biases have in common looks like a rotation (+-{common * unit.factor:.2g}"
+        words += f" {unit.name}); noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s,"
+        words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif share <= LEAST_SHARE:
         words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
@@ -115,17 +111,13 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
         which = " and ".join(unmeasured)
         along, about = ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
-        words = (
-            f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near those"
-            " configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
-        )
+        words = f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near"
+        words += " those configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
         yield Finding(Role.UNKNOWN, "scale factors", words, unmeasured, None, float(error.max()), UNMEASURED)
     if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
         turns = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor)
-        words = (
-            f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
-            " Turn it back and forth about them, some 1 rad/s"
-        )
+        words = f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
+        words += " Turn it back and forth about them, some 1 rad/s"
         yield Finding(Role.UNKNOWN, "axes", words, ["xyz"[a] for a in poor], None, float(error[poor].max()), SHOWN_AXES)
     if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
         names = list(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
@@ -205,9 +197,8 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         words = f"the axes of the array are not known (a cone is assumed): {found.refused}"
         yield Finding(warning, "axes", words, headline="DO NOT USE")
     elif tried.judged < LEAST_JUDGED:
-        words = (
-            f"only {tried.judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
-        )
+        note = tried.note or "channels are missing"
+        words = f"only {tried.judged:.0%} of the samples of the proof are judged: {note}"
         yield Finding(warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE")
     elif tried.declared:
         words = f"the monitor declares {times_words(tried.declared)} on {proof.source}: a gyro is faulty there, or the"
@@ -239,20 +230,14 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     if not found.chosen:
         return
     if source_of(found.config).units:
-        words = (
-            "where the vehicle's forward, left and up are: the body frame is that of the mounts, all units together;"
-            " turn all axes of the config if it is mounted otherwise"
-        )
+        words = "where the vehicle's forward, left and up are: the body frame is that of the mounts, all units"
+        words += " together; turn all axes of the config if it is mounted otherwise"
     elif found.calibration is None:
-        words = (
-            "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
-            " worth anything before the true ones stand there (geometry.axes, or a preset)"
-        )
+        words = "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
+        words += " worth anything before the true ones stand there (geometry.axes, or a preset)"
     else:
-        words = (
-            "the body frame: of an array only how its channels hang together is seen; the axes of its first three are"
-            " an assumption (a cone)"
-        )
+        words = "the body frame: of an array only how its channels hang together is seen; the axes of its first three"
+        words += " are an assumption (a cone)"
     yield Finding(Role.UNKNOWN, "body frame", words)
     turn_on = found.config.bias.turn_on_std
     words = "the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
@@ -295,9 +280,7 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
 
     def measured(values: Array, form: str) -> list[str]:
-        return [
-            f"{value:{form}}" if shown else "not measured" for value, shown in zip(values, result.measured, strict=True)
-        ]
+        return [f"{v:{form}}" if known else "not measured" for v, known in zip(values, result.measured, strict=True)]
 
     lost = [{why: count[i] for why, count in result.unusable.items()} for i in range(len(result.names))]
     return [
@@ -376,10 +359,8 @@ def _sections(
 ) -> tuple[list[str], list[Section]]:
     """Lay out what a reader is to know first: the verdict and what it is from; and the rest in sections."""
     proof, result, first = found.proof, found.calibration, verdict_of(findings)
-    hint = (
-        f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
-        f" to be isolated within {WITHIN:g} s."
-    )
+    hint = f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
+    hint += f" to be isolated within {WITHIN:g} s."
     bag, config = shlex.quote(bag), shlex.quote(config)
     steps = [
         f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",

@@ -244,10 +244,7 @@ Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]  # settings b
 
 
 def _kept_from(block: Block) -> tuple[float, float] | None:
-    """Time from which a recording is kept aside, s from its first sample, and how much that is, gaps not counted.
-
-    None: it is too short for that.
-    """
+    """Time from which a recording is kept aside, s, and how much that is, gaps not counted; None: it is too short."""
     if len(block) < 2:
         return None
     steps = np.diff(block.stamp) * 1e-9
@@ -314,10 +311,8 @@ def _with_mounts(block: Block, before: LearnedSettings, reference: str) -> Learn
         # Where most are mirrored against the first, it is the first.
         if len(odd) > len(mounts) - 1 - len(odd):
             odd = [names[0]] if len(mounts) > 2 else [f"{names[0]} or {odd[0]}"]
-        words = (
-            f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"
-            " swapped; no mount does that: mend its driver, or leave its topic out"
-        )
+        words = f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"
+        words += " swapped; no mount does that: mend its driver, or leave its topic out"
         return replace(before, why=DisagreementError(words))
     lost = [k for k, mount in enumerate(mounts) if mount.rotation is None and not mount.contradicts]
     found = _calibrated(block, before, reference, [3 * k + axis for k in lost for axis in range(3)])

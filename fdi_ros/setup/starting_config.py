@@ -114,10 +114,7 @@ NEEDED = ", or ".join(
 
 
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
-    """Return the topics a config is made for: up to four units, else the first array that fits.
-
-    What a monitor itself has published is no sensor: the fused rate must not be its own witness.
-    """
+    """Return the topics a config is made for: up to four units, else the first array that fits."""
     possible = [report for report in reports if not _unusable(report)]
     for kind in _PREFERRED:
         alike = [report for report in possible if report.kind is kind]
@@ -150,6 +147,7 @@ def _unusable(report: TopicReport) -> str:
     # The first that holds is the reason.
     reasons = {
         "no messages": not received,
+        # The fused rate must not be its own witness.
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
         "no name that ROS allows": not is_plain_name(report.topic.name),
         f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels and not kind.stamped,
@@ -157,16 +155,13 @@ def _unusable(report: TopicReport) -> str:
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
-        f"it {_copied(report)}: {_NO_REDUNDANCY}": bool(report.copy_of),
+        f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
     }
     return next((words for words, holds in reasons.items() if holds), "")
 
 
 def needs(reports: Sequence[TopicReport]) -> str:
-    """Say what a recording needs before a config can be made of it; empty: nothing.
-
-    That is gyros in rad/s, or else what is wrong with each topic that could do.
-    """
+    """Say what a recording needs, and what is wrong with each topic that could do; empty: a config can be made."""
     if chosen := candidates(reports):
         return in_degrees(chosen)
     why = [(shown(report.topic.name), _unusable(report)) for report in reports if report.kind is not None]
@@ -185,8 +180,7 @@ def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: 
         yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
         return
     if copies := copy_words(reports):
-        words = f"{copies}; the copy is left out"
-        yield Finding(Role.WARNING, "copy", words, headline="NEEDS A LOOK")
+        yield Finding(Role.WARNING, "copy", f"{copies}; the copy is left out", headline="NEEDS A LOOK")
     units = len(chosen) > 1
     names = [f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places]
     groups = np.split(np.arange(len(names)), np.cumsum([one.channels for one in chosen])[:-1] if units else len(names))
@@ -207,17 +201,13 @@ def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Itera
             yield Finding(Role.WARNING, "messages", f"{one.topic.name}: {', '.join(words)}", (one.topic.name,))
 
 
-def copy_words(reports: Sequence[TopicReport]) -> str:
-    """Say which topics give the values of others; empty: none does."""
-    copies = [f"{shown(one.topic.name)} {_copied(one)}" for one in reports if one.copy_of]
-    return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""
-
-
 _NO_REDUNDANCY = "one sensor on two topics is no redundancy"
 
 
-def _copied(report: TopicReport) -> str:
-    return f"gives the values of {shown(report.copy_of)}"
+def copy_words(reports: Sequence[TopicReport]) -> str:
+    """Say which topics give the values of others; empty: none does."""
+    copies = [f"{shown(one.topic.name)} {one.copied}" for one in reports if one.copy_of]
+    return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""
 
 
 # Degrees a second -----------------------------------------------------------------------------------------------------
@@ -230,10 +220,7 @@ STILL, NOISIEST = 0.3, 0.02  # share of a recording that lies still; noise there
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
-    """Say which topics, of one body, are in deg/s, and what shows it; empty: nothing does.
-
-    Gyros in rad/s have a range of `largest_rate`.
-    """
+    """Say which topics, of one body, are in deg/s, and what shows it, of gyros of a range; empty: nothing does."""
     chosen = [one for one in chosen if one.complete]
     # The size of the rate: a bias is no rotation.
     apart = [one.segments.means - np.median(one.segments.means, axis=0) for one in chosen]
@@ -257,7 +244,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
 
 
 def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
-    """Whether rates, less than a shock or damage makes, are beyond the range of gyros for long."""
+    """Whether rates are beyond the range of gyros for long."""
     largest = np.abs(report.segments.means).max(axis=1)
     beyond = largest > largest_rate
     # Of what is deg/s no gyro shows more than twice its range.
@@ -276,10 +263,7 @@ def _no_gyro_at_rest(report: TopicReport) -> bool:
 
 
 def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
-    """Refuse a recording whose gyros, of this config, are in deg/s; return what was seen of their topics.
-
-    `BagError` if it cannot be read, or says which topic is and what shows it.
-    """
+    """Return what was seen of the topics of a config; `BagError` if one is in deg/s, or the recording is damaged."""
     chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
     if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
         raise BagError(f"{bag} needs {words}; mend the driver")
@@ -312,10 +296,7 @@ class StartingConfig:
 
 
 def starting_config_of(path: Path, refused: str) -> StartingConfig:
-    """Return the config to start from that ``fdi inspect`` writes for a recording.
-
-    `BagError` in these words, and with what is missing, if the recording shows no gyros in rad/s.
-    """
+    """Return the config that ``fdi inspect`` writes; `BagError` in these words where there are no gyros in rad/s."""
     reports, _ = inspect(path)
     if words := needs(reports):
         raise BagError(f"{refused}: needs {words}")
