@@ -145,7 +145,7 @@ class Repeats:
 
 
 POINTS = 6  # of the interpolation
-PRESENT = 0.8  # share of a window that a channel gives to count in it: one message in ten may be lost, and an edge
+PRESENT = 0.8  # share of a window that a channel gives to count in it
 PORTION = 100_000  # samples worked on at once, about
 NOT_SHIFTED = 1e-6  # s; smaller delays are none: of 100 rad/s^2 they make 1e-4 rad/s
 

@@ -27,9 +27,9 @@ from fdi_ros.model.samples import Array, Int, Mask
 LENGTH = BLOCK_TIME * REST_BLOCKS  # of a segment, s; longer where so few samples are in it that blocks were empty
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest, which chance makes, is as quiet; rounds of it
+AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest is as quiet; rounds in which these are found
 LOUDER = 2.0  # noise this many times that of rest is vibration, and slower noise no more than it of the other
-LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has: 6 deg/s, beyond every data sheet of MEMS
+LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
 MOST = 4096  # segments kept; of a longer recording every second one, and so on: memory does not grow with its length
 
 

@@ -69,17 +69,14 @@ def test_an_error_as_large_as_stated_is_found_in_the_time_stated() -> None:
     assert (np.diff(rest, axis=0) < 0).all()
     assert (turning > rest).all()
     np.testing.assert_allclose(vibration, VIBRATION * rest)
+    # Of a wait shorter than two samples nothing is said.
+    assert np.isnan(assess(config.replaced({"sample_rate": 25.0})).waiting["at rest"][WAITS.index(0.02)]).all()
     # A stream with that error, whitened: the CUSUM of the channel's own direction.
     V, R = result.geometry.parity, np.diag(result.noise.noise_std**2)
     inverse = np.linalg.inv(V @ R @ V.T)
     own = float(V[:, 2] @ inverse @ V[:, 2])
     shift = rest[WAITS.index(0.5), 2] * math.sqrt(own)
     assert moustakides_delay(shift, 1 / result.false_alarm_probability) == pytest.approx(50, rel=0.03)
-
-
-def test_waits_shorter_than_two_samples_are_no_matter_of_waiting() -> None:
-    config = two_imus(np.eye(3)).replaced({"sample_rate": 25.0})
-    assert np.isnan(assess(config).waiting["at rest"][WAITS.index(0.02)]).all()
 
 
 def test_what_names_rest_on_is_said() -> None:
