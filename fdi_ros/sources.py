@@ -23,17 +23,18 @@ from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, compiled
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import INPUTS
 from fdi_ros.core.messages import (
+    CUT_VALUES,
     ENCAPSULATION,
     FIRST_OWN,
     GOOD,
     IMU_BEFORE_RATE,
     IMU_DOUBLES,
     NO_CDR,
+    NO_HEADER,
     Decoded,
     MessageError,
     as_batch,
     byte_order,
-    explain,
     is_cdr,
     place_after_header,
     read_bits,
@@ -45,9 +46,6 @@ from fdi_ros.core.path import receive_arrived, receive_stamped
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
-
-Alignment = tuple[int, int, int, tuple[float, ...]]
-"""Units, largest skew ns, timeout ns, delays s: what `fdi_ros.core.alignment` takes."""
 
 
 class Source(ABC):
@@ -90,7 +88,16 @@ class Source(ABC):
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
         """Explain in one line what is wrong with a message in which count values were expected."""
-        return explain(code, data, cls.called)
+        size, order = len(data), byte_order(data)
+        if code == NO_CDR:
+            return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
+        if code == NO_HEADER:
+            return f"{size} bytes are too few for {cls.called}"
+        if code == CUT_VALUES:
+            (name,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION + 8)
+            return f"{size} bytes are too few for {cls.called} whose frame_id has {name} bytes"
+        sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION)
+        return f"stamp has {sec} s and {nanosec} ns, expected at least 0 s and less than 1000000000 ns"
 
     @classmethod
     def announced(cls, buffer: Bytes, offset: Int, length: Int) -> int:
@@ -108,7 +115,8 @@ class Source(ABC):
 
         One with another number of values is malformed.
         """
-        decoded = Decoded.nothing(len(offset), count)
+        k = len(offset)
+        decoded = Decoded(np.zeros(k, dtype=np.uint8), np.zeros(k, dtype=np.int64), np.zeros((k, count)))
         cls.decode_into(read_only(buffer), offset, length, *decoded)
         return decoded
 
@@ -144,8 +152,8 @@ class Source(ABC):
         self.topics = config.topics  #: the input topics
 
     @property
-    def alignment(self) -> Alignment:
-        """How the messages of the topics are aligned."""
+    def alignment(self) -> tuple[int, int, int, tuple[float, ...]]:
+        """How the messages of the topics are aligned: units, largest skew ns, timeout ns, delays s."""
         imus = self.config.imus
         return len(self.topics), round(imus.max_skew * 1e9), round(imus.timeout * 1e9), imus.delays
 

@@ -7,34 +7,30 @@ Decisions come from stamps in arrival order alone: no clock and no timer, so tha
 the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
 one: `enter`, then `next_sample` until there is none.
 
-Where a sample is formed: at the stamp of a message, if there is no sample between this message and the one before of
-the same unit. So the samples come at the rate of the fastest unit, never faster, whatever the phases; and the
-units left carry on where the fastest falls out. What the other units give at that stamp:
+Where a sample is formed: at the stamp of a message, if there is none between it and the message before of the same
+unit. So samples come at the rate of the fastest unit, whatever the phases. What the other units give at that stamp:
 
 - a message within ``max_skew`` (and nearer than half the message interval) counts as of that instant, as it is, once;
 - else the line between the messages before and after, if they are near enough (`MAX_BRIDGE`, `MAX_STEPS`);
 - else nothing: NaN, not received.
 
-A sample is formed as soon as every live unit has delivered for its stamp: by a message within the skew, or by a later
-one. The wait is at most the message interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of
-the others, once, and then it is waited for no more; and never longer than `MAX_PENDING` messages.
+A sample is formed as soon as every live unit has delivered for its stamp, or beyond. The wait is at most the message
+interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of the others, once; and never longer than
+`MAX_PENDING` messages.
 
 Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` behind the common time,
 the newest stamp that two units have reached, and not ahead of all other units by more. So of three units or more, one
-whose clock is fast, slow, jumps or is random leaves the base alone, and the others stay; of two, the newest counts, but
-where one falls behind by ``timeout`` without a jump the other may be fast. Until it comes back, or a third delivers,
-neither is believed: samples are formed, without values (`are_parted`). Only units that deliver count: one does until
-another has gone on for ``timeout`` since its last message, by that one's own stamps. A unit that leaves the base has a
-bad clock: it is refused. When all leave it together (a recording that starts anew, a clock set back, a pause of the
-whole system) the base itself has moved. That is accepted once every live unit stands within ``timeout`` of the others
-there, or one has gone on there for ``timeout`` while no other delivered. After a step back, ``shift`` is added to the
-stamps of the samples, so that these never run backwards.
+whose clock is fast, slow, jumps or is random leaves the base alone; of two, the newest counts, but where one falls
+behind by ``timeout`` without a jump the other may be fast. Until it comes back, or a third delivers, neither is
+believed: samples are formed, without values (`are_parted`). Only units that deliver count: one does until another has
+gone on for ``timeout`` since its last message. When all leave the base together (a clock set back, a pause of the whole
+system) it has moved. That is accepted once every live unit stands within ``timeout`` of the others there, or one has
+gone on there for ``timeout`` while no other delivered. After a step back, ``shift`` is added to the stamps of samples.
 
-A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
-those of the samples, are of the instant of the measurement. A delay that is
-only estimated in flight leaves the stamps alone (`restamp`): where those of unit u are late by T_u, the value of the
-instant t is the one stamped t + T_u. So a sample stands for the instant that lies the largest delay back; the unit that
-is late most gives it as it is, the others what lies between their samples around that.
+Delays that are set are taken off before all of this. One that is estimated in flight leaves the stamps alone
+(`restamp`): where those of unit u are late by T_u, the value of the instant t is the one stamped t + T_u. So a sample
+stands for the instant that lies the largest delay back; the unit that is late most gives it as it is, the others what
+lies between their samples around that.
 """
 
 from __future__ import annotations
@@ -61,15 +57,11 @@ from fdi_ros.core.records import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
-MAX_BRIDGE = 0.25  # longest span between two messages that is interpolated, as a share of the timeout
+MAX_BRIDGE = 0.25  # longest span that is interpolated, over the timeout: a unit that lost four messages is hardly there
 MAX_STEPS = 2.5  # and in usual message intervals: one lost message is bridged, two are not
-MAX_STAMP = 1 << 61
-"""ns, before and after zero: beyond all stamps that an Imu can carry, and no sum or difference of stamps overflows."""
-MAX_SPAN = 10**13  # longest skew and timeout, ns
-
+MAX_STAMP = 1 << 61  # ns: beyond all that an Imu can carry, and no sum or difference of two overflows
 _UNKNOWN = 1 << 62  # step before the first message of a time base, ns
 _NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
-_ROOM = 8192  # samples that are formed together at most
 _IDLE, _FORMING, _RESTARTING = range(3)
 
 
@@ -77,10 +69,10 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
     """Return an `Aligner`, (1,), of a number of units.
 
     ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent for longer than this by the
-    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,),
-    since what they stand for was measured that much earlier; empty: not at all.
+    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,);
+    empty: not at all.
     """
-    if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= MAX_SPAN and 1 <= timeout <= MAX_SPAN):
+    if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= 10**13 and 1 <= timeout <= 10**13):
         raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
     rows = allocate(Aligner)
     if len(delays) not in (0, units):
@@ -95,10 +87,7 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
 
 @compiled
 def enter(aligner: Aligner, j: int, stamp: int) -> None:
-    """Take one message of unit j, ``aligner.rate`` measured at stamp, ns. Before the next one take out all samples.
-
-    Nothing is done if there is no such unit, or the stamp is none that an Imu can have.
-    """
+    """Take a message of unit j, ``aligner.rate`` at stamp, ns, if there can be one; then take out its samples."""
     if not 0 <= j < aligner.n:
         return
     unit = aligner.units[j]
@@ -159,10 +148,7 @@ def _is_silent(aligner: Aligner, unit: Unit) -> bool:
 
 @compiled
 def _pass_time(aligner: Aligner, j: int, stamp: int) -> None:
-    """Note by a stamp of unit j, accepted or not, for how long the others have been silent.
-
-    A step longer than the timeout is a jump, and no time that has passed.
-    """
+    """Note by a stamp of unit j for how long the others have been silent; a step beyond the timeout is a jump."""
     unit = aligner.units[j]
     step = stamp - unit.before
     if unit.heard and 0 < step <= aligner.timeout:
@@ -227,10 +213,7 @@ def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
 
 @compiled
 def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
-    """Note a stamp that was not accepted; return whether with it all units have left the time base.
-
-    Or most of them, if these were never in it.
-    """
+    """Note a refused stamp; return whether all units have left the time base, or most if these were never in it."""
     unit, timeout = aligner.units[j], aligner.timeout
     _count_refused(unit, stamp, aligner.common)
     if (unit.end > 0 and stamp == unit.newest) or not _is_outside(aligner, j, stamp):
@@ -461,11 +444,6 @@ class Alignment:
         return bool(is_live(self.rows[0], unit))
 
     @property
-    def are_parted(self) -> bool:
-        """Whether the clocks of the only two units that deliver went apart."""
-        return bool(are_parted(self.rows[0]))
-
-    @property
     def counters(self) -> tuple[dict[str, int], ...]:
         """What was counted, by name, for each unit."""
         rows = self.rows["units"]["counters"][0, : self.units]
@@ -481,15 +459,10 @@ class Alignment:
         """Added to the stamps of the samples, ns; 0 until all clocks were set back."""
         return int(self.rows["shift"][0])
 
-    @property
-    def restarts(self) -> int:
-        """How often the time base began anew."""
-        return int(self.rows["restarts"][0])
-
     def _aligned(self, unit: Int, stamp: Int, rate: Array) -> NDArray[Any]:
         parts, start = [], 0
         while True:
-            samples = allocate(Sample, min(len(stamp) - start + 64, _ROOM))
+            samples = allocate(Sample, min(len(stamp) - start + 64, 8192))
             start, count = align_messages(self.rows, unit, stamp, rate, start, samples)
             parts.append(samples[:count])
             if count < len(samples):

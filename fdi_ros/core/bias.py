@@ -5,22 +5,19 @@
 
 The average is robust. Values are taken eight at a time, without the largest and the smallest; the means of these groups
 are averaged over fifteen portions of the time; the bias is the mean of the portions without a fifth of them at either
-end. So neither single spikes nor a few disturbed portions reach it. In white noise its standard deviation is 10 %
-larger than that of the plain mean (`EFFICIENCY`).
+end. So neither single spikes nor a few disturbed portions reach it.
 
-Whether it was rest is tested for each channel by itself (mean and scatter), and for the channels together. A turn
-lies in the part of all channels that a body rate can explain; biases and noise, one channel as good as another, lie as
-much in each dimension of that part as in each of the others, which no body rate reaches. So with C the mean square of
-the first part per dimension (3) and P that of the second (k - 3 of k channels):
+Whether it was rest is tested for each channel by itself (mean and scatter), and for the channels together. A turn lies
+in the part of all channels that a body rate can explain; biases and noise, one channel as good as another, lie as much
+in each dimension of that part as in each of the others. So with C the mean square of the first part per dimension (3)
+and P that of the second (k - 3 of k channels):
 
 - averages: C / s^2 is F-distributed with 3 and k degrees of freedom, s^2 = (3 USUAL^2 + (k - 3) P) / k, as the size of
   the biases is not known but for a prior, scaled inverse chi-square about `USUAL` with 3 degrees of freedom (Gelman et
   al., Bayesian Data Analysis, 3rd ed., 3.3);
 - deviations of the 15 portions from their mean: C / P is F-distributed with 42 and 14 (k - 3) degrees of freedom,
-  however coloured the noise, as long as it is not slower than the portions. What is no more than the noise of one
-  sample is let pass: vibration below the sample noise is not rotation.
-
-Both need nothing of the mounting but that noise and bias of one channel are independent of the others'.
+  however coloured the noise, if it is not slower than the portions. No more than the noise of one sample is let pass:
+  vibration below it is not rotation.
 """
 
 from __future__ import annotations
@@ -37,23 +34,17 @@ from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, Val
 from fdi_ros.core.subsets import apply_gain, eliminate_rate
 from fdi_ros.model.samples import MAX_RATE, Array
 
-LEAST_ROWS = 10  # samples that an average takes at least
-LEAST_GIVEN = 4  # a channel gives one value in so many samples at least: a unit may be slower than the others
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
 """Where the bias comes from; or why the last average was refused."""
+LEAST_ROWS = 10  # samples that an average takes at least: fewer may be a single group, and show no scatter
+LEAST_GIVEN = 4  # a channel gives one value in so many samples at least: a unit may be slower than the others
 GROUP = 8  # values taken together, of which the largest and the smallest are left out
 MIDDLE_SQUARE = 0.3995  # mean square of the middle six of eight normal values about their mean, in variances of one
-END = 5  # one of so many portions is left out at either end
-EFFICIENCY = 0.82
-"""Variance of the plain mean over that of this average, in white noise: 0.934 by the groups, 0.88 by the portions."""
-USUAL = 0.005  # usual size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s
-FALSE_TURN = 0.003
-"""Probability that biases are taken for a turn, averaged over the sizes that they may have. A vehicle with such
-biases is refused each time, until they are given by ``bias.fixed`` or followed in motion."""
-FALSE_SWAY = 0.001  # probability that noise is taken for motion; then the next average is taken
-PRIOR = 3  # degrees of freedom of what is known of the size of biases beforehand
-LEAST_SQUARE = 1e-30  # (rad/s)^2; instead of zero, to divide by
-_RATE = 3  # dimensions of a body rate
+EFFICIENCY = 0.82  # variance of the plain mean over that of this one, in white noise: 0.934 by groups, 0.88 by portions
+USUAL = 0.005  # size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s
+PRIOR = 3  # degrees of freedom of that: it may be half to four times as much
+FALSE_TURN = 0.003  # probability that biases are taken for a turn: such a vehicle is refused until they are given
+FALSE_SWAY = 0.001  # that noise is taken for motion: less, since it costs another average each time
 
 
 def restart_bias(core: NDArray[Any]) -> None:
@@ -67,19 +58,16 @@ def restart_bias(core: NDArray[Any]) -> None:
 def prepare_limits(bias: Any) -> None:
     """Fill in the ratios beyond which a time was not at rest."""
     bias["turn_ratio"], bias["sway_ratio"] = np.inf, np.inf
-    for k in range(_RATE, MAX_CHANNELS + 1):
-        bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, _RATE, k - _RATE + PRIOR)
-        if k > _RATE:
+    for k in range(3, MAX_CHANNELS + 1):
+        bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, 3, k - 3 + PRIOR)
+        if k > 3:
             freedom = BIAS_PORTIONS - 1
-            bias["sway_ratio"][k - 1] = f_quantile(FALSE_SWAY, _RATE * freedom, (k - _RATE) * freedom)
+            bias["sway_ratio"][k - 1] = f_quantile(FALSE_SWAY, 3 * freedom, (k - 3) * freedom)
 
 
 @functools.cache
 def f_quantile(probability: float, above: int, below: int) -> float:
-    """Value that an F-distributed one exceeds with the given probability, 1e-4 to 0.5; within 0.1 %.
-
-    ``above``, ``below``: degrees of freedom of numerator and denominator.
-    """
+    """Value that F exceeds, of degrees of freedom above and below, with a probability, 1e-4 to 0.5; within 0.1 %."""
     # F = (below / above) / tan^2(angle), with the density cos^(above - 1) sin^(below - 1).
     edges = np.linspace(0.0, np.pi / 2, 8001)
     middle = 0.5 * (edges[1:] + edges[:-1])
@@ -151,7 +139,7 @@ def middle_mean(values: Array, count: int) -> float:
             values[j] = values[j - 1]
             j -= 1
         values[j] = value
-    out = count // END
+    out = count // 5
     total = 0.0
     for k in range(out, count - out):
         total += values[k]
@@ -241,13 +229,13 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
             noise += sensors.noise_std[i] * sensors.noise_std[i] / k
     eliminate_rate(parity, sensors.n, sensors.axes, 0.0)
     turn, explained, other = split(core, mask)
-    size = (PRIOR * USUAL * USUAL + other) / (k - _RATE + PRIOR)
+    size = (PRIOR * USUAL * USUAL + other) / (k - 3 + PRIOR)
     average.common_rate = turn
-    average.max_common_rate = turn * math.sqrt(average.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
+    average.max_common_rate = turn * math.sqrt(average.turn_ratio[k - 1] * size * 3 / max(explained, 1e-30))
     explained, other, count = split_portions(core, mask)
-    if k > _RATE and count > 1:
-        average.sway = math.sqrt(explained / (_RATE * (count - 1)))
-        average.max_sway = math.sqrt(average.sway_ratio[k - 1] * other / ((k - _RATE) * (count - 1)) + noise)
+    if k > 3 and count > 1:
+        average.sway = math.sqrt(explained / (3 * (count - 1)))
+        average.max_sway = math.sqrt(average.sway_ratio[k - 1] * other / ((k - 3) * (count - 1)) + noise)
     return average.common_rate > average.max_common_rate or average.sway > average.max_sway
 
 

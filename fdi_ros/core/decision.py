@@ -3,9 +3,8 @@
 
 """From alarms to declarations, and from these and what a channel shows by itself to its state.
 
-The evidence of one sample, confirmation over a window, latching or return. All memory of declarations lives here, and
-all of it is bounded: the last samples of one window, a few figures per channel. A fault after ten hours is declared as
-fast as one after a second.
+All memory of declarations lives here, and is bounded: the last samples of one window, a few figures per channel. A
+fault after ten hours is declared as fast as one after a second.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from fdi_ros.core.records import Core, Current, Decision, Estimate, Evidence, Pa
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
-SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit before that counts
+SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit: by chance it is so once in 30 000
 
 
 @compiled
@@ -58,7 +57,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             variance = 2 * variance_of(settings.sensors, i, now.along[i], core.acceleration.value)
             if abs(evidence.error[i]) <= settings.return_limit * math.sqrt(variance):
                 evidence.agrees |= 1 << i
-    evidence.intermittent = intermittent_channels(health, settings.n, INTERMITTENT_SHARE)
+    evidence.intermittent = intermittent_channels(health.gone, health.leaves, settings.n, INTERMITTENT_SHARE)
     clear &= now.usable
     return update_stuck(core, subsets[clear], clear, evidence.stamp)
 
@@ -114,7 +113,7 @@ def bits_of(flags: NDArray[np.uint8], n: int) -> int:
 # Declarations --------------------------------------------------------------------------------------------------------
 
 
-RETURN_MEAN = 0.5  # a channel returns only if, averaged over the clean time, it is off by less than this many noise_std
+RETURN_MEAN = 0.5  # noise_std that a channel's mean over the clean time is off by where it returns: else it is a fault
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
@@ -246,11 +245,7 @@ def follow_declared(settings: PathSettings, decision: Decision, evidence: Eviden
 
 @compiled
 def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> int:
-    """Bits of the declared channels that have agreed for the clean time.
-
-    A small fault agrees sample by sample. So the mean is of the last one or two clean times: of what was before it is
-    no more.
-    """
+    """Bits of the declared channels that have agreed for the clean time, and in the mean of one or two of these."""
     returns = 0
     for i in range(settings.n):
         if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= settings.clean_time:
@@ -385,22 +380,18 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
 
 
 @compiled
-def update_reasons(core: Core, subset: Subset) -> None:
-    """Why each channel is in its state; subset: the channels alive."""
-    for i in range(core.settings.n):
-        state, condition = core.last.state[i], core.health.condition[i]
-        reason = _OF_CONDITION[condition] if state == _SHOWN[condition] else _DISAGREES
-        if state == OK:
-            reason = 0
-        elif state == EXCLUDED:
-            reason = _OPERATOR
-        elif state == FAULTY:
-            reason = _OF_DECISION[core.decision.why[i]]
-        elif state == UNCHECKED:
-            reason = why_unchecked(core, subset, i)
-        elif state == SUSPECT and core.now.evidence.flickers >> i & 1:
-            reason = _INTERMITTENT
-        core.reason[i] = reason
+def reason_of(core: Core, subset: Subset, i: int) -> int:
+    """Why a channel is in its state; subset: the channels alive."""
+    state, condition = core.last.state[i], core.health.condition[i]
+    if state in (OK, EXCLUDED):
+        return _NONE if state == OK else _OPERATOR
+    if state == FAULTY:
+        return _OF_DECISION[core.decision.why[i]]
+    if state == UNCHECKED:
+        return why_unchecked(core, subset, i)
+    if state == SUSPECT and core.now.evidence.flickers >> i & 1:
+        return _INTERMITTENT
+    return _OF_CONDITION[condition] if state == _SHOWN[condition] else _DISAGREES
 
 
 @compiled
@@ -422,9 +413,9 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
     """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
     last = core.last
     core.group = core.decision.ambiguous
-    update_reasons(core, subset)
     for i in range(core.settings.n):
-        after, reason = last.state[i], core.reason[i]
+        after, reason = last.state[i], reason_of(core, subset, i)
+        core.reason[i] = reason
         if after != core.state[i]:
             error = 0.0
             if reason in (_DISAGREES, _DRIFTED) and not learning:

@@ -43,9 +43,7 @@ from fdi_ros.model.samples import Array
 # Rivals of what is declared -------------------------------------------------------------------------------------------
 
 
-APART = 1e-3
-"""Least share of a channel's own variance in its parity, and of A_ii A_jj in the determinant of two: else no residual
-shows them, or they look alike and one is enough."""
+APART = 1e-3  # least share of a variance in its parity, and of A_ii A_jj in the determinant: else none shows, or alike
 
 
 @compiled
@@ -82,10 +80,7 @@ def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
 
 @compiled
 def cover(core: Core, out: int, chi: float) -> None:
-    """Raise the level to what holds if the channels in ``out`` are healthy, and one or two of those fused are not.
-
-    chi: chi-square of those fused.
-    """
+    """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not."""
     n, now, parity, prior = core.settings.n, core.now, core.now.parity, core.settings.prior
     mask, count, free = now.fused | out, 0, -1.0
     update_parity(core, mask)
@@ -100,6 +95,7 @@ def cover(core: Core, out: int, chi: float) -> None:
     base = 0.5 * (chi - chi_of(parity, n, mask, now.corrected)) + free - math.log(core.settings.risk / (count * count))
     for i in range(n):
         a, u = parity.information[i, i], now.rival[i]
+        # Else no residual shows the channel; or two look alike, and one is enough.
         if now.fused >> i & 1 and a * now.uncertainty[i] > APART:
             cover_one(core, i, i, (u / a, 0.0), (1.0 / a, 0.0, 0.0), base + 0.5 * u * u / a)
         for j in range(i):
@@ -113,10 +109,7 @@ def cover(core: Core, out: int, chi: float) -> None:
 
 @compiled
 def cover_one(core: Core, i: int, j: int, f: tuple[float, float], p: tuple[float, float, float], odds: float) -> None:
-    """Raise the level to what holds if channels i and j have errors f of covariance p (ii, jj, ij).
-
-    odds: logarithm of the odds of that over its share of the risk.
-    """
+    """Raise the level where channels i, j have errors f of covariance p (ii, jj, ij), of log odds over their risk."""
     now, last = core.now, core.last
     for a in range(3 if odds > 0.0 else 0):
         g, h, rate = now.parity.gain[a, i], now.parity.gain[a, j], 0.0
@@ -133,11 +126,7 @@ def cover_one(core: Core, i: int, j: int, f: tuple[float, float], p: tuple[float
 
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left.
-
-    Weights are those of the noise and of what is not known of the errors at the moment, where a detector estimates
-    them; else those of the noise expected.
-    """
+    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left."""
     settings, last, now = core.settings, core.last, core.now
     n = settings.n
     now.fused = choose_fused(settings, core.health, now, subsets, doubtful)
@@ -168,11 +157,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 @compiled
 def update_lag(core: Core) -> None:
-    """Find the instant that the rate is of, and by how much the rate has changed up to it where that has to wait.
-
-    Where units are late the values are of an instant before the stamp. Those of the samples only ever go forwards: when
-    more is taken off, the next ones come close after each other.
-    """
+    """Find the instant that the rate is of, where units are late before the stamp; instants only ever go forwards."""
     true = core.now.evidence.stamp - round(1e9 * core.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
@@ -328,10 +313,9 @@ def update_common_error(core: Core) -> None:
 def update_level(core: Core, subsets: NDArray[Any]) -> None:
     """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
 
-    It is for the errors that this sample may have, in its own motion: that of the rate with weights as expected, by how
-    much the fused rate differs from that, and what passes for rate and shows in no residual. There is none without a
-    fused rate, while a doubtful channel has to be fused for want of others, and where the separation test
-    fails, whatever the verdict is.
+    It is that of the rate with weights as expected, in the motion of this sample; by how much the fused rate differs
+    from that; and what passes for rate and shows in no residual. There is none without a fused rate, while a doubtful
+    channel has to be fused for want of others, and where the separation test fails, whatever the verdict is.
     """
     last, now, subset = core.last, core.now, subsets[core.now.fused]
     passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused

@@ -4,12 +4,9 @@
 """Checks beside the detector: of each value by itself, of values that repeat while others move, of units that are one.
 
 A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much
-longer time, or against motion that the other channels see along this channel's axis: then the channel is stuck, or the
-values of a whole unit are old.
-
-The other channels are evidence of motion only if they agree among themselves: in a sample with an alarm that does not
-isolate the channel that repeats, it is not called stuck. So a fault of another channel never makes a quantised sensor
-at rest look stuck, and of two parallel channels neither is called stuck because of the other.
+longer time, or against motion that the others see along this channel's axis: then the channel is stuck, or the values
+of a whole unit are old. The others are evidence of motion only if they agree: in a sample with an alarm that does not
+isolate the channel that repeats, it is not called stuck, and so neither of two parallel ones because of the other.
 """
 
 from __future__ import annotations
@@ -36,6 +33,7 @@ from fdi_ros.core.records import (
     Subset,
 )
 from fdi_ros.core.subsets import fill_rate
+from fdi_ros.model.geometry import MIN_SENSITIVITY, ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
 FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(int, Condition)
@@ -89,21 +87,16 @@ def receive(settings: PathSettings, health: Health, i: int, stamp: int, z: float
 # Values that come and go ----------------------------------------------------------------------------------------------
 
 SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0
-"""Time and values over which the share that is not finite is averaged, ns; the longer one counts."""
-DOUBTED_SHARE, INTERMITTENT_SHARE = 0.15, 0.25
-"""A channel is left out of the rate from the first share on, and faulty from the second: of single values that a driver
-drops, up to 10 %, neither is reached."""
-RETURNING = 3
-"""After a value that is not finite the next ones are left out of the rate, where enough are left: all but the third."""
-LEAST_LEAVES = 4.0  # and if so many went away lately at least: one hole is none that comes and goes
+"""ns and values over which the share that is not finite is averaged, the longer: 50 tell 15 % from 25 %."""
+DOUBTED_SHARE = 0.15  # from which a channel is left out of the rate: drivers drop up to 10 % of single values
+INTERMITTENT_SHARE = 0.25  # from which it is faulty: 2.5 standard deviations of the average above that
+RETURNING = 3  # a value that is not finite, and the next two, are left out of the rate: they are no better
+LEAST_LEAVES = 4.0  # times that a channel went away lately where it comes and goes: a hole or two are none of it
 
 
 @compiled
 def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
-    """Follow the share of the values of a channel that are not finite; step: since the value before, ns.
-
-    What is not received has other reasons: a link that loses messages, a unit that is slower than the others.
-    """
+    """Follow the share of the values of a channel that are not finite; step: since the value before, ns."""
     adaptation_gain = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     health.gone[i] += adaptation_gain * ((0.0 if finite else 1.0) - health.gone[i])
     health.leaves[i] *= 1.0 - adaptation_gain
@@ -112,17 +105,13 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
         health.leaves[i] += 1.0
 
 
-COMPLETE_SHARE, COMPLETE_TIME = 0.02, 2_000_000_000
-"""A unit that has given a value in all but so few samples for so long, ns, is no slow one: if it goes away again and
-again later, it is left out of the rate."""
+COMPLETE_SHARE, COMPLETE_TIME = 0.02, 4 * SHARE_TIME
+"""A unit that lacked so few samples, one of a whole average, for so long is no slow one, and may come to flicker."""
 
 
 @compiled
 def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uint8]) -> None:
-    """Follow the share of the samples of each channel that nothing was received for.
-
-    That is no fault of the channel: a link loses messages, a unit gives fewer of them.
-    """
+    """Follow the share of samples that nothing was received for: no fault, as a link loses messages."""
     adaptation_gain = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     for i in range(n):
         if health.begun == 1:
@@ -140,51 +129,35 @@ def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uin
 
 
 @compiled
-def sparse_channels(health: Health, n: int) -> int:
-    """Bits of the channels that were complete, and now go away again and again."""
+def intermittent_channels(gone: Array, leaves: Array, n: int, share: float) -> int:
+    """Bits of the channels of which at least a share comes and goes: shares gone (n,), and how often they went."""
     found = 0
     for i in range(n):
-        if health.absent[i] >= INTERMITTENT_SHARE and health.lapses[i] >= LEAST_LEAVES:
-            found |= 1 << i
-    return found & health.complete
-
-
-@compiled
-def intermittent_channels(health: Health, n: int, share: float) -> int:
-    """Bits of the channels of whose values at least a share comes and goes."""
-    found = 0
-    for i in range(n):
-        if health.gone[i] >= share and health.leaves[i] >= LEAST_LEAVES:
+        if gone[i] >= share and leaves[i] >= LEAST_LEAVES:
             found |= 1 << i
     return found
 
 
 # Values that repeat --------------------------------------------------------------------------------------------------
 
-LEAST_MOTION = 6.0
-"""Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
-beyond one step of a quantised sensor: so far it may turn without a new value."""
+LEAST_MOTION = 6.0  # standard deviations, beyond one step, that the others move by while a stuck value repeats
 STEPS = 3.0  # of a quantised sensor: it repeats its value by chance until the body has moved by so many
 RESTS, AT_REST = 3.0, 1e-3
-"""At rest the rate is within so many standard deviations of a channel, and so many rad/s, of zero."""
-COARSE_STEP = 0.5  # steps of so many standard deviations are coarse
+"""At rest the rate is within three standard deviations of a channel, and a step of MAVLink in rad/s, of zero."""
+COARSE_STEP = 0.5  # standard deviations: noise takes a value over smaller steps with nearly every sample
 ALL_REPEAT = 100_000_000
-"""ns that all channels repeat their values before none of them is believed; in coarse steps ``stuck_time``, if that is
-longer: gyros without noise repeat for longer in a steady turn."""
-LEAST_SENSITIVITY = 1e-3  # below it a channel's own error does not show in its residual
+"""ns that all channels repeat their values before none of them is believed: what a link may hold up. In coarse steps
+``stuck_time``, if that is longer: gyros without noise repeat for longer in a steady turn."""
 
 
 @compiled
 def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
-    """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
-
-    In ``now.prediction``, rad/s, from the rate in ``now.others_rate``; NaN where there is none.
-    """
+    """Predict each channel from the others of a subset, into ``now.prediction``, rad/s; NaN: they say nothing."""
     axes, rate = settings.sensors.axes, now.others_rate
     for i in range(settings.n):
         along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         share = subset.sensitivity[i]
-        if share > LEAST_SENSITIVITY:
+        if share > MIN_SENSITIVITY**2:
             residual = now.input[i] - along
             now.prediction[i] = along + residual - residual / share
         else:
@@ -240,8 +213,10 @@ def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
 @compiled
 def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
     """Leave channels whose values seem to come and go out of the sample, where enough are left."""
-    now, n = core.now, core.settings.n
-    now.evidence.flickers = intermittent_channels(core.health, n, DOUBTED_SHARE) | sparse_channels(core.health, n)
+    now, health, n = core.now, core.health, core.settings.n
+    # And those that were complete, and now lack samples again and again.
+    sparse = health.complete & intermittent_channels(health.absent, health.lapses, n, INTERMITTENT_SHARE)
+    now.evidence.flickers = sparse | intermittent_channels(health.gone, health.leaves, n, DOUBTED_SHARE)
     for i in range(n):
         rest = now.usable & ~(now.evidence.flickers & 1 << i)
         if subsets[rest].spare:
@@ -250,10 +225,7 @@ def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
 
 @compiled
 def update_repeated(core: Core) -> int:
-    """Channels of the units that give all their values again while the others have measured motion.
-
-    The values are old, and no evidence about any single channel.
-    """
+    """Channels of the units that give old values: all of theirs again, while the others have measured motion."""
     members, sensors, found = core.settings.members, core.settings.sensors, 0
     for u in range(core.settings.units):
         # A unit with a channel that gives nothing, or nothing in range, is none of these: what it gives is new, or the
@@ -311,21 +283,17 @@ def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int)
 
 # Units that are one sensor --------------------------------------------------------------------------------------------
 #
-# Their values are the same to the bit, turned, scaled or some samples later. Two gyros differ by their noise. Where a
-# linear map of three channels explains to rounding what three others change by, from sample to sample, these are a
-# copy: a topic that was mapped twice, or a driver that publishes one device under two names. A copy agrees with its
-# original whatever is wrong with it, so it is left out.
+# Two gyros differ by their noise. Where a linear map of three channels explains to rounding what three others change
+# by, from sample to sample, these are a copy, perhaps turned, scaled or some samples later: a topic that was mapped
+# twice. A copy agrees with its original whatever is wrong with it, so it is left out.
 
 
-PERIOD = 1_000_000_000  # from one comparison to the next, ns
+PERIOD = 1_000_000_000  # from one comparison to the next, ns: a copy is found on the ground, and in no hurry
 ROWS = 24  # changes that are compared; quantised values of two gyros at rest may agree by chance in fewer
-FEW = 8  # of these so many first: mostly they tell that there is no copy
-MAX_LAG = 20  # samples by which a copy may come later
-HITS = 2  # comparisons that make a copy
-EXPLAINED = 1e-9  # a copy leaves less than this share of the square of what changes
-ROUNDING = 1e-12  # a channel of which no more than this share is its own adds nothing to what the others explain
-LEAST_NOISE = 0.02
-"""Changes smaller than this share of what the noise makes are smooth: what explains them may be the motion."""
+FEW = ROWS // 3  # of these so many first: mostly they tell that there is no copy
+MAX_LAG = 20  # samples by which a copy may come later: a second topic of one driver is not held up for longer
+HITS = 2  # comparisons that make a copy: one alone may be of values that hardly change
+LEAST_NOISE = 0.02  # of what the noise makes: smaller changes are smooth, and what explains them may be the motion
 
 
 @compiled
@@ -376,9 +344,9 @@ def first_of_three(members: int) -> int:
 def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int) -> bool:
     """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
 
-    Of the newest samples, until so many as wanted have changed; what is not received or out of range is no evidence.
-    ``source``, ``target``: first channel of the unit that may be the original, and of the one that may be the copy,
-    which comes later by ``lag`` samples. Return whether there are so many, in no more than twice so many samples.
+    Of the newest samples, until so many as wanted have changed. ``source``, ``target``: first channel of the unit that
+    may be the original, and of the one that may be the copy, later by ``lag`` samples. Return whether there are so
+    many, in no more than twice so many samples.
     """
     change, products, count = copies.change, copies.products, 0
     for i in range(6):
@@ -399,10 +367,7 @@ def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag
 
 @compiled
 def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -> bool:
-    """Second differences of three channels up to sample k, into three places of ``out``; return whether all are there.
-
-    What is not finite or out of range is no evidence.
-    """
+    """Second differences of three channels up to sample k, into ``out``; return whether all are finite and in range."""
     new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
     old = line.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
@@ -424,22 +389,20 @@ def is_explained(copies: Copies, settings: PathSettings, target: int, count: int
         noise += settings.sensors.noise_std[target + i] ** 2
     for p in range(3):
         pivot = products[p, p]
-        if pivot > ROUNDING * trace:
+        # A channel of which no more is its own adds nothing to what the others explain.
+        if pivot > 1e-12 * trace:
             for i in range(p + 1, 6):
                 share = products[i, p] / pivot
                 for j in range(p + 1, 6):
                     products[i, j] -= share * products[p, j]
     for i in range(3):
-        if products[3 + i, 3 + i] > EXPLAINED * copies.change[i]:
+        if products[3 + i, 3 + i] > ROUNDING * copies.change[i]:
             return False
     return size > count * 6.0 * LEAST_NOISE**2 * noise
 
 
 def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
-    """Find pairs of series (N, 3) of one rate, rad/s, of which one gives what the other gives, by their numbers.
-
-    Of series of different lengths the last values are compared.
-    """
+    """Find pairs of series (N, 3) of one rate, rad/s, of which one is a copy of the other: their numbers."""
     found = []
     line, copies, settings = allocate(DelayBuffer), allocate(Copies), allocate(PathSettings)
     settings["members"][0, :2] = 0b111, 0b111000

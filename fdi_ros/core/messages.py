@@ -25,20 +25,16 @@ from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
 from fdi_ros.model.samples import Array, Bytes, Int
 
-GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP = range(5)
+GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
-FIRST_OWN = 5
 ENCAPSULATION = 4  # bytes before the first field
-LAST_STAMP = (2**31 - 1) * 1_000_000_000  # latest time that the header of a message can hold, to the second, ns
-
 IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
-_WORD = (1 << 32) - 1
+LAST_STAMP = (_SIGN - 1) * _NS  # latest time that the header of a message can hold, to the second, ns
 _FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # elements of a symmetric (3, 3) matrix by rows, in its upper triangle
 _IN_ORDER = np.arange(MAX_CHANNELS)
-_UPPER = [0, 1, 2, 4, 5, 8]
 
 
 class MessageError(FdiError):
@@ -122,26 +118,12 @@ def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, ra
         return at
     little = data[offset + 1] == 1
     both = read_bits(data, offset + ENCAPSULATION, 8, little)
-    first, second = both >> 32 & _WORD, both & _WORD
+    first, second = both >> 32 & 0xFFFFFFFF, both & 0xFFFFFFFF
     sec, nanosec = (second, first) if little else (first, second)
     if sec >= _SIGN or nanosec >= _NS:
         return -BAD_STAMP
     read_doubles(data, at, 3, little, rate)
     return sec * _NS + nanosec
-
-
-def explain(code: int, data: bytes, called: str) -> str:
-    """Explain in one line what a code says is wrong with a message with a std_msgs/Header; called: "an Imu"."""
-    size, order = len(data), byte_order(data)
-    if code == NO_CDR:
-        return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
-    if code == NO_HEADER:
-        return f"{size} bytes are too few for {called}"
-    if code == CUT_VALUES:
-        (name,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION + 8)
-        return f"{size} bytes are too few for {called} whose frame_id has {name} bytes"
-    sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION)
-    return f"stamp has {sec} s and {nanosec} ns, expected at least 0 s and less than {_NS} ns"
 
 
 def byte_order(data: bytes) -> str:
@@ -155,11 +137,6 @@ class Decoded(NamedTuple):
     code: Bytes  # (k,) `GOOD`, or what is wrong
     stamp: Int  # (k,) ns; 0 for messages that carry none
     values: Array  # (k, c) rad/s
-
-    @classmethod
-    def nothing(cls, k: int, columns: int) -> Decoded:
-        """Nothing decoded yet."""
-        return cls(np.zeros(k, dtype=np.uint8), np.zeros(k, dtype=np.int64), np.zeros((k, columns)))
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -199,10 +176,7 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
 
 @compiled
 def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int) -> None:
-    """Write statistic, threshold, states of n channels and protection level of one sample into a Float64MultiArray.
-
-    It has n + 5 values; out and at as for `fill_imu`.
-    """
+    """Write statistic, threshold, n states and level into a Float64MultiArray; out and at as for `fill_imu`."""
     _write_double(out, at, row.statistic)
     _write_double(out, at + 8, row.threshold)
     _write_doubles(out, at + 16, row.state, _IN_ORDER, n)
@@ -227,7 +201,7 @@ class ImuTemplate:
 
     def fill(self, stamp: int, rate: Sequence[float], covariance: Sequence[float]) -> bytes:
         """Return the message: stamp ns, rate (3,) rad/s, covariance (9,) by rows, symmetric, (rad/s)^2."""
-        upper = np.array([covariance[i] for i in _UPPER], dtype=np.float64)
+        upper = np.array([covariance[i] for i in (0, 1, 2, 4, 5, 8)], dtype=np.float64)
         fill_imu(self.bytes, self.at, stamp, np.array(rate, dtype=np.float64).reshape(3), upper)
         return self.bytes.tobytes()
 

@@ -9,7 +9,7 @@
 constants of the detector for just the channels present are still to be prepared, which happens once for each set of
 channels.
 
-Each kind of input has a compiled `take` of its own (`fdi_ros.sources`), made of its reading and `receive_stamped` or
+Each kind of input has a compiled `receive` (`fdi_ros.sources`), made of its reading and `receive_stamped` or
 `receive_arrived`. The samples that are complete then go through `process`.
 """
 
@@ -44,12 +44,11 @@ from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, PathSetting
 from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
 from fdi_ros.model.samples import Bytes
 
-NOISY, NOISIER = 3.0, 1.4
-"""A channel is noisy from so many times the noise expected, if that is so many times what any other has."""
-RAIL_MARGIN = 0.9
-"""A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
-WAITING = -1
-RAIL_LIMIT = 10.0  # a value out of range is fed to the detector as so many ranges at most
+NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
+NOISIER = 1.4  # and times that of any other: vibration of the body comes to no channel alone
+RAIL_MARGIN = 0.9  # of the range: where the others predict less, a value out of it is a fault and no manoeuvre
+RAIL_LIMIT = 10.0  # ranges that the detector sees of a value out of range at most: any shows as well
+WAITING = -1  # instead of a number of events
 
 
 Path = tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]]
@@ -64,12 +63,9 @@ def run(
     """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
 
     Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first sample that
-    brings one.
-
-    Returned are the row at which work ended, N if all is done; the number of events; and whether something must be
-    prepared. If it is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set; if the
-    row before it lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is
-    set.
+    brings one. Returned are the row at which it ended, N if all is done; the number of events; and whether something
+    must be prepared. If it is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set;
+    if the row before it lacks its level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
     core, count = path[0][0], 0
     for k in range(start, len(samples)):
@@ -88,11 +84,7 @@ def run(
 
 @compiled
 def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int) -> int:
-    """Work one sample; the output is ``core.last``. Return the number of events.
-
-    Or `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.input_mask``: then the same
-    sample is to be given again.
-    """
+    """Work one sample; the output is ``core.last``. Return the number of events, or `WAITING`: then give it again."""
     core, bank = path[0][0], path[1][0]
     now = core.now
     if not now.waiting:
@@ -313,11 +305,9 @@ WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
 """Bits of what taking and working a message returns: a sample was worked; it has a fused rate; it brought
 events; another is to be worked; the path wants something prepared (before the next call, which goes on with the
 sample if none was worked); the message was refused."""
-NEVER = -1
-AHEAD_OF_CLOCK = 1_000_000_000
-"""A live stamp is ahead of the clock by so much at most, ns: clocks of two computers may differ, and a simulator's has
-steps."""
-STEP_BACK = 100_000_000  # a clock set back by more than this is followed, ns; less is waited out
+NEVER = -1  # instead of a stamp
+AHEAD_OF_CLOCK = 1_000_000_000  # ns that a live stamp may be: clocks of two computers differ, and simulators step
+STEP_BACK = 100_000_000  # ns; a clock set back by more is followed, less is waited out: NTP slews that within minutes
 
 
 @compiled
@@ -347,10 +337,7 @@ def receive_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: in
 
 @compiled
 def receive_arrived(live: Live, code: int, stamp: int) -> int:
-    """Take what was read of a message of all channels, their values into `live.sample.z`; return `MALFORMED` or `MORE`.
-
-    ``code``: what reading said. ``stamp``: when the message arrived, ns.
-    """
+    """Take what was read of all channels, into `live.sample.z`, stamped on arrival; return `MALFORMED` or `MORE`."""
     inlet, sample = live.inlets[0], live.sample
     inlet.received += 1
     inlet.error = code

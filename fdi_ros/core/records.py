@@ -39,8 +39,7 @@ MAX_PENDING = 1024  # messages of one unit that wait at most
 RING = MAX_PENDING + 2  # messages kept of one unit: those that wait, one too many, and the one before them
 RESTAMP_SAMPLES = 1024  # kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
 BIAS_PORTIONS = 15  # into which the time of the average at the start is divided
-ACCELERATION_SAMPLES = 1024
-"""Samples that the window of the angular acceleration spans at most; of a longer one the last so many count."""
+ACCELERATION_SAMPLES = 1024  # that the window of the angular acceleration spans; of a longer one the last count
 DECISION_SAMPLES = 1000  # samples in the longest window of the votes
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
@@ -72,7 +71,7 @@ class Counters:
 
 @record
 class Accepted:
-    """One message that was accepted."""
+    """A message that was accepted."""
 
     stamp: Whole  # ns
     rate: Vector  # rad/s
@@ -321,10 +320,7 @@ class Portion:
 
 @record
 class Bias:
-    """Bias of each channel, and the average that is being taken.
-
-    A time that was not at rest is refused: a new one is begun, or the biases are followed in motion.
-    """
+    """Bias of each channel, and the average that is being taken."""
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
@@ -385,9 +381,8 @@ class TimedRate:
 class Acceleration:
     """Rates of the last samples.
 
-    The acceleration is the difference of the rate to the latest sample at least `window` older, at least one sample.
-    A difference over one sample at 1 kHz would turn a fault's own step into so much acceleration that the timing
-    term hides the fault; over 10 ms it cannot. Where there was no rate at the older end, the one before it is taken.
+    The acceleration is the difference of the rate to the latest sample at least `window` older that had one. Over one
+    sample at 1 kHz a fault's own step would make so much of it that the timing term hides the fault.
     """
 
     window: Whole  # ns

@@ -31,9 +31,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_R
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import MAX_RATE, Array, Mask
 
-MIN_SPARE_RATIO = 0.1
-"""Channels under suspicion are left out as long as the rest measures its worst axis at least a tenth as well as its
-best; below that, leaving them out costs more than a widened covariance."""
+MIN_SPARE_RATIO = 0.1  # worst over best axis of the rest, below which leaving out costs more than a wider covariance
 
 
 def mask_of(channels: Iterable[int]) -> int:
@@ -126,9 +124,8 @@ def fill_growth(n: int, noise_std: Array, variance: Array, remaining: Array, gro
     """How many times noise_std^2 the square of each channel's error in a sample is, into growth (n,).
 
     ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): what is not known of each channel's bias, standard
-    deviation, rad/s. How the biases that remain hang together is not known: an axis with gains G is off by G b with a
-    standard deviation of up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch et al. 2015), whose square is
-    at most n times that of independent ones.
+    deviation, rad/s. How these hang together is not known: an axis with gains G is off by up to ``sum |G_i| std(b_i)``
+    (as by the nominal biases of Blanch et al. 2015), whose square is at most n times that of independent ones.
     """
     for i in range(n):
         growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (noise_std[i] * noise_std[i])
@@ -216,15 +213,10 @@ def note_known(acceleration: Acceleration, oldest: int) -> None:
             acceleration.known.rate[a] = one.rate[a]
 
 
-# The detector ---------------------------------------------------------------------------------------------------------
-#
-# It has one row of constants and of memory for each set of channels present, or one for all (`Detector.takes_any`). A
-# sample from which channels are absent is judged by the channels left, with constants prepared for just these
-# (`fdi_ros.detectors.base`).
+# The detector: one row of constants and of memory for each set of channels present, or one for all --------------------
 
 
-UNPREPARED, REFUSED = -1, -2
-"""Instead of a row: constants for these channels were not prepared yet; the method cannot run on them."""
+UNPREPARED, REFUSED = -1, -2  # instead of a row: not prepared yet; the method cannot run on these channels
 
 
 @compiled
@@ -250,12 +242,7 @@ def clear_verdict(verdict: SampleVerdict, n: int) -> None:
 
 @compiled
 def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumstances, verdict: SampleVerdict) -> bool:
-    """Judge one sample z (n,) by the channels in mask.
-
-    Returns
-    -------
-    False, and nothing is done, if the constants for these channels are still to be prepared.
-    """
+    """Judge a sample z (n,) by the channels in mask; False, and nothing is done, if their constants are unprepared."""
     row = 0 if bank.takes_any else bank.row[mask]
     if row == UNPREPARED:
         return False
@@ -322,9 +309,7 @@ def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> Non
 # channels that are not in a set are zero.
 
 
-UNKNOWN_RATE = 1e-6
-"""k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no
-division by zero."""
+UNKNOWN_RATE = 1.0 / MAX_RATE**2  # k where nothing is known: an axis that no channel measures is no division by zero
 
 
 @compiled

@@ -3,10 +3,9 @@
 
 """A block of 40 ms: motion or rest, innovations, the correction of the states, and those kept from moments before.
 
-Delays that are sure leave the states for `restamp`, and after a hole the blocks begin anew. The states kept are 0.12 to
-490 s apart, eight of each distance; after a fault the estimator goes back to them. The test of rest (`rests`) is also
-that of calibration and inspection; the average of the biases at the start has one of its own, which needs no estimator
-(`core/bias.py`), and so has the check of values that repeat (`stands` in `core/health.py`).
+After a fault the estimator goes back to states kept 0.12 to 490 s before, eight of each distance. The test of rest
+(`rests`) is also that of calibration and inspection; the average of the biases at the start has one of its own, which
+needs no estimator (`core/bias.py`), and so has the check of values that repeat (`is_at_rest` in `core/health.py`).
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from fdi_ros.estimator.error_states import (
 )
 from fdi_ros.estimator.estimator import (
     LEAST_SHARE,
+    LONG_TIME,
     REST_BLOCKS,
     SNAPSHOTS,
     TIERS,
@@ -43,13 +43,11 @@ from fdi_ros.estimator.noise import MOTION, REST, THREE_SIGMA
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array
 
-QUIET, LIVED = 3.0, 2.0
-"""At rest the variance of blocks is at most so many times what it was at rest before, once that was so many s."""
+QUIET = 3.0  # variance of blocks over that of rest before: a hover in vibration has more
 REST_STD = 3e-4  # rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates
 UNLEARNED = 0.003  # rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn
-REST_CHI, REST_LAST = 1.6, 12.0
-"""At rest the scatter of those is at most so many times that of noise, the square of their mean at most `THREE_SIGMA`
-variances and of the last one's distance from it so many."""
+REST_CHI = 1.6  # scatter of the blocks of a second over that of noise: 72 degrees of freedom exceed it once in 1000
+REST_LAST = 12.0  # square of the last block's distance from their mean: soon enough for motion that begins
 
 
 @compiled
@@ -75,8 +73,8 @@ def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floo
 
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
-"""Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""
-AFTER_HOLE = 10.0
+"""Random walk of a bias over a hole, rad/s/sqrt(s), which has gone its way, of a turn-on bias, in an hour."""
+AFTER_HOLE = 5.0 * LONG_TIME
 """s of samples after a hole in which biases are compared with those before: five comparisons, and by then the states
 know what they can learn of the biases."""
 
@@ -99,10 +97,7 @@ def keep_snapshot(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
-    """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off.
-
-    The states kept from before it stay, as little sure of the biases: what changed in the hole is compared with them.
-    """
+    """Let the biases be others after a hole, in all states kept too: what changed in it is compared with those."""
     if not is_after_hole(params, kf):
         kf.hole_at, kf.hole_sample = kf.seconds - seconds, kf.samples
     move_biases(params, kf, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
@@ -139,14 +134,9 @@ def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
         if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
             kf.states.p[place, place] += params.layout.prior[place] * params.layout.prior[place]
-            forget_snapshots(kf)
-
-
-@compiled
-def forget_snapshots(kf: Estimator) -> None:
-    """Forget all states before now: they were surer than what is known now."""
-    for tier in range(TIERS):
-        kf.taken[tier] = 0
+            # The states kept are surer than what is known now.
+            for tier in range(TIERS):
+                kf.taken[tier] = 0
 
 
 @compiled
@@ -171,9 +161,10 @@ def predict_from(params: Constants, kf: Estimator, seconds: float, states: Error
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
-PEAK = 0.8  # what a peak of motion fades to with every block
-TAKE_OFF, SURE = 0.002, 25.0  # a delay is sure beyond so many s, and the square of so many standard deviations
-LONGEST_DELAY = 0.06  # s that are made up for at most
+PEAK = 0.8  # what a peak of motion fades to with every block: gone in half a second
+TAKE_OFF = 0.002  # s; a smaller delay is an error state, whose first order is enough
+SURE = 25.0  # square of a delay in its variances from which it is sure: it moves the values of all that come after
+LONGEST_DELAY = 0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
 
 
 @compiled
@@ -247,10 +238,7 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def judge_block(params: Constants, kf: Estimator) -> float:
-    """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable.
-
-    Its means are put to its middle, and the share of noise in the statistics of blocks is noted.
-    """
+    """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable."""
     n, noise, layout = params.sensors.n, kf.noise, params.layout
     for a in range(3):
         kf.signal_rate[a] = kf.rates[1, a] if noise.regime == MOTION else 0.0
@@ -309,7 +297,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         # Where little is known of the biases, a steady turn looks like them.
         kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
     kf.rest = rests(kf.rest_rates, newest, kf.rest_noise, kf.rest_bias_variance, params.rest_std * params.rest_std)
-    if kf.noise.lived[REST] > LIVED:
+    if kf.noise.lived[REST] > LONG_TIME:
         # A hover in vibration may turn as little: it is known by its noise.
         for i in range(n):
             if kf.masks[1] >> i & 1 and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]:
@@ -360,11 +348,7 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def learn(params: Constants, kf: Estimator, weight: float) -> None:
-    """Correct the states by the block before.
-
-    At rest the rate is known to be zero. The estimated one would be the noise of the values themselves, and is no
-    signal there.
-    """
+    """Correct the states by the block before; at rest the rate is zero, and the estimated one no signal."""
     n, layout = params.sensors.n, params.layout
     kept = kf.masks[1] & ~kf.under_test
     if kf.rest:

@@ -7,8 +7,6 @@ Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each 
 table `ERROR_KINDS`: its states enter a channel multiplied by a signal each (`fill_signals`): ``y = C x + H w + e``
 with row i of C the signals of channel i at the places of its states. Some have no signal: they are the rate of change
 of others.
-
-To add a kind of error (an error by acceleration, by temperature): the recipe in docs/architecture.md.
 """
 
 from __future__ import annotations
@@ -283,10 +281,7 @@ def fill_shares(layout: Layout, states: ErrorStates, at: Projection, information
 
 @compiled
 def keep_least_variance(layout: Layout, i: int, by: int, least: float, taught: Array) -> None:
-    """Let the states that enter channel i multiplied by ``by`` keep a variance, in ``taught`` (states,).
-
-    A unit learns from that of its axes which shows most.
-    """
+    """Let the states that enter channel i by ``by`` keep a variance: a unit learns from the axis that shows most."""
     for k in range(SIGNALS):
         place = layout.place[i, k]
         if layout.by[k] == by and place >= 0:

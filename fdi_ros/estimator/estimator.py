@@ -39,30 +39,28 @@ from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, Stat
 from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array
 
-BLOCK_TIME, LONG_TIME = 0.04, 2.0
-"""s; the second is that of the longest time scale of evidence. For so long the states are held under suspicion at most
-(their errors would be common to all blocks), and of a longer time since an onset the last half is explained."""
+BLOCK_TIME = 0.04  # s; four samples at 100 Hz, and short against what moves a body
+LONG_TIME = 2.0
+"""s; the longest time scale of evidence. For so long the states are held under suspicion at most (their errors would be
+common to all blocks), and of a longer time since an onset the last half is explained."""
 BEGINS = 16.0
-"""Motion begins where the square of the rate is so many of its variances, and `THREE_SIGMA` times what no rate
-explains: a fault looks like motion too."""
-SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8  # s between snapshots; of each tier every eighth goes on to the next
-REST_BLOCKS = 25  # blocks without motion that are rest
-SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
-"""Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
+"""Motion begins where the square of the rate is so many of its variances, which noise never is, and `THREE_SIGMA` times
+what no rate explains: a fault looks like motion too."""
+SNAPSHOT_TIME, TIERS, SNAPSHOTS = 3.0 * BLOCK_TIME, 5, 8
+"""s between snapshots, three blocks; of each tier every eighth goes on to the next."""
+REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
+STRIDE = round(LONG_TIME / BLOCK_TIME)
+SAMPLES, BLOCKS, COARSE = 256, 1024, 512  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
 LEAST_SHARE = 0.02  # share of noise in the variance of a statistic, at least: what is less is rounding
-CHECKABLE = 0.01
-"""Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
-ten times as large."""
-CHECKABLE_AT = 2.0 * BLOCK_TIME * 100.0
-"""How often what is not known of the states counts at 100 Hz: twice the samples of a block."""
 SENSITIVE = 1e-6  # share of a channel's own variance in its parity, below which a fault does not show
+CHECKABLE = 0.01  # information over that with all errors known: with less a fault would have to be ten times as large
 Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
 Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
 Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
-SLOW_TURN = 1e-4  # (rad/s)^2; below it nothing grows with the motion
+SLOW_TURN = 1e-4  # (rad/s)^2; below 0.6 deg/s nothing grows with the motion
 SPIKE = 4  # samples that a spike lasts at most: delays spread it over neighbours
 
 
@@ -230,7 +228,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
             kf.share[i] = max(share / information, LEAST_SHARE)
             # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
             hidden = kf.known[i] / information - 1.0
-            if hidden * CHECKABLE_AT / lasting < 1.0 / CHECKABLE - 1.0:
+            if hidden * (2.0 * BLOCK_TIME * 100.0) / lasting < 1.0 / CHECKABLE - 1.0:
                 kf.checked |= 1 << i
         kf.growth[i] = kf.shared.level[i] + kf.at.covariance[i, i]
     kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
@@ -296,10 +294,7 @@ def usual_chi(free: float) -> float:
 
 @compiled
 def update_statistics(params: Constants, kf: Estimator) -> None:
-    """Statistics of a sample: the innovation of each channel in its standard deviations.
-
-    What is not known of the states grows with motion, which may be faster now than in the last block.
-    """
+    """Statistics of a sample: innovations in their standard deviations; that of the states grows with motion."""
     n = params.sensors.n
     square = kf.rate[0] * kf.rate[0] + kf.rate[1] * kf.rate[1] + kf.rate[2] * kf.rate[2]
     more = max((square + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
@@ -341,10 +336,7 @@ def is_spike(params: Constants, kf: Estimator) -> bool:
 
 @compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
-    """Add a sample to the totals and to the block being filled; return whether that is complete.
-
-    A block of other channels than those before is none of the same. From a spike nothing is learned.
-    """
+    """Add a sample to the totals and, but for spikes, to the block being filled; return whether that is complete."""
     n, total, spike = params.sensors.n, kf.total, is_spike(params, kf)
     total.sample = kf.samples
     if kf.filled == 0:

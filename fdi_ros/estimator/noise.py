@@ -34,29 +34,26 @@ from fdi_ros.compiling.compiled import (
 from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 
-SCALES = 4  # samples, blocks, 0.25 s, 2 s
-SAMPLE, BLOCK, QUARTER, LONG = range(SCALES)
+SAMPLE, BLOCK, QUARTER, LONG, SCALES = range(5)
+"""Time scales: samples, blocks, 0.25 s, 2 s; and their number."""
 REST, MOTION = range(2)
 LAGS = 3  # of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later
 THREE_SIGMA, FAR = 9.0, 100.0
 """Squares of three standard deviations, which one of 370 normal values exceeds, and of ten, which none does."""
-BURST = 0.75
-"""The variance of the moment counts where it exceeds the learned one by more than it scatters in white noise."""
+BURST = 0.75  # share of the variance of half a second that is no scatter: it counts where it exceeds the learned one
 QUIETEST = 0.1  # of the variance expected: less is not believed, or the noise would be unknown when it comes back
-QUIETEST_BLOCK, LOUDEST = 0.03, 1e4
-"""And that of blocks at least, and at most: beyond it is no noise that anything could be told in."""
-UNKNOWN = 16.0  # by how much the variance of long times may exceed that of blocks, before anything was measured
-FASTER = 16.0
-"""Four times as fast as ever: vibration and what is not linear are others, and the noise of a hover says nothing."""
-WILD, TAME = 5.0, 3.0
-"""A value beyond so many standard deviations followed by one below so many is a wild one, and no fault."""
-WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0  # what is known of their frequency before any was seen: so many in so many
+QUIETEST_BLOCK = 0.03  # the same of blocks: quantised values at rest have means that scatter less
+LOUDEST = 1e4  # of blocks at most: in a hundred times the noise expected nothing could be told
+UNKNOWN = 16.0  # variance of long times over that of blocks at most, before any was measured: four times the noise
+FASTER = 16.0  # four times as fast as ever: vibration and what is not linear are others than in a hover
+WILD = 5.0  # standard deviations that no normal value reaches: gone with the next one it is no fault
+WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0  # before any was seen: one in 200 000, of which 4000 samples tell more
 SURELY = 0.8  # share of a level of long times that is no scatter of its estimate, which is from some 80 values at most
-TRUST = 50.0  # degrees of freedom that the learned noise counts for at most
+TRUST = 50.0  # degrees of freedom at most: what has more is normal
 TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
-"""Samples over which the weight of the tails is averaged, and that the first guess counts for."""
+"""Samples over which the weight of the tails is averaged: a minute tells some; and that the first guess counts for."""
 TAIL_SCATTER = 2.8  # standard deviation of those products in white noise, cut at `FAR`
-LEARNED_IN = 64.0  # samples for each degree of freedom to be earned
+LEARNED_IN = 64.0  # samples for each degree of freedom to be earned: all of `TRUST` within half a minute at 100 Hz
 
 ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
 ByLevel = Annotated[NDArray[np.float64], "f8", (SCALES + LAGS, MAX_CHANNELS)]
@@ -152,23 +149,16 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
     """Begin with the variances expected (n,), (rad/s)^2; ``noise`` is all zero."""
     noise.regime = MOTION
     for i in range(n):
-        for part in range(2):
-            fill_levels(noise.kept[part], i, expected[i])
-        fill_levels(noise.now, i, expected[i])
+        for levels in (noise.now, noise.kept[0], noise.kept[1]):
+            levels.sample[i] = levels.block[i] = expected[i]
+            for k in range(SCALES + LAGS):
+                levels.level[k, i] = 1.0
         noise.quick[i] = noise.square[i] = noise.share[i] = 1.0
         noise.squares[0, i] = noise.squares[1, i] = 1.0
         noise.unknown[i] = 1.0 + UNKNOWN
         noise.degrees[i] = TRUST
         noise.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
     update_longest(noise, n)
-
-
-@compiled
-def fill_levels(levels: Levels, i: int, expected: float) -> None:
-    """Begin one channel."""
-    levels.sample[i] = levels.block[i] = expected
-    for k in range(SCALES + LAGS):
-        levels.level[k, i] = 1.0
 
 
 @compiled
@@ -212,7 +202,7 @@ def place_of(noise: Noise, mask: int) -> int:
 @compiled
 def update_sample_noise(noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
     """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
-    adaptation_gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
     # Of other channels the rate is another: their difference would be that of the errors of the sensors.
     place = place_of(noise, mask)
     for i in range(n):
@@ -226,8 +216,8 @@ def update_sample_noise(noise: Noise, n: int, mask: int, t: Array, inflation: Ar
             noise.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * noise.quick[i])
             if learn:
-                noise.neighbours[i] += adaptation_gain * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
-                noise.square[i] += adaptation_gain * (step - noise.square[i])
+                noise.neighbours[i] += gain * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
+                noise.square[i] += gain * (step - noise.square[i])
             noise.squares[odd, i] = step
     count_wild(noise, SAMPLE, n, mask, t)
 
@@ -240,7 +230,7 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
     """
     for i in range(n):
         if mask >> i & 1:
-            if abs(noise.last[scale, i]) > WILD and abs(t[i]) < TAME:
+            if abs(noise.last[scale, i]) > WILD and t[i] * t[i] < THREE_SIGMA:
                 noise.wild[scale, i] += 1.0
             noise.last[scale, i] = t[i]
         noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (noise.wild[scale, i] + WILD_EVENTS)
@@ -252,8 +242,8 @@ def update_sample_variance(
 ) -> None:
     """Learn the variance of samples, beside the one expected (n,) (rad/s)^2, from those of a block.
 
-    ``mask``: channels that delivered throughout; ``length``, ``blocks``: samples of a block, blocks so far;
-    ``adaptation_gain``: of the noise of the moment, per block; ``learn``: the learned variance follows.
+    ``mask``: channels that delivered throughout; ``length``, ``blocks``: samples of a block, blocks so far; ``learn``:
+    the learned variance follows.
     """
     gain = 1.0 / min(blocks + 25.0, 100.0)
     for i in range(n):
@@ -307,10 +297,8 @@ def update_block_noise(noise: Noise, n: int, mask: int, t: Array, expected: Arra
 def update_slow_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
-        level = noise.now.level[k, i]
-        noise.now.level[k, i] += gain * (
-            min(0.5 * step * step * noise.longest[i], THREE_SIGMA * max(level, 1.0)) - level
-        )
+        level, square = noise.now.level[k, i], 0.5 * step * step * noise.longest[i]
+        noise.now.level[k, i] += gain * (min(square, THREE_SIGMA * max(level, 1.0)) - level)
 
 
 @compiled
@@ -321,9 +309,8 @@ def update_long_noise(noise: Noise, scale: int, n: int, mask: int, t: Array, lea
         if mask >> i & 1:
             if scale == QUARTER:
                 # Noise with a memory shows at a second's distance, a beat at half its period.
-                update_slow_level(
-                    noise, QUARTER, i, t[i] - noise.apart[quarter, i], gain, learn and noise.seen[scale] > 4
-                )
+                step = t[i] - noise.apart[quarter, i]
+                update_slow_level(noise, QUARTER, i, step, gain, learn and noise.seen[scale] > 4)
                 for lag in range(1, LAGS + 1):
                     step = t[i] - noise.apart[(quarter - lag) % 4, i]
                     update_slow_level(noise, SCALES + lag - 1, i, step, gain, learn and noise.seen[scale] > lag)

@@ -31,22 +31,18 @@ import math
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, compute_weights, eliminate_rate, invert
 from fdi_ros.estimator.estimator import Constants, Estimator
-from fdi_ros.estimator.noise import BURST, PAST, THREE_SIGMA, SharedNoise
+from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
 MEMORY = 2.0  # half seconds that everything here is a mean of
-FARTHEST = 10.0  # standard deviations beyond which an innovation counts less, and three of the rate of differences
-LINE = 1.0 / 6.0
-"""Excess of the inverse of the dimensions at which all is taken for a line: of two dimensions in a parity of three."""
+LINE = 1.0 / 6.0  # excess of the inverse of the dimensions where all is a line: two dimensions in a parity of three
 INCOHERENT, COHERENT = 0.25, 0.75  # squared correlation that chance reaches in a second, and from which all is coherent
 STEADY = 4.0
 """Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
 parallel channels see a tenth more or less makes a variance wrong by a sixth there."""
 UNEQUAL = 0.15  # by how much units see vibration differently; logs show 0.04 to 0.6
-INDEPENDENT = 4.0  # values of a block that are independent of one another
-NEAR_SINGULAR, TINY_RATE = 1e-3, 1e-11
-"""Added to Q, share of it and of a square in (rad/s)^2: an axis about which nothing is measured."""
-FOURTH = math.sqrt(70.0)  # standard deviation of a fourth difference of white noise, over its own
+INDEPENDENT = 4.0  # values of a block that are independent of one another: all four at 100 Hz
+NEAR_SINGULAR = 1e-3  # share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is measured
 
 
 @compiled
@@ -86,7 +82,7 @@ def update_covariance(params: Constants, kf: Estimator) -> None:
         largest = max(largest, abs(kf.statistic[i]))
     half = params.length / params.adaptation_gain
     shared.count = min(shared.count + 1.0, MEMORY * half)
-    share = min(1.0, (FARTHEST / max(largest, 1.0)) ** 2)
+    share = min(1.0, (math.sqrt(FAR) / max(largest, 1.0)) ** 2)
     for i in range(n):
         if shared.kept >> i & 1:
             innovation = kf.innovation[i] - shared.local[i]
@@ -101,21 +97,24 @@ def update_covariance(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def add_fourth_difference(params: Constants, kf: Estimator) -> None:
-    """Sum the products of what channels have in common and what they differ by, of one fourth difference."""
+    """Sum the products of what channels have in common and what they differ by, of one fourth difference.
+
+    Of white noise its standard deviation is that of the values times the root of 70.
+    """
     shared, n = kf.shared, params.sensors.n
     past = shared.past
     for i in range(n):
         shared.difference[i] = 0.0
         if shared.kept >> i & 1:
             ends = kf.corrected[i] + past[3, i]
-            shared.difference[i] = (ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]) / FOURTH
+            shared.difference[i] = (ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]) / math.sqrt(70.0)
     apply_gain(shared.alone.gain, n, shared.difference, shared.common)
     size = 0.0
     for a in range(3):
         for b in range(3):
             size += shared.common[a] * shared.inverse[a, b] * shared.common[b]
             shared.common_sum[a, b] += shared.common[a] * shared.common[b]
-    share = min(1.0, 9.0 / max(size, 1e-12))
+    share = min(1.0, THREE_SIGMA / max(size, 1e-12))
     shared.taken += 1
     for i in range(n):
         if shared.kept >> i & 1:
@@ -250,7 +249,7 @@ def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> fl
             shared.common_sum[a, b] = 0.0
             over += shared.alone.normal[max(a, b), min(a, b)] * shared.square[a, b] / 3.0
             shared.factor[a, b] = shared.square[a, b]
-        shared.factor[a, a] = shared.factor[a, a] * (1.0 + NEAR_SINGULAR) + NEAR_SINGULAR * TINY_RATE
+        shared.factor[a, a] = shared.factor[a, a] * (1.0 + NEAR_SINGULAR) + NEAR_SINGULAR * 1e-11
     invert(shared.factor, 3, shared.inverse)
     return over
 

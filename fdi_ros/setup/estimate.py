@@ -27,7 +27,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.estimator.blocks import LIVED, QUIET, REST_STD, UNLEARNED, rests
+from fdi_ros.estimator.blocks import QUIET, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     ERROR_KINDS,
     ONE,
@@ -37,7 +37,7 @@ from fdi_ros.estimator.error_states import (
     places_of,
     prepare_layout,
 )
-from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.pipeline import UNIT_DELAY
@@ -252,7 +252,7 @@ class _Pass:
         found &= (np.abs(mean - np.median(mean[found], axis=0)) < limit).all(axis=1)
         # Beside motion its beginning is hidden by the noise.
         found &= np.append(True, found[:-1]) & np.append(found[1:], True)
-        return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LIVED)
+        return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LONG_TIME)
 
     def _find_evidence(
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array

@@ -110,15 +110,3 @@ def test_real_units_at_rest_are_taken_as_such_and_turned_by_hand_not(recording, 
         some = {"imus.topics": [settings.imus.topics[k] for k in kept], "imus.names": [], "imus.mounts": mounts}
         assert first_average(recording, settings.replaced(some), 0.0, 4.0) == "learned"
     assert first_average(recording, settings, 18.0, 21.5).startswith("refused, not at rest")
-
-
-def test_a_vehicle_on_the_ground_is_taken_as_at_rest(recording):
-    folder = recording.parent / "solo"
-    if not folder.exists():
-        pytest.skip(f"the recorded flight is not here: {folder}")
-    topics = [f"/imu_{k}/data_raw" for k in (1, 2, 3)]
-    settings = config(input="imus", imus__topics=topics, sample_rate=50.0, noise__noise_std=0.004)
-    assert first_average(folder, settings, 20.0, 24.0) == "learned"
-    assert first_average(folder, settings, 45.0, 49.0) == "learned"
-    # Picked up and put down.
-    assert first_average(folder, settings, 15.0, 18.5).startswith("refused, not at rest")

@@ -86,13 +86,6 @@ def outcome(process):
     return Path(lines["kept"].removeprefix("in ")), lines["says"], output
 
 
-@pytest.fixture
-def closed(copy):
-    """A copy in which nothing can be kept: a file is where a folder would be, which fails for every user, root too."""
-    (copy / "fdi_ros" / "__pycache__").write_text("")
-    return copy
-
-
 def test_first_starts_at_once_then_a_load(copy):
     both = [start(copy), start(copy)]
     (kept, says, output), second = (outcome(process) for process in both)
@@ -104,13 +97,6 @@ def test_first_starts_at_once_then_a_load(copy):
     warm = outcome(start(copy))
     assert warm[:2] == (kept, says)
     assert "compiled it in" not in warm[2]
-
-
-def test_installation_that_cannot_be_written(closed):
-    kept, _, output = outcome(start(closed))
-    assert kept.is_relative_to(closed.parent / "home" / ".cache" / "fdi_ros")
-    assert "compiled it in" in output
-    assert "compiled it in" not in outcome(start(closed))[2]
 
 
 def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
@@ -130,21 +116,27 @@ def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_writte
     assert "compiled it in" not in output
 
 
-def test_user_without_a_home_whatever_the_umask(closed):
+def test_installation_that_cannot_be_written(copy):
+    # A file is where a folder would be, which fails for every user, root too.
+    (copy / "fdi_ros" / "__pycache__").write_text("")
+    kept, _, output = outcome(start(copy))
+    assert kept.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
+    assert "compiled it in" in output
+    # Nor a home, whatever the umask.
     before = os.umask(0)
     try:
-        kept, _, output = outcome(start(closed, HOME="/proc/nothing"))
-        assert "compiled it in" not in outcome(start(closed, HOME="/proc/nothing"))[2]
+        kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+        assert "compiled it in" not in outcome(start(copy, HOME="/proc/nothing"))[2]
     finally:
         os.umask(before)
-    assert kept.is_relative_to(closed.parent / "temporary")
+    assert kept.is_relative_to(copy.parent / "temporary")
     assert stat.S_IMODE(kept.parent.stat().st_mode) == 0o700
     assert f"compiled code is kept in {kept}" in output
     for one in (kept, *kept.rglob("*.nb?")):
         assert not one.stat().st_mode & 0o022, one
     # A folder that others can write may hold what they like: it is not used.
     kept.parent.chmod(0o777)
-    assert outcome(start(closed, HOME="/proc/nothing"))[0].parent != kept.parent
+    assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
 
 
 class Planted:

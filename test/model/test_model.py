@@ -68,13 +68,6 @@ def test_two_triad_cone_as_the_paper_says() -> None:
         assert geometry.rho[i, j] == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("n", [4, 5, 7, 9, 12])
-def test_cone(n: int) -> None:
-    axes = Geometry.cone(n).axes
-    np.testing.assert_allclose(axes @ [0, 0, 1], np.full(n, 1 / np.sqrt(3)), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-12)
-
-
 def test_what_can_be_told_apart() -> None:
     geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
     assert geometry.groups == ((0, 3), (1, 4), (2, 5))
@@ -89,15 +82,6 @@ def test_what_can_be_told_apart() -> None:
     alone = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert alone.detectable.tolist() == [True, True, False, False]
     assert not alone.rho[2, [0, 1, 3]].any()
-
-
-def test_subset_keeps_names_and_axes_which_cannot_be_written_to() -> None:
-    geometry = Geometry.two_triad_cone()
-    left = geometry.subset([True, False, True, True, True, True])
-    assert left.channel_names == ("g1", "g3", "g4", "g5", "g6")
-    np.testing.assert_array_equal(left.axes, geometry.axes[[0, 2, 3, 4, 5]])
-    with pytest.raises(ValueError, match="read-only"):
-        left.axes[0, 0] = 1.0
 
 
 def test_variance_is_that_of_simulated_errors() -> None:
@@ -115,8 +99,12 @@ def test_variance_is_that_of_simulated_errors() -> None:
 
 
 def test_subset_takes_the_channels_left() -> None:
+    kept, geometry = [True, False, True, True, True], Geometry.cone(5)
+    part = geometry.subset(kept)
+    assert part.channel_names == ("g1", "g3", "g4", "g5")
+    np.testing.assert_array_equal(part.axes, geometry.axes[kept])
     noise = NoiseModel([1.0, 2, 3, 4, 5], scale_std=0.1, bound=[5.0, 6, 7, 8, 9], bias_std=[0.0, 1, 2, 3, 4])
-    left = noise.subset([True, False, True, True, True])
+    left = noise.subset(kept)
     expected = {"noise_std": [1, 3, 4, 5], "scale_std": [0.1] * 4, "bound": [5, 7, 8, 9], "bias_std": [0, 2, 3, 4]}
     for name, values in expected.items():
         np.testing.assert_array_equal(getattr(left, name), values)
@@ -168,13 +156,6 @@ def test_largest_of_correlated_normals_by_simulation(n: int, probability: float)
     error = math.sqrt(rows * probability)
     # Above three parity dimensions the threshold is itself an average over samples, good to about 1 %.
     assert abs(hits - rows * probability) < 3.5 * error + 0.01 * rows * probability
-
-
-@pytest.mark.parametrize("n", [4, 6, 9])
-@pytest.mark.parametrize("probability", [1e-2, 1e-6, 1e-12])
-def test_between_one_normal_and_bonferroni(n: int, probability: float) -> None:
-    threshold = max_normal_threshold(directions(Geometry.cone(n)), probability)
-    assert normal_isf(probability / 2) - 1e-6 <= threshold <= normal_isf(probability / (2 * n)) + 1e-6
 
 
 def test_twins_count_once() -> None:

@@ -6,10 +6,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import struct
-import sys
-import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -20,8 +17,7 @@ from bag.recordings import imu as imu_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.compiling.compiled import INTERPRETED
-from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError
 from fdi_ros.sources import ChannelsSource, ImuSource
 
 finite = st.floats(allow_nan=False)
@@ -35,9 +31,6 @@ imus = st.lists(st.tuples(stamps, st.tuples(numbers, numbers, numbers), frames, 
 labelled = st.lists(st.text("abcdef", max_size=9), max_size=4)
 arrays = st.lists(st.tuples(st.lists(numbers, max_size=8), labelled, orders, gaps), min_size=1, max_size=12)
 triangles = st.lists(finite, min_size=6, max_size=6)
-
-ros = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="ROS 2 is not installed")
-
 
 parse_imu, decode_imu = partial(ImuSource.parse, count=3), partial(ImuSource.decode, count=3)
 patch_imu, patch_channels = ImuSource.patch, ChannelsSource.patch
@@ -73,14 +66,12 @@ def full(triangle) -> list[float]:
 class TestOneMessage:
     """Read, patched and refused from Python."""
 
-    @given(stamps, vectors, vectors, frames, orders)
-    def test_patched_imu_differs_in_the_rate_alone(self, stamp, rate, other, frame, order) -> None:
-        assert patch_imu(imu_bytes(stamp, rate, frame, order), other) == imu_bytes(stamp, other, frame, order)
-
-    @given(st.lists(finite, min_size=1, max_size=12), st.lists(frames, max_size=3), orders)
-    def test_patched_channels_differ_in_the_values_alone(self, values, labels, order) -> None:
-        other = [v + 1.0 for v in values]
-        assert patch_channels(array_bytes(values, labels, order), other) == array_bytes(other, labels, order)
+    @given(stamps, vectors, st.lists(finite, min_size=3, max_size=12), st.lists(frames, min_size=1, max_size=3), orders)
+    def test_patched_messages_differ_in_the_values_alone(self, stamp, rate, values, names, order) -> None:
+        imus = [imu_bytes(stamp, one, names[0], order) for one in (rate, values[:3])]
+        arrays = [array_bytes(one, names, order) for one in (values, values[::-1])]
+        assert patch_imu(imus[0], values[:3]) == imus[1]
+        assert patch_channels(arrays[0], values[::-1]) == arrays[1]
 
     @given(st.binary(max_size=400))
     def test_any_bytes_are_read_or_refused_as_a_known_error(self, data) -> None:
@@ -92,16 +83,6 @@ class TestOneMessage:
         ):
             with contextlib.suppress(MessageError):
                 assert len(read(data)) > 1
-
-    @settings(max_examples=30)
-    @given(st.integers(0, 400), orders)
-    def test_half_a_message_is_refused(self, cut, order) -> None:
-        for whole, read in (
-            (imu_bytes(1, (1.0, 2.0, 3.0), order=order), parse_imu),
-            (array_bytes([1.0] * 6, order=order), lambda d: parse_channels(d, 6)),
-        ):
-            with pytest.raises(MessageError):
-                read(whole[: min(cut, len(whole) - 1)])
 
     @pytest.mark.parametrize("order", "<>")
     @pytest.mark.parametrize(
@@ -148,15 +129,6 @@ class TestOneMessage:
         with pytest.raises(MessageError, match="1000000 values, expected 6"):
             parse_channels(million, 6)
 
-    def test_a_frame_id_of_a_megabyte_is_not_copied(self) -> None:
-        data = imu_bytes(5, (1.0, 2.0, 3.0), "x" * 1_000_000)
-        parse_imu(data)
-        tracemalloc.start()
-        assert parse_imu(data) == (5, (1.0, 2.0, 3.0))
-        largest = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert largest < 100_000
-
 
 class TestManyMessages:
     """Read from one buffer, as they lie in a recording."""
@@ -202,6 +174,8 @@ class TestManyMessages:
                     stamp, values = single(message)
                 except MessageError:
                     good = False
+                # Half a message is refused, too.
+                assert good <= (drawn[k][0] is not None or len(message) == len(sound))
                 assert (decoded.good[k], decoded.stamp[k]) == (good, stamp)
                 assert same(decoded.values[k], values)
 
@@ -221,88 +195,15 @@ class TestManyMessages:
         assert array_count(*packed([b"", array_bytes([1.0] * 7, ["a"], ">")[:-30], array_bytes([1.0])])) == 7
         assert array_count(*packed([b"", b"\0\1"])) == 0
 
-    @pytest.mark.skipif(INTERPRETED, reason="plain Python makes a call for each message")
-    @pytest.mark.parametrize("order", "<>")
-    def test_messages_of_a_batch_cost_no_call_of_python_each(self, order) -> None:
-        count = 5_000
-        for one, decode in (
-            (imu_bytes(5, (1.0, 2.0, 3.0), order=order), decode_imu),
-            (array_bytes([1.0] * 6, order=order), lambda b, o, k: decode_array(b, o, k, 6)),
-        ):
-            batch = packed([one])
-            assert decode(*batch).good.all()
-            buffer, offset, length = np.tile(batch[0], count), np.arange(count) * len(one), np.full(count, len(one))
-            assert calls_of(lambda: decode(buffer, offset, length)) == calls_of(lambda: decode(*batch))  # noqa: B023
-            assert decode(buffer, offset, length).good.all()
 
-
-def calls_of(function) -> int:
-    """Calls of Python and C functions that a call makes."""
-    count = 0
-
-    def counted(frame, event, argument) -> None:
-        nonlocal count
-        count += event in ("call", "c_call")
-
-    function()
-    sys.setprofile(counted)
-    try:
-        function()
-    finally:
-        sys.setprofile(None)
-    return count
-
-
-class TestWriting:
-    """Templates, filled from Python and from compiled code."""
-
-    @given(st.integers(-(2**31) * 10**9, -1))
-    def test_a_stamp_before_1970_is_written_as_ros_writes_it(self, stamp) -> None:
-        true = STORE.deserialize_cdr(ImuTemplate("a").fill(stamp, [0.0] * 3, [0.0] * 9), IMU).header.stamp
-        assert (true.sec, true.nanosec) == divmod(stamp, 10**9)
-
-
-def unpadded(data: bytes, start: int) -> bytes:
-    """The bytes with those between start and the next multiple of 8 as zeros: ROS leaves in them what was there."""
-    end = start + -(start - 4) % 8
-    return data[:start] + bytes(end - start) + data[end:]
-
-
-@ros
-class TestAgainstRos:
-    """The same bytes as rclpy's own serialiser, and the same values."""
-
-    @settings(max_examples=60, deadline=None)
-    @given(stamps, vectors, triangles, frames)
-    def test_filled_imu(self, stamp, rate, triangle, frame) -> None:
-        from rclpy.serialization import deserialize_message, serialize_message
-        from sensor_msgs.msg import Imu
-
-        message = Imu()
-        message.header.frame_id = frame
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-        velocity = message.angular_velocity
-        velocity.x, velocity.y, velocity.z = rate
-        message.angular_velocity_covariance = full(triangle)
-        message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
-        data = ImuTemplate(frame).fill(stamp, rate, full(triangle))
-        assert data == unpadded(serialize_message(message), 17 + len(frame.encode()))
-        assert deserialize_message(data, Imu) == message
-
-    @settings(max_examples=60, deadline=None)
-    @given(st.lists(finite, min_size=1, max_size=14))
-    def test_filled_channels(self, values) -> None:
-        from rclpy.serialization import serialize_message
-        from std_msgs.msg import Float64MultiArray
-
-        data = serialize_message(Float64MultiArray(data=values))
-        assert ChannelsTemplate(len(values)).fill(values) == unpadded(data, 16)
-        assert parse_channels(data, len(values)) == tuple(values)
-
-
-def test_every_code_has_words_of_its_own() -> None:
-    imu, array = imu_bytes(1, (1.0, 2.0, 3.0)), array_bytes([1.0] * 6)
-    told = [ImuSource.explain(code, imu, 3) for code in range(GOOD + 1, FIRST_OWN)]
-    told += [ChannelsSource.explain(code, array, 5) for code in range(FIRST_OWN, FIRST_OWN + 4)]
-    assert len(set(told)) == len(told)
-    assert all("\n" not in line for line in told)
+@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1), vectors, triangles, frames, st.lists(finite, min_size=1))
+def test_what_is_written_equals_what_others_deserialise(stamp, rate, triangle, frame, values) -> None:
+    """From templates, filled in compiled code; stamps before 1970 as ROS has them."""
+    true = STORE.deserialize_cdr(ImuTemplate(frame).fill(stamp, rate, full(triangle)), IMU)
+    assert (true.header.stamp.sec, true.header.stamp.nanosec) == divmod(stamp, 10**9)
+    assert true.header.frame_id == frame
+    assert same([true.angular_velocity.x, true.angular_velocity.y, true.angular_velocity.z], rate)
+    assert same(true.angular_velocity_covariance, full(triangle))
+    # No orientation, no acceleration.
+    assert true.orientation_covariance[0] == true.linear_acceleration_covariance[0] == -1.0
+    assert same(STORE.deserialize_cdr(ChannelsTemplate(len(values)).fill(values), ARRAY).data, values)
