@@ -312,6 +312,8 @@ HARMLESS = {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "STATUSTEXT", "NAMED_VALUE_
 class Conversation:
     """A vehicle of ours and simulated autopilots over a link with a latency, in steps of 1 ms of simulated time.
 
+    Settings of the vehicle that are not given: 50 Hz of SCALED_IMU.
+
     Everything that our side sends is checked to be harmless.
     """
 
@@ -332,7 +334,8 @@ class Conversation:
         self.latency, self.may_set = latency, may_set
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
-        self.vehicle = Vehicle(VehicleSettings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
+        settings = VehicleSettings(**{"rate": 50.0, "kind": "SCALED_IMU", **settings})
+        self.vehicle = Vehicle(settings, self._send, lambda: UTC + self.now / NS)
         self.samples: list[tuple[int, ImuSample]] = []
         """With the time at which each came out, ns."""
         self.cut = False
@@ -379,8 +382,6 @@ class Conversation:
             self.vehicle.tick(self.now)
         return self
 
-    def by_unit(self) -> dict[int, list[ImuSample]]:
-        found: dict[int, list[ImuSample]] = {}
-        for _, sample in self.samples:
-            found.setdefault(sample.unit, []).append(sample)
-        return found
+    def of_unit(self, unit: int, since: float = math.inf) -> list[ImuSample]:
+        """Samples of a unit that came in the last seconds."""
+        return [sample for at, sample in self.samples if sample.unit == unit and at > self.now - since * NS]

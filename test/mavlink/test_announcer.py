@@ -9,15 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.mavlink.report import (
-    AT_ONCE,
-    CRITICAL,
-    INFO,
-    LENGTH,
-    NOTHING_SEEN,
-    WARNING,
-    Announcer,
-)
+from fdi_ros.mavlink.report import AT_ONCE, CRITICAL, INFO, LENGTH, NOTHING_SEEN, WARNING, Announcer
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 NS = 1_000_000_000

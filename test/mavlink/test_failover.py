@@ -124,7 +124,7 @@ class Monitored(Conversation):
     """A conversation with failover and a monitor that says what it is told to, at 50 Hz."""
 
     def __init__(self, path: Path, *autopilots: Autopilot, limit: int = 1, **settings) -> None:
-        super().__init__(*autopilots, kind="SCALED_IMU", may_set=True, **settings)
+        super().__init__(*autopilots, may_set=True, **settings)
         self.failover = Failover(self.vehicle, CHANNELS, limit, path / "out.json")
         self.states = [OK] * 9
         self.failover.is_alone = self.reports = True
@@ -137,8 +137,10 @@ class Monitored(Conversation):
             self.failover.turn(self.now)
         return self
 
-    def declare(self, channel: str, state: int = FAULTY) -> None:
+    def declare(self, channel: str, seconds: float = 0.0, state: int = FAULTY) -> Monitored:
+        """Have a channel declared, and let so many seconds go by."""
         self.states[CHANNELS.index(channel)] = state
+        return self.run(seconds)
 
 
 @pytest.fixture
@@ -151,8 +153,7 @@ def flying(tmp_path: Path) -> Monitored:
 def test_an_imu_is_out_within_100_ms_told_kept_and_put_back_on_disarm(flying: Monitored, tmp_path: Path) -> None:
     autopilot, at = flying.autopilots[0], flying.now
     flying.failover.errors["imu_1.y"] = 0.301
-    flying.declare("imu_1.y")
-    flying.run(1.0)
+    flying.declare("imu_1.y", 1.0)
     assert autopilot.sets == [(pytest.approx(at, abs=100 * MS), "INS_USE", 0.0)]
     assert autopilot.flies_with == 1
     assert autopilot.texts == [(2, "FDI: IMU 1 (imu_1) out of use (gyro y -0.30 rad/s)")]
@@ -168,31 +169,27 @@ def test_an_imu_is_out_within_100_ms_told_kept_and_put_back_on_disarm(flying: Mo
 
 @pytest.mark.parametrize("state", [SUSPECT, AMBIGUOUS, STALE, UNCHECKED])
 def test_what_is_not_declared_by_name_stays(flying: Monitored, state: int) -> None:
-    flying.declare("imu_1.y", state)
-    flying.declare("imu_2.y", state)
-    assert not flying.run(3.0).autopilots[0].sets
+    flying.declare("imu_1.y", state=state)
+    assert not flying.declare("imu_2.y", 3.0, state).autopilots[0].sets
 
 
 def test_on_the_ground_over_another_stack_or_before_an_answer_nothing_is_set(tmp_path: Path) -> None:
     deaf = Autopilot("ardupilot", armed=True, parameters=dict.fromkeys(PARAMETERS[:2], 1.0))
     for autopilot in (Autopilot("ardupilot"), Autopilot("px4", armed=True), deaf):
         talk = Monitored(tmp_path, autopilot).run(5.0)
-        talk.declare("imu_1.y")
-        assert not talk.run(3.0).autopilots[0].sets
+        assert not talk.declare("imu_1.y", 3.0).autopilots[0].sets
 
 
 def test_it_is_repeated_over_a_poor_link_and_given_up_where_refused(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     autopilot = Autopilot("ardupilot", loss=0.4, armed=True)
     talk = Monitored(tmp_path, autopilot, latency=lambda: int(random.exponential(50 * MS))).run(12.0)
-    talk.declare("imu_3.x")
-    talk.run(2.0)
+    talk.declare("imu_3.x", 2.0)
     assert autopilot.flies_with == 0
     assert autopilot.parameters["INS_USE3"] == 0.0
     refusing = Autopilot("ardupilot", armed=True, read_only={"INS_USE2"})
     talk = Monitored(tmp_path / "..", refusing, limit=2).run(6.0)
-    talk.declare("imu_2.x")
-    talk.run(5.0)
+    talk.declare("imu_2.x", 5.0)
     assert len(refusing.sets) == 10
     assert refusing.texts == [(2, "FDI: IMU 2 (imu_2) out of use: not accepted")]
     refusing.read_only.clear()
@@ -212,10 +209,8 @@ def test_what_somebody_else_sets_is_left_alone_however_soon(flying: Monitored, w
     flying.inject(out[0])
     flying.run(1.0 if wait > 2.0 else 5.0)
     assert autopilot.texts[-1] == (4, "FDI: IMU 1 (imu_1) set by others, left alone")
-    flying.declare("imu_1.y", OK)
-    flying.run(3.0)
-    flying.declare("imu_1.y")
-    flying.run(3.0)
+    flying.declare("imu_1.y", 3.0, OK)
+    flying.declare("imu_1.y", 3.0)
     assert [value for _, _, value in autopilot.sets] == [0.0]
     assert autopilot.texts[-1] == (2, "FDI: IMU 1 (imu_1) stays: set by others")
 
@@ -224,8 +219,7 @@ def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> N
     """The one with an IMU out falls silent, another is heard, then the first again, landed."""
     first, second = Autopilot("ardupilot", armed=True), Autopilot("ardupilot", system=2, armed=True, loss=1.0)
     talk = Monitored(tmp_path, first, second).run(6.0)
-    talk.declare("imu_1.y")
-    talk.run(5.0)
+    talk.declare("imu_1.y", 5.0)
     first.loss, second.loss = 1.0, 0.0
     talk.run(15.0)
     assert talk.vehicle.system == 2
@@ -239,8 +233,7 @@ def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> N
 def test_after_a_start_in_flight_what_is_in_use_again_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "out.json").write_text('{"system_id": 1, "out_of_use": [1]}')
     talk = Monitored(tmp_path, Autopilot("ardupilot", armed=True)).run(6.0)
-    talk.declare("imu_1.y")
-    talk.run(3.0)
+    talk.declare("imu_1.y", 3.0)
     assert talk.autopilots[0].texts == [(2, "FDI: IMU 1 (imu_1) stays: set by others")]
     assert not talk.autopilots[0].sets
 
@@ -250,8 +243,7 @@ def test_a_monitor_that_was_silent_is_believed_after_its_next_report(flying: Mon
     Conversation.run(flying, 1.5)
     flying.reports = False
     flying.run(0.1)
-    flying.declare("imu_1.y")
-    assert not flying.run(0.5).autopilots[0].sets
+    assert not flying.declare("imu_1.y", 0.5).autopilots[0].sets
     flying.reports = True
     assert flying.run(0.1).autopilots[0].sets
 
@@ -260,8 +252,7 @@ def test_a_file_that_cannot_be_written_in_flight_is_told_and_written_later(flyin
     for file in tmp_path.iterdir():
         file.unlink()
     tmp_path.rmdir()
-    flying.declare("imu_1.y")
-    flying.run(1.0)
+    flying.declare("imu_1.y", 1.0)
     assert flying.failover.status("failover", flying.now)[2].endswith("of system 1; failover_file is not written")
     tmp_path.mkdir()
     flying.run(2.0)
@@ -270,8 +261,7 @@ def test_a_file_that_cannot_be_written_in_flight_is_told_and_written_later(flyin
 
 def test_a_companion_that_dies_tells_and_puts_back_at_its_next_start(flying: Monitored, tmp_path: Path) -> None:
     autopilot = flying.autopilots[0]
-    flying.declare("imu_1.y")
-    flying.run(1.0)
+    flying.declare("imu_1.y", 1.0)
     autopilot.reboot(flying.now)
     autopilot.armed = False
     autopilot.texts.clear()
@@ -296,8 +286,7 @@ def test_what_failover_would_have_done_in_a_recording() -> None:
 
 
 def test_an_operator_puts_back(flying: Monitored) -> None:
-    flying.declare("imu_1.y")
-    flying.run(1.0)
+    flying.declare("imu_1.y", 1.0)
     assert flying.failover.restore(flying.now) == (True, "IMU 1 (imu_1) is put back")
     flying.run(5.0)
     assert flying.autopilots[0].flies_with == 0

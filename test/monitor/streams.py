@@ -14,6 +14,7 @@ from fdi_ros.core.records import OutputRow
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.diagnostics import PREFIX, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -33,12 +34,11 @@ def swing(seconds: NDArray[np.float64], size: float = 0.5) -> NDArray[np.float64
     return size * np.sin(2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3]) + np.arange(3.0))
 
 
-def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0) -> Block:
-    """White noise of SIGMA on every channel of a moving vehicle."""
+def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0, late: float = 0.0) -> Block:
+    """White noise of SIGMA on every channel of a moving vehicle, stamped so many seconds late."""
     rng = np.random.default_rng(seed)
     z = body_rate(samples, size) @ geometry.axes.T + rng.normal(0, SIGMA, (samples, geometry.n))
-    stamp = START + np.arange(samples, dtype=np.int64) * round(1e9 / RATE)
-    return Block(stamp, z)
+    return Block(START + round(1e9 * late) + np.arange(samples, dtype=np.int64) * round(1e9 / RATE), z)
 
 
 def config(**changes: object) -> Config:
@@ -68,10 +68,15 @@ def struck(block: Block, faults: Sequence[str], names: Sequence[str]) -> Block:
     return Injector([parse_fault(fault) for fault in faults], names).apply(block)
 
 
-def run(pipeline: Pipeline, samples: int, *faults: str, size: float = 1.0, seed: int = 0) -> tuple[Block, Output]:
-    """A stream with faults injected, and what a monitor makes of it."""
-    block = struck(stream(pipeline.geometry, samples, size, seed), faults, pipeline.channel_names)
+def run(pipeline: Pipeline, samples: int, *faults: str, **options: float) -> tuple[Block, Output]:
+    """A stream, of these options, with faults injected, and what a monitor makes of it."""
+    block = struck(stream(pipeline.geometry, samples, **options), faults, pipeline.channel_names)
     return block, pipeline.process(block)
+
+
+def told(pipeline: Pipeline) -> dict[str, StatusLine]:
+    """What an operator is told of a monitor as it stands, by name."""
+    return {line.name.removeprefix(PREFIX): line for line in describe(pipeline.status())}
 
 
 def declarations(pipeline: Pipeline, output: Output) -> list[tuple[str, str]]:

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import config, mounted, parallel
+from monitor.streams import config, mounted, parallel, told
 
 from fdi_ros.core.subsets import fill_level, passes_test, prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.diagnostics import describe
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
@@ -90,9 +89,9 @@ class Exceedance:
         return figure.mean(), figure.std() / np.sqrt(draws)
 
 
-def level_and_limits(parameters, rate, remaining):
-    """Level in a steady turn, and up to which residuals there is one; noise 1e-3, here and in what is returned 1."""
-    pipeline = monitor(**parameters, **{"noise.noise_std": 1e-3})
+def level_and_limits(settings, rate, remaining):
+    """Level in a steady turn, and up to which residuals there is one, both in units of the noise, 1e-3."""
+    pipeline = Pipeline(settings)
     pipeline.core["remaining"] = 1e-3 * remaining
     geometry = pipeline.geometry
     output = pipeline.process(block(np.tile(geometry.axes @ rate, (3, 1))))
@@ -106,16 +105,16 @@ def level_and_limits(parameters, rate, remaining):
 def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate, remaining, prior, risk):
     """Errors of noise, of scale factors as the body turns, and of biases that hang together as is worst for an axis."""
     scale = 0.003
-    parameters = {
-        "detector.name": "likelihood_ratio",
-        "detector.false_alarms_per_hour": 0.0,
-        "detector.false_alarm_probability": ALARM,
-        "noise.scale_std": scale,
-        "integrity.risk": risk,
-        "integrity.fault_rate": -math.log1p(-prior),
-    }
+    settings = config(
+        detector__false_alarms_per_hour=0.0,
+        detector__false_alarm_probability=ALARM,
+        noise__noise_std=1e-3,
+        noise__scale_std=scale,
+        integrity__risk=risk,
+        integrity__fault_rate=-math.log1p(-prior),
+    )
     geometry = Geometry.two_triad_cone()
-    level, limit = level_and_limits(parameters, np.array(rate), remaining)
+    level, limit = level_and_limits(settings, np.array(rate), remaining)
     std = np.sqrt(1 + (1e3 * scale * geometry.axes @ np.array(rate)) ** 2)
     for axis in (0, 2):
         root = np.column_stack([np.diag(std), remaining * np.sign(geometry.least_squares[axis])])
@@ -187,15 +186,11 @@ def test_a_level_is_given_where_redundancy_or_priors_bear_the_risk(channels, pri
     assert (np.isfinite(level) == given).all()
 
 
-def monitor(**parameters):
-    return Pipeline(config(**parameters))
-
-
 def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     rng = np.random.default_rng(5)
     z = 0.0025 * rng.standard_normal((400, 6))
     z[200:, 3] += 0.1
-    pipeline = monitor(publish_under_doubt=False)
+    pipeline, healthy = Pipeline(config(publish_under_doubt=False)), Pipeline(config())
     output = pipeline.process(block(z))
     level = output.level
     assert output.valid.all(), "what can be left out withholds nothing"
@@ -203,7 +198,6 @@ def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     assert (level[:200] == level[0]).all()
     assert (level[300:] == level[300]).all()
     # A later level was foreseen for the worst loss.
-    healthy = monitor()
     assert np.isinf(healthy.status().protection_level_after_loss).all(), "no sample yet: no rate, no level"
     healthy.process(block(z[:200]))
     status = healthy.status()
@@ -218,7 +212,7 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
     rng = np.random.default_rng(6)
     z = 0.0025 * rng.standard_normal((200, 6))
     z[100:, 2] += 0.05
-    pipeline = monitor(**{"detector.name": "guaranteed"})
+    pipeline = Pipeline(config(detector__name="guaranteed"))
     output = pipeline.process(block(z))
     level = output.level
     assert (output.state[5:] == ChannelState.OK).all()
@@ -227,48 +221,37 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
     assert np.isinf(pipeline.status().protection_level).all()
 
 
-def two_alike(**parameters):
-    return Pipeline(parallel(2, **parameters))
-
-
-def turned_unit(rows=400, first=200):
-    """Two units mounted alike in a turn, of which the second comes loose at a row: it feels other axes."""
-    rng = np.random.default_rng(8)
-    t = np.arange(rows) / 100
-    rate = np.column_stack([1.5 * np.sin(2 * t), 0.8 * np.cos(1.3 * t), 0.5 * np.sin(t)])
-    other = rate.copy()
-    other[first:] = rate[first:][:, [1, 2, 0]]
-    return rate, np.hstack([rate, other]) + 0.0025 * rng.standard_normal((rows, 6))
-
-
 def test_a_rate_of_channels_under_doubt_says_so_in_covariance_and_level_or_is_withheld_if_asked_for():
-    rate, z = turned_unit()
-    pipeline, other = two_alike(publish_under_doubt=False), two_alike()
-    output, published = pipeline.process(block(z)), other.process(block(z))
+    """Two units mounted alike in a turn, of which the second comes loose: it feels other axes."""
+    t = np.arange(400) / 100
+    rate = np.column_stack([1.5 * np.sin(2 * t), 0.8 * np.cos(1.3 * t), 0.5 * np.sin(t)])
+    other = np.vstack([rate[:200], rate[200:, [1, 2, 0]]])
+    z = np.hstack([rate, other]) + 0.0025 * np.random.default_rng(8).standard_normal((400, 6))
+    pipeline, open_ = Pipeline(parallel(2, publish_under_doubt=False)), Pipeline(parallel(2))
+    output, published = pipeline.process(block(z)), open_.process(block(z))
     np.testing.assert_array_equal(output.state, published.state)
     doubt = np.isin(output.state, (ChannelState.SUSPECT, ChannelState.AMBIGUOUS))
     all_doubted = doubt.all(axis=1)
     assert all_doubted[210:].all()
     assert published.valid.all()
     assert np.isinf(published.level[all_doubted]).all()
-    error = np.abs(published.rate - rate)[all_doubted]
-    assert error.max() > 0.5
-    assert (error < 3 * np.sqrt(np.diagonal(published.covariance, axis1=1, axis2=2))[all_doubted]).all()
+    error, std = np.abs(published.rate - rate), np.sqrt(np.diagonal(published.covariance, axis1=1, axis2=2))
+    assert error[all_doubted].max() > 0.5
+    assert (error < 3 * std)[all_doubted].all()
     np.testing.assert_array_equal(output.valid, ~doubt.any(axis=1))
     assert np.isnan(output.rate[~output.valid]).all()
     assert np.isnan(output.covariance[~output.valid]).all()
     assert pipeline.status().withheld
-    assert describe(pipeline.status())[0].message.startswith("no fused rate: withheld, as channels under doubt")
-    pipeline.reconfigure(other.config)
+    assert told(pipeline)["monitor"].message.startswith("no fused rate: withheld, as channels under doubt")
+    pipeline.reconfigure(open_.config)
     assert pipeline.process(block(z[-1:], len(z))).valid.all()
     assert not pipeline.status().withheld
 
 
 def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
-    pipeline = monitor(**{"integrity.risk": 0.0})
-    assert np.isinf(pipeline.process(block(np.zeros((3, 6)))).level).all()
+    assert np.isinf(Pipeline(config(integrity__risk=0.0)).process(block(np.zeros((3, 6)))).level).all()
     with pytest.raises(ConfigError, match=r"fault_rate has 2 values, expected 1 or 6 \(one per channel\)"):
-        monitor(**{"integrity.fault_rate": [1e-4, 1e-4]})
+        Pipeline(config(integrity__fault_rate=[1e-4, 1e-4]))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -7,7 +7,7 @@ import gc
 
 import numpy as np
 import pytest
-from monitor.streams import START, config, parallel, stream, struck
+from monitor.streams import START, config, parallel, run, stream
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
@@ -81,27 +81,21 @@ def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch
 def test_message_by_message_equals_the_whole_stream(units):
     settings = parallel(units, bias__startup_bias_duration=0.5, bias__max_rest_rate=10.0, noise__timing_std=1e-4)
     ear, offline = Ear(Pipeline(settings)), Pipeline(settings)
-    block = struck(
-        stream(offline.geometry, 400, size=0.02),
-        ["channel=imu_2.y kind=bias size=0.5 start=2", "channel=imu_1.x kind=dropout start=3 stop=3.2"],
-        offline.channel_names,
-    )
+    faults = "channel=imu_2.y kind=bias size=0.5 start=2", "channel=imu_1.x kind=dropout start=3 stop=3.2"
+    block, _ = run(Pipeline(settings), 400, *faults, size=0.02)
     sent = list(messages(block, units))
     for unit, data in sent:
         ear.take(unit, data)
-    aligned = Alignment(units, 2_000_000, 100_000_000).push_block(
-        np.array([unit for unit, _ in sent]),
-        np.array([ImuSource.parse(data, 3)[0] for _, data in sent]),
-        np.array([ImuSource.parse(data, 3)[1] for _, data in sent]),
-    )
-    output = offline.process(aligned)
+    stamps, values = zip(*(ImuSource.parse(data, 3) for _, data in sent), strict=True)
+    given = np.array([unit for unit, _ in sent]), np.array(stamps), np.array(values)
+    output = offline.process(Alignment(units, 2_000_000, 100_000_000).push_block(*given))
     assert list(ear.events) == list(output.events)
     figures = np.array([ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity])
     np.testing.assert_array_equal(figures[:, 0], output.statistic)
     np.testing.assert_array_equal(figures[:, 2 : 2 + 3 * units], output.state)
     np.testing.assert_array_equal(figures[:, -3:], output.level)
-    rates = dict(zip(output.stamp[output.valid].tolist(), map(tuple, output.rate[output.valid].tolist()), strict=True))
-    assert ear.rates() == rates
+    assert [*ear.rates()] == output.stamp[output.valid].tolist()
+    np.testing.assert_array_equal([*ear.rates().values()], output.rate[output.valid])
     assert offline.core.tobytes() == ear.receiver.pipeline.core.tobytes()
 
 

@@ -30,9 +30,9 @@ NAMES = [f"g{k}" for k in range(1, 7)]
 TURN = (Geometry.two_triad_cone().axes @ [0.15, 0.0, 0.0]).tolist()
 
 
-def rest(pipeline, samples=300, seed=0, begin=START):
+def rest(pipeline, samples=300, seed=0):
     z = np.random.default_rng(seed).normal(OFFSET, SIGMA, (samples, pipeline.geometry.n))
-    return Block(begin + np.arange(samples, dtype=np.int64) * 10_000_000, z)
+    return Block(START + np.arange(samples, dtype=np.int64) * 10_000_000, z)
 
 
 def flown(**changes):
