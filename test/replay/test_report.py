@@ -353,9 +353,11 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
 SORTED = {
     "name": ["2024-05-03.mcap", "2024-05-10.mcap", "2024-11-02.mcap", "2025-01-01.mcap"],
     "log": ["9_59_01.ulg", "10_2_45.ulg", "10_23_45.ulg", "a"],
+    "fault": ["bias 0.02 rad/s", "bias 0.1 rad/s", "bias 2 rad/s", "bias 10 rad/s"],
     "duration": ["0.7 min", "3.5 min", "12.0 min", "-"],
     "wrong": ["0 (at most 2.83%)", "2 (at most 4%)", "10 (at most 20.00%)", "-"],
     "interval": ["9.1% to 13.0%", "93.2% to 98.1%", "100.0% to 100.0%", ""],
+    "bias": ["-0.013", "-7.1e-05", "5.4e-05", "2"],
     "late": ["-4.5 ms", "-0.5 ms", "+3.2 ms", "+12.0 ms"],
 }
 """Cells of each column in their order."""
