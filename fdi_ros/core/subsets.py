@@ -29,7 +29,7 @@ from fdi_ros.core.records import (
 )
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import MAX_RATE, Array, Mask
+from fdi_ros.model.samples import Array, Mask
 
 MIN_SPARE_RATIO = 0.1  # worst over best axis of the rest, below which leaving out costs more than a wider covariance
 
@@ -217,6 +217,7 @@ def note_known(acceleration: Acceleration, oldest: int) -> None:
 
 
 UNPREPARED, REFUSED = -1, -2  # instead of a row: not prepared yet; the method cannot run on these channels
+LARGEST_RATE = 1e6  # rad/s; methods of a paper take a larger finite value for this, so that squares stay finite
 
 
 @compiled
@@ -253,7 +254,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            present.z[k] = min(max(z[i], -MAX_RATE), MAX_RATE) if math.isfinite(z[i]) else 0.0
+            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0

@@ -161,7 +161,7 @@ class Detector(ABC):
         ----------
         z
             Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A finite value beyond
-            `MAX_RATE` counts as that.
+            `LARGEST_RATE` counts as that.
         acceleration
             Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing term; None is zero.
 

@@ -77,6 +77,7 @@ from fdi_ros.estimator.noise import (
 from fdi_ros.estimator.shared_noise import begin_shared, update_line, update_shape, update_shared_level
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
+from fdi_ros.model.samples import MAX_RATE
 
 LEAST_TIME = 0.02  # s that a fault lasts before it is declared: two samples at 100 Hz, as one value decides nothing
 OUTLIER, ALIKE = 5.5, 0.95
@@ -205,6 +206,8 @@ def is_blind(kf: Estimator) -> bool:
 def process_sample(params: Constants, state: State, sample: SampleInput) -> None:
     """Take a sample into estimator and evidence."""
     kf = state.estimator
+    for i in range(params.sensors.n):
+        sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
     # Without a sample for so long a block begins anew.
     if kf.seconds - kf.used_at > max(1.5 * BLOCK_TIME, 2.5 * params.period):
         drop_block(kf, params.sensors.n)

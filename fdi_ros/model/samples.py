@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 Int = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-MAX_RATE = 1e3  # rad/s; a larger finite value counts as this: no gyro measures as much, and squares stay finite
+MAX_RATE = 1e3  # rad/s; a larger finite value counts as this: no gyro measures as much, no vehicle survives it
 
 
 @dataclass(frozen=True)

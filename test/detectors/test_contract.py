@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros.core.subsets import LARGEST_RATE
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.base import MOST_ROWS, Detector, Verdict, accepted_options
 from fdi_ros.errors import DetectorError
-from fdi_ros.model.samples import MAX_RATE
 
 SIGMA = 1e-3
 CONSTANT = NoiseModel(SIGMA, bound=SIGMA)
@@ -243,7 +243,7 @@ def test_value_no_gyro_can_measure(name, options, noise):
     for channel in range(usual_geometry(name).n):
         wild = faulty(usual_geometry(name), channel, 0.0)
         wild += np.random.default_rng(17).normal(0, SIGMA, wild.shape)
-        wild[5:, channel] = MAX_RATE
+        wild[5:, channel] = LARGEST_RATE
         verdict = detector_of(name, noise, **options).detect(wild, acceleration)
         assert verdict.alarm[-1]
         # At rest, or nearly, the condition number is documented to name wrongly.

@@ -29,22 +29,21 @@ def sample(rng, geometry, bound, faults):
 
 
 def test_the_worked_example_of_the_paper():
-    """In thousandths of its unit: a value beyond 1000 would count as that."""
     c, s, h = 1 / np.sqrt(3), np.sqrt(2 / 3) / 2, np.sqrt(2 / 3) * np.sqrt(3) / 2
     geometry = Geometry([[-c, -2 * s, 0], [c, s, -h], [-c, s, h], [c, -2 * s, 0], [-c, s, -h], [c, s, h]])
     z = geometry.axes @ [-172.82, 604.19, -1284.63] + [0.50, 20.10, -50.80, -0.01, -0.02, 0.30]
     np.testing.assert_allclose(z, [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19], atol=0.0051)
-    detector = guaranteed(geometry, 1e-3, max_faults=2)
-    lower, upper = (1e3 * bounds[0] for bounds in detector.error_bounds(1e-3 * z[None]))
+    detector = guaranteed(geometry, max_faults=2)
+    lower, upper = (bounds[0] for bounds in detector.error_bounds(z[None]))
     printed = [0, 20.89, -51.35, 0, 0, 0]
     np.testing.assert_allclose((lower + upper) / 2, printed, atol=0.0051)
     np.testing.assert_allclose((upper - lower) / 2, [1.00, 2.74, 2.74, 1.00, 1.00, 1.00], atol=0.0051)
     np.testing.assert_allclose([z[1] - upper[1], z[1] - lower[1]], [1051.72, 1057.20], atol=0.0051)
-    verdict = detector.detect(1e-3 * z[None])
+    verdict = detector.detect(z[None])
     assert verdict.isolated[0]
     assert np.flatnonzero(verdict.suspects[0]).tolist() == [1, 2]
-    np.testing.assert_allclose(1e3 * verdict.error[0], printed, atol=0.0051)
-    assert [detector.sets[k] for k in np.flatnonzero(detector.culprits(1e-3 * z[None])[0])] == [(1, 2)]
+    np.testing.assert_allclose(verdict.error[0], printed, atol=0.0051)
+    assert [detector.sets[k] for k in np.flatnonzero(detector.culprits(z[None])[0])] == [(1, 2)]
 
 
 @pytest.mark.parametrize(("n", "trials"), [(5, 8), (6, 8), (7, 5), (9, 3)])
