@@ -29,7 +29,7 @@ from fdi_ros.core.records import (
 )
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Array, Mask
+from fdi_ros.model.samples import MAX_RATE, Array, Mask
 
 MIN_SPARE_RATIO = 0.1  # worst over best axis of the rest, below which leaving out costs more than a wider covariance
 
