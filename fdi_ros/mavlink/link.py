@@ -20,7 +20,8 @@ import os
 import select
 import socket
 import stat
-from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from fdi_ros.errors import FdiError
@@ -33,29 +34,32 @@ MOST_WAITING = 1 << 12  # bytes that wait to be sent: half a second of a slow li
 RETRY = NS  # between two attempts to open a link, ns
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN)
+_CLOSED = "the other side has closed the connection"
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
-class Link(ABC):
-    """A way to an autopilot; messages that are sent wait, whole, until there is room."""
+class Link:
+    """A way to an autopilot, opened by a function; messages that are sent wait, whole, until there is room.
 
-    _gone = "the other side has closed the connection"
+    ``gone``: what it means, in words, that there is nothing to read where there should be.
+    """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, make: Callable[[], Any], gone: str = _CLOSED) -> None:
         self.url = url
         self.trouble = "not open yet"  # why it is not open, in words; empty: it is
         self.dropped = 0  # messages that could not be sent
         self.opened = 0  # how often it was opened
+        self._make, self._gone = make, gone
         self._attempt = 0
-        self._handle: Any = None  # the socket or the serial port; None: there is none.
+        self._handle: Any = None  # the socket or the serial port, which never waits; None: there is none.
         self._waiting = bytearray()
-
-    @abstractmethod
-    def _open(self) -> None:
-        """Make the handle, which never waits; raises OSError."""
 
     def _is_connected(self) -> bool:
         """Whether the handle can be used; raises OSError if it never can."""
+        if not select.select([], [self._handle], [], 0)[1]:
+            return False
+        if isinstance(self._handle, socket.socket):
+            _raise(self._handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
         return True
 
     def _read(self) -> tuple[Any, bytes]:
@@ -67,10 +71,6 @@ class Link(ABC):
         if not data:
             raise OSError(errno.EIO, self._gone)
         return None, data
-
-    def _write(self, data: bytes) -> int:
-        """Write what there is room for, and return how much."""
-        return os.write(self._handle.fileno(), data)
 
     def receive(self, now: int) -> list[tuple[Any, bytes]]:
         """Return what has arrived and from whom, opening the link first if it is not open; and send what waits.
@@ -84,7 +84,7 @@ class Link(ABC):
                 if now < self._attempt:
                     return []
                 self._attempt, self.trouble = now + RETRY, "connecting"
-                self._open()
+                self._handle = self._make()
             if self.trouble and self._is_connected():
                 self.trouble, self.opened = "", self.opened + 1
             while not self.trouble and size < MOST_AT_ONCE:
@@ -111,7 +111,7 @@ class Link(ABC):
         if not self._waiting or self.trouble:
             return
         try:
-            del self._waiting[: self._write(bytes(self._waiting))]
+            del self._waiting[: os.write(self._handle.fileno(), bytes(self._waiting))]
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -140,17 +140,11 @@ class Link(ABC):
 
 
 class Udp(Link):
-    """UDP, either listening at an address or sending to one."""
+    """UDP to an address; None: to whoever has sent."""
 
-    def __init__(self, url: str, address: tuple[str, int], family: int, listens: bool) -> None:
-        super().__init__(url)
-        self._address, self._family, self._listens = address, family, listens
-
-    def _open(self) -> None:
-        self._handle = socket.socket(self._family, socket.SOCK_DGRAM)
-        self._handle.setblocking(False)
-        if self._listens:
-            self._handle.bind(self._address)
+    def __init__(self, url: str, make: Callable[[], Any], address: tuple[str, int] | None) -> None:
+        super().__init__(url, make)
+        self._address = address
 
     def _read(self) -> tuple[Any, bytes]:
         try:
@@ -164,7 +158,7 @@ class Udp(Link):
 
     def send(self, data: bytes, peer: Any) -> None:
         """Send one message, or drop it."""
-        to = peer if self._listens else self._address
+        to = self._address or peer
         if self._handle is None or to is None:
             return
         try:
@@ -173,45 +167,20 @@ class Udp(Link):
             self.dropped += 1
 
 
-class Tcp(Link):
-    """A connection to a TCP server."""
-
-    def __init__(self, url: str, address: tuple[str, int], family: int) -> None:
-        super().__init__(url)
-        self._address, self._family = address, family
-
-    def _open(self) -> None:
-        self._handle = socket.socket(self._family, socket.SOCK_STREAM)
-        self._handle.setblocking(False)
-        self._handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._check(self._handle.connect_ex(self._address))
-
-    def _is_connected(self) -> bool:
-        if not select.select([], [self._handle], [], 0)[1]:
-            return False
-        self._check(self._handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
-        return True
-
-    def _check(self, code: int) -> None:
-        if code not in (0, errno.EINPROGRESS):
-            raise OSError(code, os.strerror(code))
+def _open_socket(kind: str, family: int, address: tuple[str, int]) -> socket.socket:
+    handle = socket.socket(family, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM)
+    handle.setblocking(False)
+    if kind == "tcp":
+        handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        _raise(handle.connect_ex(address))
+    elif kind == "udpin":
+        handle.bind(address)
+    return handle
 
 
-class Serial(Link):
-    """A serial line, by pyserial."""
-
-    _gone = "the device is gone"
-
-    def __init__(self, url: str, device: str, baud: int) -> None:
-        super().__init__(url)
-        require("a serial line", ("serial",))
-        import serial
-
-        self._serial, self._device, self._baud = serial, device, baud
-
-    def _open(self) -> None:
-        # Two programs that read one line each get half of it.
-        self._handle = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
+def _raise(code: int) -> None:
+    if code not in (0, errno.EINPROGRESS):
+        raise OSError(code, os.strerror(code))
 
 
 def open_link(url: str) -> Link:
@@ -223,7 +192,12 @@ def open_link(url: str) -> Link:
     place, _, last = rest.rpartition(":")
     number = int(last) if last.isdecimal() and len(last) < 9 else -1
     if kind == "serial" and place and number > 0:
-        return Serial(url, place, number)
+        require("a serial line", ("serial",))
+        from serial import Serial
+
+        # Two programs that read one line each get half of it.
+        port = partial(Serial, place, number, timeout=0, write_timeout=0, exclusive=True)
+        return Link(url, port, "the device is gone")
     if kind not in ("udpin", "udpout", "tcp") or not place or not 0 < number < 1 << 16:
         raise FdiError(f"url is {url!r}, expected {_FORMS}")
     sort = socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM
@@ -234,7 +208,8 @@ def open_link(url: str) -> Link:
     except UnicodeError as error:
         raise FdiError(f"url {url}: {place!r} is no name of a host") from error
     to = (str(address[0]), int(address[1]))
-    return Tcp(url, to, family) if kind == "tcp" else Udp(url, to, family, kind == "udpin")
+    make = partial(_open_socket, kind, family, to)
+    return Link(url, make) if kind == "tcp" else Udp(url, make, None if kind == "udpin" else to)
 
 
 KEY_BYTES = 32

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -43,7 +43,9 @@ class Watchdog:
         self.timeout = timeout
         self.silent = False
         self.at = 0  # clock time at which the counter last moved, to the precision of the checks, ns
+        self.rate = 0.0  # of the counter, 1/s, by the clock between the last two calls of `measure`
         self._count = -1
+        self._measured = 0, 0  # count and clock time, ns, of the last call
 
     def check(self, count: int, now: int) -> bool:
         """Check the count at the clock time now, ns; True if silence began or ended."""
@@ -56,6 +58,12 @@ class Watchdog:
     def seconds(self, now: int) -> float:
         """How long the counter has stood still, s."""
         return max(0, now - self.at) / 1e9
+
+    def measure(self, count: int, now: int) -> None:
+        """Measure the rate of the counter since this was last called."""
+        before, then = self._measured
+        self.rate = 1e9 * (count - before) / (now - then) if now > then > 0 else 0.0
+        self._measured = count, now
 
 
 class SampleRateCheck:
@@ -85,8 +93,6 @@ class SampleRateCheck:
 
 COUNTERS = ("duplicate", "backward", "ahead", "jumped", "late", "interpolated", "missing")
 """What alignment counts of each unit beside the messages received."""
-
-
 _NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
 
 
@@ -106,10 +112,8 @@ class Receiver:
         self.errors = [""] * len(self.source.topics)  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
-        self.messages = {output: template.bytes for output, template in self.encoder.templates.items()}
-        """Bytes of what is to be published about the last sample."""
-        fused, integrity = self.encoder.templates[FUSED], self.encoder.templates[INTEGRITY]
-        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
+        self._fused, self._integrity = (self.encoder.templates[output] for output in (FUSED, INTEGRITY))
+        self.live["fused_at"], self.live["integrity_at"] = self._fused.at, self._integrity.at
         self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         pipeline.prepare()
@@ -119,18 +123,8 @@ class Receiver:
     def _update_detector(self) -> None:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
         self._detector = self.pipeline.detector
-        messages = self.messages[FUSED], self.messages[INTEGRITY]
-        self._records = (self.aligner, self.live, self._events, *messages)
+        self._records = (self.aligner, self.live, self._events, self._fused.bytes, self._integrity.bytes)
         self._process: Callable[[], int] = partial(process, self.pipeline.path, *self._records)
-        if others := [output for output in self.messages if output not in (FUSED, INTEGRITY)]:
-            self._process = partial(self._process_and_fill, self._process, others)
-
-    def _process_and_fill(self, compiled: Callable[[], int], others: Sequence[SampleOutput]) -> int:
-        """Work a sample, and fill the messages that compiled code does not."""
-        flags = compiled()
-        for output in others:
-            self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
-        return flags
 
     def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take in a message of an input topic; stamp: when it arrived, ns; 0: not known."""
@@ -155,6 +149,13 @@ class Receiver:
         """Keep why a message was refused."""
         code = int(self.live["inlets"]["error"][0, unit])
         self.errors[unit] = self.source.explain(code, data, self.pipeline.geometry.n)
+
+    def message(self, output: SampleOutput) -> bytes:
+        """Return what is to be published about the last sample."""
+        if output not in (FUSED, INTEGRITY):
+            # Compiled code does not fill it.
+            self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
+        return self.encoder.templates[output].bytes.tobytes()
 
     @property
     def events(self) -> list[Event]:

@@ -35,15 +35,7 @@ END_OF_TIME = 2**62
 """The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 QUIET = 5.0
 """After a line about a channel the next one comes not before so long, s, unless the channel's state becomes worse."""
-SEVERITY = {
-    ChannelState.OK: 0,
-    ChannelState.EXCLUDED: 1,
-    ChannelState.UNCHECKED: 1,
-    ChannelState.SUSPECT: 2,
-    ChannelState.STALE: 3,
-    ChannelState.AMBIGUOUS: 4,
-    ChannelState.FAULTY: 5,
-}
+BY_SEVERITY = ("OK", "EXCLUDED", "UNCHECKED", "SUSPECT", "STALE", "AMBIGUOUS", "FAULTY")  # states, the worst last
 
 
 @dataclass
@@ -73,7 +65,7 @@ class ChangeLog:
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
             last = self._last[event.channel]
-            if now < last.until and SEVERITY[event.after] <= SEVERITY[last.state]:
+            if now < last.until and BY_SEVERITY.index(event.after.name) <= BY_SEVERITY.index(last.state.name):
                 last.left_out, last.present = last.left_out + 1, event.after
                 continue
             words = format_reason(event, self._names)
@@ -98,7 +90,7 @@ class ChangeLog:
         for channel in channels:
             self._last[channel] = _Line(state, self._clock() + QUIET)
         line = f"{', '.join(self._names[channel] for channel in channels)}: {words}"
-        if SEVERITY[state] >= SEVERITY[ChannelState.STALE]:
+        if state.name in BY_SEVERITY[-3:]:
             self._log.error(line)
         elif state is ChannelState.OK:
             self._log.info(line)
@@ -117,12 +109,7 @@ class InputTopic:
         self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._was_heard = self._was_unstamped = False
         self._sources = ""  # what is wrong with who publishes on it; empty: nothing
-        self._rate, self._reported_at, self._reported_messages = 0.0, 0, 0
         self._reported_counts: dict[str, int] = {}
-
-    @property
-    def _received(self) -> int:
-        return int(self._inlet["received"])
 
     @property
     def _is_unstamped(self) -> bool:
@@ -132,13 +119,13 @@ class InputTopic:
     def status(self, now: int) -> InputStatus:
         """Describe the topic at the clock time now, ns."""
         counts, receiver, watchdog = self._receiver.counts(self._number), self._receiver, self._watchdog
-        stamp, lag = int(self._inlet["stamp"]), int(self._inlet["lag"])
+        received, stamp, lag = (int(self._inlet[name]) for name in ("received", "stamp", "lag"))
         return InputStatus(
             name=self._name,
             topic=self.topic,
-            received=self._received,
-            rate=self._rate,
-            silent=watchdog.seconds(now) if self._received else None,
+            received=received,
+            rate=watchdog.rate,
+            silent=watchdog.seconds(now) if received else None,
             live=receiver.is_live(self._number) and not watchdog.silent,
             arrives=watchdog.seconds(now) < ARRIVES,
             lag=max(lag, 0) / 1e9,
@@ -154,14 +141,15 @@ class InputTopic:
 
     def check(self, now: int, log: BoundedLog) -> bool:
         """Log what is new at the clock time now, ns; return whether the topic fell silent, or came back."""
-        changed = self._watchdog.check(self._received, now)
+        received = int(self._inlet["received"])
+        changed = self._watchdog.check(received, now)
         if changed and not self._watchdog.silent:
             log.info(f"{self._name}: messages on {self.topic}{' again' if self._was_heard else ''}")
-        elif changed and not self._received:
+        elif changed and not received:
             log.warning(f"{self._name}: no message yet on {self.topic}")
         elif changed:
             log.error(f"{self._name}: no message on {self.topic}")
-        self._was_heard |= self._received > 0
+        self._was_heard |= received > 0
         if self._is_unstamped and not self._was_unstamped:
             self._was_unstamped = True
             log.warning(f"{self.topic}: stamps are not set")
@@ -181,9 +169,7 @@ class InputTopic:
 
     def count_anew(self, now: int) -> None:
         """Begin to count anew what is recent, at the clock time now, ns."""
-        messages, before = self._received - self._reported_messages, self._reported_at
-        self._rate = 1e9 * messages / (now - before) if before and now > before else 0.0
-        self._reported_at, self._reported_messages = now, self._received
+        self._watchdog.measure(int(self._inlet["received"]), now)
         self._reported_counts = self._receiver.counts(self._number)
         self._inlet["lag"] = NEVER
 
@@ -209,15 +195,13 @@ class Running:
         self._changes = ChangeLog(self._node.log, receiver.pipeline.channel_names)
         self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
-        self._rate, self._counted, self._counted_at = 0.0, 0, 0
-        """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
         self._due = 0.0
         """Steady time of the next regular report, s: the first at once, however soon there is another monitor."""
         self._at_once = MAX_AT_ONCE  # changes that may still be reported at once before it
         self._restarts = receiver.restarts
         self._bias_outcome = -1
-        self._shifts: dict[int, tuple[int, int]] = {}
-        """By channel: stamp of its last change of state, and what to take off for that of the message, ns."""
+        self._changed = [(0, 0)] * len(receiver.pipeline.channel_names)
+        """By channel: stamps of the sample that last changed its state, and of the message that brought it, ns."""
 
     def close(self) -> None:
         """Take the topics down."""
@@ -242,7 +226,7 @@ class Running:
                 receiver.supply()
             for flag, output, publisher in self._wanted:
                 if result & flag:
-                    publisher.publish(receiver.messages[output].tobytes())
+                    publisher.publish(receiver.message(output))
             if result & WORKED:
                 self._latencies.append(time.perf_counter_ns() - begun)
             if result & HAS_EVENTS:
@@ -256,7 +240,7 @@ class Running:
         in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
         pair = self.receiver.pipeline.status().apart if in_sets else None
         for event in events:
-            self._shifts[event.channel] = (event.stamp, self.receiver.shift)
+            self._changed[event.channel] = (event.stamp, event.stamp - self.receiver.shift)
         self._changes.add(events, self.receiver.shift, pair)
         if self._at_once > 0:
             self._at_once -= 1
@@ -274,8 +258,7 @@ class Running:
             self._report()
         if self.receiver.restarts != self._restarts:
             self._restarts = self.receiver.restarts
-            words = "all stamps jumped together, or paused: the time of the samples begins anew"
-            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+            log.warning("all stamps jumped together, or paused: the time of the samples begins anew")
         self._check_bias()
         self._changes.check()
         if (steady := time.monotonic()) >= self._due:
@@ -320,35 +303,30 @@ class Running:
 
     def _check_bias(self) -> None:
         """Log where the biases come from, and why not from a time at rest, whenever that changes."""
-        pipeline, logger = self.receiver.pipeline, self._node.get_logger()
+        pipeline, log = self.receiver.pipeline, self._node.log
         outcome = int(pipeline.core["bias"]["outcome"][0])
-        if outcome == self._bias_outcome or not self._samples:
-            return
-        self._bias_outcome = outcome
-        words = f"bias: {pipeline.status().bias_state}"
-        if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION):
-            logger.warning(words, throttle_duration_sec=1.0)
-        else:
-            logger.info(words, throttle_duration_sec=1.0)
+        if outcome != self._bias_outcome and self._samples:
+            self._bias_outcome = outcome
+            say = log.warning if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION) else log.info
+            say(f"bias: {pipeline.status().bias_state}")
 
     def _count_anew(self, now: int) -> None:
         """Begin a new time between two regular reports."""
         for topic in self.topics:
             topic.count_anew(now)
-        count, samples, before = self._samples, self._counted, self._counted_at
-        self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
-        self._counted, self._counted_at, self._at_once = count, now, MAX_AT_ONCE
+        self._watchdog.measure(self._samples, now)
+        self._at_once = MAX_AT_ONCE
         was_wrong = self._rate_check.words
-        self._rate_check.check(count, int(self.receiver.live["last_stamp"][0]))
+        self._rate_check.check(self._samples, int(self.receiver.live["last_stamp"][0]))
         if self._rate_check.words and not was_wrong:
             self._node.log.warning(self._rate_check.words)
 
     def _report(self) -> None:
         """Publish the diagnostics."""
         now, prefix = self._node.get_clock().now().nanoseconds, self._node.prefix
-        hardware = self.receiver.pipeline.config.hardware_id
         if not self._node.inputs.subscriptions:
-            lines = [StatusLine(Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware, ())]
+            hardware = self.receiver.pipeline.config.hardware_id
+            lines = [StatusLine(Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware)]
         else:
             status = self.receiver.pipeline.status()
             lines = describe(
@@ -356,20 +334,18 @@ class Running:
                 inputs=[topic.status(now) for topic in self.topics],
                 figures=self._figures(),
                 silent=self._watchdog.seconds(now) if self._has_no_samples else None,
-                since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
+                since=[
+                    message if sample == channel.since else channel.since
+                    for channel, (sample, message) in zip(status.channels, self._changed, strict=True)
+                ],
                 warning=self._rate_check.words,
             )
         self._diagnostics.publish(encode_diagnostics(lines, now))
 
-    def _message_stamp(self, channel: int, since: int) -> int:
-        """Return the stamp of the message, ns, that brought a channel into its state."""
-        stamp, shift = self._shifts.get(channel, (0, 0))
-        return since - shift if stamp == since else since
-
     def _figures(self) -> list[tuple[str, str]]:
         median, late = np.percentile(np.array(self._latencies or [0]), (50, 99), method="lower") / 1e6
         return [
-            ("sample rate (Hz)", f"{self._rate:.1f}"),
+            ("sample rate (Hz)", f"{self._watchdog.rate:.1f}"),
             ("latency p50 (ms)", f"{median:.3f}"),
             ("latency p99 (ms)", f"{late:.3f}"),
             ("samples without fused rate", str(self.receiver.live["without_rate"][0])),

@@ -50,7 +50,7 @@ REGULAR = 10.0  # line by line, the state of the whole is reported at least so o
 SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there before the node is configured
 SETTLE = 1.0
 """Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
-STATES = tuple(state.name for state in ChannelState)
+STATES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 SILENT = {"fused": 1.0, "diagnostics": 3.0}
 """After so long without a message the last one is no longer shown as the present state, s."""
@@ -85,8 +85,6 @@ class Picture:
     rate: tuple[float, float, float] | None = None  # fused rate, rad/s
     heard: dict[str, float] = field(default_factory=dict)  # when the last message of each kind came, s, monotonic clock
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    ignored: int = 0  # messages that no monitor sends: nothing was taken from them
-    ignored_why: str = ""  # why the last of them
 
     def is_silent(self, kind: str) -> bool:
         """Whether messages of a kind have stopped, or never came."""
@@ -98,11 +96,6 @@ class Picture:
         found = self.whole.number("statistic"), self.whole.number("threshold")
         is_stale = self.whole.level == Level.STALE or self.is_silent("diagnostics")
         return None if is_stale or not math.isfinite(found[0]) or not found[1] > 0 else found
-
-    def format_ignored(self) -> str:
-        """Say how many messages were ignored and why the last one was; empty: none."""
-        some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} ignored"
-        return shown(f"{some}: {self.ignored_why}", LINE) if self.ignored else ""
 
     def update_channels(self, channels: Mapping[str, StatusLine]) -> None:
         """Keep the present channels and remember which changed state."""
@@ -187,31 +180,19 @@ class Watcher(Node):
         whole = self.picture.whole
         return f"waiting for the first sample: {whole.message}" if whole.value("samples") == "0" else ""
 
-    def _ignore(self, message: object, why: str) -> None:
-        """Count a message that no monitor sends, and remember why."""
-        self.picture.ignored += 1
-        self.picture.ignored_why = f"{self._heard_on[type(message)].topic_name}: {why}"
-
+    # What no monitor sends is ignored: anybody may speak there.
     def _on_fused(self, message: Imu) -> None:
         rate = message.angular_velocity
-        if not all(map(math.isfinite, (rate.x, rate.y, rate.z))):
-            self._ignore(message, "a rate that is not finite")
-            return
-        self.picture.rate = (rate.x, rate.y, rate.z)
-        self.picture.heard["fused"] = time.monotonic()
+        if all(map(math.isfinite, (rate.x, rate.y, rate.z))):
+            self.picture.rate = (rate.x, rate.y, rate.z)
+            self.picture.heard["fused"] = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        try:
-            found = read_diagnostics(message, self.picture.monitor)
-        except ValueError as error:
-            self._ignore(message, str(error))
-            return
+        found, picture = [], self.picture
+        with contextlib.suppress(ValueError):
+            found = read_diagnostics(message, picture.monitor)
         channels = {line.name: line for line in found if line.value("state")}
-        wrong = next((state for line in channels.values() if (state := line.value("state")) not in STATES), "")
-        if wrong:
-            self._ignore(message, f"state {wrong!r}, expected one of {', '.join(STATES)}")
-        elif found:
-            picture = self.picture
+        if found and STATES.issuperset(line.value("state") for line in channels.values()):
             picture.whole = next((line for line in found if line.name == WHOLE), picture.whole)
             picture.inputs = [
                 line._replace(name=line.name.removeprefix(INPUT)) for line in found if line.name.startswith(INPUT)
@@ -264,7 +245,7 @@ class LineReport:
 
     def __init__(self, picture: Picture) -> None:
         self._picture = picture
-        self._caption, self._said = "", ("", False)
+        self._caption = self._said = ""
         self._due = 0.0  # when the state of the whole is reported again, s since 1970
 
     def print(self) -> None:
@@ -276,14 +257,13 @@ class LineReport:
         """Return what is new since the last time; its changes are taken out of the picture."""
         picture, now, caption, before = self._picture, time.time(), self._caption, self._said
         whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole.message)
-        self._caption, self._said = picture.caption, (whole, picture.ignored > 0)
+        self._caption, self._said = picture.caption, whole
         lines = [(now, picture.caption)] if picture.caption != caption else []
         lines += [(change.at, change.words) for change in picture.changes]
         picture.changes.clear()
-        if any(self._said) and (self._said != before or now >= self._due):
+        if whole and (whole != before or now >= self._due):
             self._due = now + REGULAR
             lines.append((now, whole if picture.waiting else f"{whole}{_format_figures(picture)}"))
-            lines += [(now, picture.format_ignored())] if picture.ignored else []
         return [
             f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}  {shown(words, LINE)}"
             for at, words in lines
@@ -321,8 +301,6 @@ def draw(picture: Picture, width: int) -> Group:
     if picture.waiting:
         waited = time.monotonic() - picture.since
         parts.append(Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow"))
-    if picture.ignored:
-        parts.append(Text(picture.format_ignored(), style="yellow"))
     if not picture.is_silent("diagnostics"):
         parts.append(Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level]))
     if not picture.channels:

@@ -34,9 +34,9 @@ class Ear:
             if flags & SUPPLY:
                 self.receiver.supply()
             if flags & HAS_RATE:
-                self.fused.append(self.receiver.messages[FUSED].tobytes())
+                self.fused.append(self.receiver.message(FUSED))
             if flags & WORKED:
-                self.integrity.append(self.receiver.messages[INTEGRITY].tobytes())
+                self.integrity.append(self.receiver.message(INTEGRITY))
             if flags & HAS_EVENTS:
                 self.events += self.receiver.events
             if flags & MALFORMED:
@@ -68,7 +68,7 @@ def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch
         samples = len(ear.integrity)
         ear.take(unit, data)
         if len(ear.integrity) > samples:
-            live.append(ear.receiver.messages[ratio].tobytes())
+            live.append(ear.receiver.message(ratio))
     results = Pipeline(parallel(2)).process(block)
     written = [data for topic, _, data in Encoder("body", 6).encode(results) if topic is ratio.topic]
     assert len(live) >= 38
