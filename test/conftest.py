@@ -10,14 +10,22 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
-from commands import Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
 LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_bench.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
+
+
+class Said(NamedTuple):
+    """How a command ended and what it said."""
+
+    code: int
+    out: str
+    err: str
 
 
 def take_domain():

@@ -3,9 +3,7 @@
 
 """Parameter files: what is written is read as the same, whatever it is; later files win; errors say where they are."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -26,7 +24,7 @@ from fdi_ros.errors import ConfigError
 CONFIG = Path(__file__).parents[2] / "config"
 SHIPPED = ("two_imus", "three_imus", "two_triads", "px4", "ardupilot")
 
-ONE: dict[str, Callable[[Any], st.SearchStrategy[Any]]] = {
+ONE = {
     "bool": lambda field: st.booleans(),
     "int": lambda field: st.integers(int(field.low), int(field.high)),
     "float": lambda field: st.floats(field.low, field.high, allow_nan=False, allow_infinity=False),
@@ -42,7 +40,7 @@ VALUES = {
 
 @settings(deadline=None, max_examples=50)
 @given(st.data())
-def test_what_is_written_is_read_as_the_same(data: st.DataObject) -> None:
+def test_what_is_written_is_read_as_the_same(data):
     names = data.draw(st.lists(st.sampled_from(list(PARAMETERS)), unique=True, max_size=12))
     values = {name: data.draw(VALUES[name]) for name in names}
     read = parameters_of(parameter_file(values, "made of\nthese", dict.fromkeys(names, "a remark")))
@@ -52,14 +50,14 @@ def test_what_is_written_is_read_as_the_same(data: st.DataObject) -> None:
 @pytest.mark.parametrize(
     "text", ["y", "No", "on", "1", "1e5", ".inf", "nan", "", "a: b", "# a", "[a", "~", "a\nb", "\u2028"]
 )
-def test_a_text_that_yaml_or_ros_would_take_for_something_else_is_in_quotes(text: str) -> None:
+def test_a_text_that_yaml_or_ros_would_take_for_something_else_is_in_quotes(text):
     line = next(line for line in parameter_file({"hardware_id": text}, "").splitlines() if "hardware_id: " in line)
     assert line.startswith('    hardware_id: "')
     assert parameters_of(parameter_file({"hardware_id": text}, "")) == {"hardware_id": text}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_all_else_is_carried_over_by_value(name: str) -> None:
+def test_all_else_is_carried_over_by_value(name):
     source = CONFIG / f"{name}.yaml"
     before = yaml.safe_load(source.read_text())
     changes = {"noise.noise_std": [0.5, 1e-5], "bias.fixed": [0.25], "detector.false_alarms_per_hour": 1.0}
@@ -74,7 +72,7 @@ def test_all_else_is_carried_over_by_value(name: str) -> None:
     assert max(len(line) for line in text.splitlines() if line.lstrip().startswith("#")) <= WIDTH
 
 
-def test_unit_and_meaning_of_every_parameter_stand_in_the_file() -> None:
+def test_unit_and_meaning_of_every_parameter_stand_in_the_file():
     text = " ".join(parameter_file(Config().parameters(), "").replace("#", " ").split())
     for field in PARAMETERS.values():
         assert f"{field.unit}: {field.description}".removeprefix(": ") in text
@@ -99,7 +97,7 @@ drone: {mavlink_node: {ros__parameters: {system_id: 4}}}
 """
 
 
-def test_of_several_files_later_ones_win(tmp_path: Path) -> None:
+def test_of_several_files_later_ones_win(tmp_path):
     files = [tmp_path / "first.yaml", tmp_path / "second.yaml"]
     for file, text in zip(files, (FIRST, SECOND), strict=True):
         file.write_text(text)
@@ -124,7 +122,7 @@ def test_of_several_files_later_ones_win(tmp_path: Path) -> None:
         ("a: !!python/object x\n", "line 1, column 4: could not determine a constructor for the tag"),
     ],
 )
-def test_an_error_says_where_it_is_in_one_line(tmp_path, text, words) -> None:
+def test_an_error_says_where_it_is_in_one_line(tmp_path, text, words):
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(ConfigError) as refused:
         Config.from_file(tmp_path / "bad.yaml")

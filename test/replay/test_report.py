@@ -117,7 +117,7 @@ def plot(number, rest=""):
     return f"figure[data-figure='{number}'] {rest}"
 
 
-def test_the_plots_are_drawn_without_a_word_on_the_console_or_a_request(browser, report):
+def test_the_plots_are_drawn_with_the_faults_and_without_a_word_on_the_console_or_a_request(browser, report):
     lines = "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
     drawn = ask(browser, f"[...document.querySelectorAll('figure')].map({lines})")
     # Timeline, statistic, three axes of the rate, six residuals, spectrum, protection level.
@@ -133,9 +133,7 @@ def test_the_plots_are_drawn_without_a_word_on_the_console_or_a_request(browser,
     # The browser asks itself for the parts of its own empty first page.
     own = ("chrome:", "chrome-untrusted:", "data:", "blob:")
     assert {url for url in asked if not url.startswith(own)} == {report.as_uri()}
-
-
-def test_faults_are_shaded_and_their_detection_is_marked_in_every_plot_over_time(browser):
+    # Faults are shaded, and their detection is marked, in every plot over time.
     count = "n => [...document.querySelectorAll('figure')].map(f => f.querySelectorAll(n).length)"
     shaded, detected, isolated = (
         ask(browser, f"({count})('{name}')") for name in ("rect.fault", ".detected", ".isolated")
@@ -254,23 +252,19 @@ def test_a_plot_without_values_is_not_drawn_and_what_paper_leaves_out_is_said():
     assert "On paper" not in html_table(["a"], [["b"]] * 60)
 
 
-def summary(bag="bag", samples=0, duration_s=0.0):
-    """The summary of a replay in which nothing happened."""
-    scores = Scores(samples, duration_s, (), (), FaultEffect(), 0.0, samples, samples, 0, ())
-    return summary_of(scores, bag)
+def made(geometry, time, residual, faults=(), episodes=(), bag="bag"):
+    """The page of samples at these times, s, and with these residuals (N, n), and the faults and episodes of them."""
+    random, drawn, count = np.random.default_rng(0), Report(geometry, 1 / np.diff(time).min()), len(time)
+    for rows in np.array_split(np.arange(count), max(2, count // 50_000)):
+        figures = {"rate": random.normal(size=(len(rows), 3)), "statistic": np.abs(random.normal(size=len(rows)))}
+        figures |= {"covariance": 1e-4 * np.eye(3), "residual": residual[rows], "threshold": 6.0, "valid": True}
+        drawn.add(None, output_of(geometry.n, stamp=np.round(1e9 * time[rows]).astype(np.int64), **figures), None)
+    scores = Scores(count, time[-1], faults, (), FaultEffect(), 0.0, count, count, 0, ())
+    return drawn.html(replace(summary_of(scores, bag), story=Story((), episodes)), {"recording": bag})
 
 
-def outputs(geometry, rows, spike):
-    """Samples as a pipeline would give them, with one spike in one residual."""
-    random = np.random.default_rng(0)
-    for first in range(0, rows, 50_000):
-        count = min(50_000, rows - first)
-        residual = random.normal(0, 0.01, (count, geometry.n))
-        residual[np.arange(first, first + count) == spike, 3] = 77.0
-        rate, covariance = random.normal(size=(count, 3)), np.broadcast_to(1e-4 * np.eye(3), (count, 3, 3))
-        figures = {"rate": rate, "covariance": covariance, "residual": residual, "threshold": 6.0, "valid": True}
-        figures["statistic"] = np.abs(random.normal(size=count))
-        yield output_of(geometry.n, stamp=1_000_000 * np.arange(first, first + count), **figures)
+def noise(rows, n):
+    return np.random.default_rng(1).normal(0, 0.01, (rows, n))
 
 
 def packed(text):
@@ -282,11 +276,9 @@ def packed(text):
 
 
 def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
-    geometry, rows, spike = Geometry.cone(12), 300_000, 123_457
-    made = Report(geometry, 1000.0)
-    for output in outputs(geometry, rows, spike):
-        made.add(None, output, None)
-    text = made.html(summary(samples=rows, duration_s=rows / 1000), {})
+    spike, residual = 123_457, noise(300_000, 12)
+    residual[spike, 3] = 77.0
+    text = made(Geometry.cone(12), 1e-3 * np.arange(len(residual)), residual)
     assert len(text) < 800_000
     width, start, series = packed(text)
     assert width > 1
@@ -296,15 +288,9 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
 
 
 def test_no_curve_is_drawn_over_a_hole():
-    geometry = Geometry.cone(6)
-    made = Report(geometry, 100.0)
-    for begin in (0.0, 7.0):
-        # A hole of 2 s within a block, and one between two.
-        for output in outputs(geometry, 100, spike=50):
-            time = begin + 0.01 * np.arange(100) + 2.0 * (np.arange(100) >= 50)
-            output.rows["stamp"] = np.round(1e9 * time)
-            made.add(None, output, None)
-    _, time, values = packed(made.html(summary(samples=200, duration_s=10.0), {}))
+    # Holes of 2 s within what is handed on at once, and one between.
+    time = 0.01 * np.arange(200) + 2.0 * np.searchsorted([50, 100, 150], np.arange(200), side="right")
+    _, time, values = packed(made(Geometry.cone(6), time, noise(200, 6)))
     long = np.flatnonzero(np.diff(time) > 1.0)
     assert len(long) == 3
     assert np.isnan(values[long]).all()
@@ -313,16 +299,12 @@ def test_no_curve_is_drawn_over_a_hole():
 def test_names_stay_text_in_page_and_plots(driver, folder):
     nasty = '</script><img src=x onerror="document.title=1">\u202egpj'
     geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
-    made, path = Report(geometry, 100.0), folder / "nasty.html"
-    for output in outputs(geometry, 200, spike=50):
-        made.add(None, output, None)
+    path = folder / "nasty.html"
     fault = Outcome(nasty, (nasty,), nasty, None, 0.05, None, detected_at_s=0.06)
     step = Step(0.1, "FAULTY", (nasty,), nasty)
     evidence, rate = Evidence("", None, 0, None), RateMeanwhile(1.0, None, None, None)
     false = Episode(1, "FAULTY", (nasty,), nasty, 0.1, 0.1, 0.2, True, (step,), (), None, evidence, rate)
-    told = replace(summary(nasty, samples=200, duration_s=0.2), story=Story((), (false,)))
-    scores = replace(told.scores, faults=(fault,))
-    path.write_text(made.html(replace(told, scores=scores), {"recording": nasty}))
+    path.write_text(made(geometry, 0.01 * np.arange(200), noise(200, 4), (fault,), (false,), nasty))
     opened(driver, path)
     driver.execute_script("links.time.over = links.time.charts[2]; links.time.point(0.1)")
     assert ask(driver, "document.querySelectorAll('img').length") == 0
@@ -334,12 +316,9 @@ def test_names_stay_text_in_page_and_plots(driver, folder):
 
 
 def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
-    geometry, rows = Geometry.cone(6), 6000
-    made, shaken = Report(geometry, 100.0), folder / "shaken.html"
-    for output in outputs(geometry, rows, spike=rows):
-        output.rows["residual"][5200:] *= 1000
-        made.add(None, output, None)
-    shaken.write_text(made.html(summary(samples=rows, duration_s=rows / 1000), {}))
+    shaken, residual = folder / "shaken.html", noise(6000, 6)
+    residual[5200:] *= 1000
+    shaken.write_text(made(Geometry.cone(6), 0.01 * np.arange(6000), residual))
     opened(driver, shaken)
     figure = "sections.find(s => s.plots.length === 6)"
     high, noted = f"{figure}.plots[2].y.range[1]", f"{figure}.element.querySelectorAll('.cut').length"

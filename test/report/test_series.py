@@ -3,8 +3,6 @@
 
 """Long series on a page: decimation loses no spike; the spectrum has its level, its lines, and what may be folded."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -18,11 +16,11 @@ from fdi_ros.report.spectrum import Spectrum
 RATE, STD = 100.0, 0.01
 
 
-def noise(samples: int) -> np.ndarray:
+def noise(samples):
     return np.random.default_rng(5).normal(0.0, STD, (samples, 2))
 
 
-def spectrum(*parts: np.ndarray) -> Spectrum:
+def spectrum(*parts):
     pytest.importorskip("scipy", reason="SciPy is not installed (extra: calibrate)")
     made = Spectrum(("a", "b"), RATE)
     for part in parts:
@@ -30,7 +28,7 @@ def spectrum(*parts: np.ndarray) -> Spectrum:
     return made
 
 
-def curves(made: Spectrum) -> list[np.ndarray]:
+def curves(made):
     section = made.section()
     assert section is not None
     return [np.array(trace["y"]) for trace in section.figures[0]["data"]]

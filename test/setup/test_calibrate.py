@@ -4,16 +4,14 @@
 """Calibration: simulated vehicles with known truth, what it refuses and says, and the real recordings."""
 
 import re
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Refused, Run
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vehicles import KINDS, NOISE, Vehicle, vehicle
+from vehicles import KINDS, NOISE, vehicle
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.outputs import Kind, check_target
@@ -22,7 +20,7 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.calibrate import Calibration, calibrate
+from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.estimate import NormalEquations, find_random_walk, smooth
 from fdi_ros.setup.report import calibration_findings
 from fdi_ros.setup.starting_config import Role, lines_of
@@ -31,25 +29,25 @@ CONFIG = Path(__file__).parents[2] / "config"
 
 
 @cache
-def made(seed: int, kind: str, units: int = 3) -> tuple[Vehicle, Calibration]:
+def made(seed, kind, units=3):
     one = vehicle(seed, kind, units)
     return one, calibrate(one.block, one.config)
 
 
-def said(result: Calibration, role: Role) -> list[str]:
+def said(result, role):
     return lines_of(calibration_findings(result, "base_link"), role)
 
 
-def hand() -> Vehicle:
+def hand():
     return made(0, "rest and turns")[0]
 
 
-def seconds(block: Block) -> np.ndarray:
+def seconds(block):
     return (block.stamp - block.stamp[0]) * 1e-9
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_stated_errors_are_the_actual_ones(kind: str) -> None:
+def test_stated_errors_are_the_actual_ones(kind):
     # Some hundred figures of each; `benchmark/estimator.py calibration` has many vehicles.
     axes, biases, delays = [], [], []
     for seed, units in ((0, 3), (1, 2), (2, 3)):
@@ -63,7 +61,7 @@ def test_stated_errors_are_the_actual_ones(kind: str) -> None:
     assert np.abs(np.concatenate(delays)).max() < 4.5
 
 
-def slow_units(block: Block) -> Block:
+def slow_units(block):
     """The second unit at half the rate of the first, the third at a quarter, between each other."""
     k, z = np.arange(len(block)), block.z.copy()
     for first, every, at in ((3, 2, 0), (6, 4, 1)):
@@ -71,7 +69,7 @@ def slow_units(block: Block) -> Block:
     return Block(block.stamp, z, np.isfinite(z))
 
 
-def armed_thrice(block: Block) -> Block:
+def armed_thrice(block):
     """With two gaps."""
     part = seconds(block) / seconds(block)[-1]
     kept = ~((part > 0.35) & (part < 0.45) | (part > 0.7) & (part < 0.75))
@@ -80,9 +78,7 @@ def armed_thrice(block: Block) -> Block:
 
 @pytest.mark.parametrize(("rate", "change"), [(10.0, None), (25.0, None), (100.0, slow_units), (100.0, armed_thrice)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_any_recording_gives_settings_with_errors_as_stated(
-    kind: str, rate: float, change: Callable[[Block], Block] | None
-) -> None:
+def test_any_recording_gives_settings_with_errors_as_stated(kind, rate, change):
     one = vehicle(7, kind, 3, rate)
     result = calibrate(one.block if change is None else change(one.block), one.config)
     assert np.abs((result.axes - one.axes) / result.axes_std).max() < 4.0
@@ -93,7 +89,7 @@ def test_any_recording_gives_settings_with_errors_as_stated(
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])
-def test_vibration_is_no_noise_scale_or_timing_error(kind: str) -> None:
+def test_vibration_is_no_noise_scale_or_timing_error(kind):
     _, result = made(0, kind)
     np.testing.assert_allclose(result.estimate.floor.std, NOISE, rtol=0.1)
     assert result.scale[0] < 1e-3
@@ -102,7 +98,7 @@ def test_vibration_is_no_noise_scale_or_timing_error(kind: str) -> None:
     assert not result.faults
 
 
-def test_without_rest_the_common_part_of_the_biases_is_said_to_be_unknown() -> None:
+def test_without_rest_the_common_part_of_the_biases_is_said_to_be_unknown():
     one, result = made(0, "flight alone")
     assert result.bias_std.min() > 0.005
     assert "nowhere at rest" in said(result, Role.UNKNOWN)[0]
@@ -111,7 +107,7 @@ def test_without_rest_the_common_part_of_the_biases_is_said_to_be_unknown() -> N
     assert np.abs(apart @ (result.estimate.bias - one.bias)).max() < 0.002
 
 
-def test_an_axis_never_turned_is_named_and_stays_as_configured() -> None:
+def test_an_axis_never_turned_is_named_and_stays_as_configured():
     one = hand()
     bias = one.block.z[:500].mean(axis=0)
     rate = (one.block.z - bias) @ np.linalg.pinv(one.axes).T
@@ -124,7 +120,7 @@ def test_an_axis_never_turned_is_named_and_stays_as_configured() -> None:
 
 
 @pytest.mark.parametrize("response", [0.05, 0.15, 0.4])
-def test_vibration_that_units_see_differently_teaches_no_scale_factor(response: float) -> None:
+def test_vibration_that_units_see_differently_teaches_no_scale_factor(response):
     """A hover: lines of the body, also folded down, that each channel sees with gains and phases of its own."""
     rng, one = np.random.default_rng(5), hand()
     t = seconds(one.block)
@@ -139,7 +135,7 @@ def test_vibration_that_units_see_differently_teaches_no_scale_factor(response: 
     assert np.abs(result.factor - 1.0).max() < 0.02
 
 
-def test_bad_values_are_left_out_and_counted() -> None:
+def test_bad_values_are_left_out_and_counted():
     one, z = hand(), hand().block.z.copy()
     rng = np.random.default_rng(5)
     for value in (np.nan, np.inf, 34.95):
@@ -155,7 +151,7 @@ def test_bad_values_are_left_out_and_counted() -> None:
     assert len(said(result, Role.WARNING)) <= 6
 
 
-def test_a_channel_that_fails_is_named_with_its_times_and_left_out() -> None:
+def test_a_channel_that_fails_is_named_with_its_times_and_left_out():
     one, at = hand(), seconds(hand().block)
     z = one.block.z.copy()
     z[(at > 5) & (at < 9), 4] += 0.1
@@ -166,12 +162,12 @@ def test_a_channel_that_fails_is_named_with_its_times_and_left_out() -> None:
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 5
 
 
-def test_contradictions_are_refused_and_named() -> None:
+def test_contradictions_are_refused_and_named():
     one = hand()
     z, stamp = one.block.z, one.block.stamp
     wide = one.config.replaced({"health.max_rate": [2000.0]})
 
-    def refused(words: str, columns: object, values: object, config: Config = wide, rows: slice = np.s_[:]) -> None:
+    def refused(words, columns, values, config=wide, rows=np.s_[:]):
         change = z.copy()
         change[rows, columns] = values
         with pytest.raises(CalibrationError, match=words):
@@ -204,20 +200,20 @@ def test_contradictions_are_refused_and_named() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_delays_put_no_motion_into_the_noise(seed: int) -> None:
+def test_delays_put_no_motion_into_the_noise(seed):
     """All channels are alike, whatever part of a sample their unit is late by."""
     noise = made(seed, "flight alone")[1].settings["noise.noise_std"]
     assert max(noise) < 1.15 * min(noise)
 
 
-def test_the_monitor_waits_for_units_that_are_late() -> None:
+def test_the_monitor_waits_for_units_that_are_late():
     one, late = hand(), hand().block.z.copy()
     late[:, 3:6] = np.roll(late[:, 3:6], 9, axis=0)
     result = calibrate(Block(one.block.stamp, late)[20:], one.config)
     assert result.settings["imus.timeout"] > 2 * np.ptp(result.settings["imus.delays"]) > 0.15
 
 
-def test_a_noisy_channel_hides_no_rest() -> None:
+def test_a_noisy_channel_hides_no_rest():
     one, z = made(0, "flight with rest")[0], made(0, "flight with rest")[0].block.z.copy()
     z[:, 8] += 0.05 * np.random.default_rng(8).standard_normal(len(z))
     result = calibrate(Block(one.block.stamp, z), one.config)
@@ -225,13 +221,13 @@ def test_a_noisy_channel_hides_no_rest() -> None:
     assert result.estimate.rest_seconds > 10.0
 
 
-def test_a_reference_is_believed() -> None:
+def test_a_reference_is_believed():
     one = hand()
     result = calibrate(one.block, one.config, "imu_2")
     np.testing.assert_allclose(result.axes[3:6], one.nominal.axes[3:6], atol=1e-4)
 
 
-def test_axes_of_an_array_are_found_from_those_of_its_first_three() -> None:
+def test_axes_of_an_array_are_found_from_those_of_its_first_three():
     one, array = hand(), {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "cone"}
     config = Config.from_parameters({**array, "geometry.cone_channels": 6, "sample_rate": one.config.sample_rate})
     result = calibrate(Block(one.block.stamp, one.block.z[:, :6]), config)
@@ -241,7 +237,7 @@ def test_axes_of_an_array_are_found_from_those_of_its_first_three() -> None:
     assert (np.abs(result.axes - true) < 4.0 * result.axes_std + 1e-5).all()
 
 
-def test_exact_repeats_are_not_data() -> None:
+def test_exact_repeats_are_not_data():
     stamp, z, coarse = hand().block.stamp, hand().block.z.copy(), np.round(hand().block.z, 2)
     z[-600:] = 0.0
     # So coarse that at rest hardly any value changes: that is rest.
@@ -251,7 +247,7 @@ def test_exact_repeats_are_not_data() -> None:
         assert (prepare(Block(stamp, values), np.full(9, 35.0)).unusable["repeated"] == repeated).all()
 
 
-def test_units_20_to_40_ms_apart_in_a_real_flight(root: Path) -> None:
+def test_units_20_to_40_ms_apart_in_a_real_flight(root):
     folder = root.parent / "shared" / "data" / "phantom4"
     if not folder.exists():
         pytest.skip(f"the recordings of a real flight are not here: {folder}")
@@ -264,7 +260,7 @@ def test_units_20_to_40_ms_apart_in_a_real_flight(root: Path) -> None:
     assert not result.faults
 
 
-def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, fdi: Run, refused: Refused) -> None:
+def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     output, report = tmp_path / "new.yaml", tmp_path / "report.html"
     words = ("calibrate", recording, "--config", CONFIG / "three_imus.yaml", "--end", 180)
     code, out, _ = fdi(*words, "--output", output, "--report", report)
@@ -286,9 +282,7 @@ def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, fdi: R
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 8), st.integers(1, 3), st.integers(1, 4), st.floats(0.05, 3.0))
-def test_the_smoother_solves_all_windows_written_into_one_large_system(
-    seed: int, windows: int, n: int, m: int, walk: float
-) -> None:
+def test_the_smoother_solves_all_windows_written_into_one_large_system(seed, windows, n, m, walk):
     rng, size = np.random.default_rng(seed), windows * n + m
     rows, y = rng.standard_normal((windows, n + m + 2, n + m)), rng.standard_normal((windows, n + m + 2))
     normal, rights = np.einsum("kai,kaj->kij", rows, rows), np.einsum("kai,ka->ki", rows, y)
@@ -315,7 +309,7 @@ def test_the_smoother_solves_all_windows_written_into_one_large_system(
     np.testing.assert_allclose(found.mean_covariance, mean @ covariance @ mean.T, atol=1e-9)
 
 
-def test_the_walk_is_found_where_there_is_one() -> None:
+def test_the_walk_is_found_where_there_is_one():
     rng, windows, walk, noise = np.random.default_rng(3), 300, 5e-4, 1e-3
     for true in (walk, 0.0):
         bias = np.cumsum(true * rng.standard_normal((windows, 3)), axis=0)

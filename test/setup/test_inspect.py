@@ -3,8 +3,6 @@
 
 """What inspection says of a recording is what was put into it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Run
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.config.config import Config
@@ -22,13 +21,13 @@ from fdi_ros.setup.mounting import VIBRATION, WAITS, assess, loss, mounting_text
 CONFIG = Path(__file__).parents[2] / "config"
 
 
-def two_imus(second: np.ndarray) -> Config:
+def two_imus(second):
     return Config.from_parameters(
         {"input": "imus", "imus.topics": ["a", "b"], "imus.mounts": [*np.eye(3).ravel(), *second.ravel()]}
     )
 
 
-def test_two_lost_against_plain_least_squares() -> None:
+def test_two_lost_against_plain_least_squares():
     """Of one axis they leave no rate."""
     geometry, noise = Geometry.dodecahedron(), NoiseModel(0.01).for_channels(6)
     kept = [0, 2, 3, 5]
@@ -42,7 +41,7 @@ def test_two_lost_against_plain_least_squares() -> None:
 
 
 @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone()])
-def test_smallest_error_is_seen_99_times_in_100(geometry: Geometry) -> None:
+def test_smallest_error_is_seen_99_times_in_100(geometry):
     probability = 1e-3
     noise = NoiseModel(np.linspace(0.8, 1.3, 6))
     smallest = smallest_detectable(geometry, noise, probability)
@@ -56,12 +55,12 @@ def test_smallest_error_is_seen_99_times_in_100(geometry: Geometry) -> None:
 
 
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
-def test_smallest_shift_is_the_one_that_the_tuned_cusum_finds_in_that_time(shift: float) -> None:
+def test_smallest_shift_is_the_one_that_the_tuned_cusum_finds_in_that_time(shift):
     # The integral equation of Page against the closed form, which is good while a delay is of several samples.
     assert smallest_shift(moustakides_delay(shift, 1e5), 1e5) == pytest.approx(shift, rel=0.02)
 
 
-def test_an_error_as_large_as_stated_is_found_in_the_time_stated() -> None:
+def test_an_error_as_large_as_stated_is_found_in_the_time_stated():
     config = two_imus(Rotation.from_euler("xyz", [40, 30, 20], degrees=True).as_matrix())
     config = config.replaced({"noise.noise_std": [0.001 * (i + 1) for i in range(6)], "noise.scale_std": [0.01]})
     result = assess(config)
@@ -79,7 +78,7 @@ def test_an_error_as_large_as_stated_is_found_in_the_time_stated() -> None:
     assert moustakides_delay(shift, 1 / result.false_alarm_probability) == pytest.approx(50, rel=0.03)
 
 
-def test_what_names_rest_on_is_said() -> None:
+def test_what_names_rest_on_is_said():
     rng = np.random.default_rng(0)
     three = Geometry(np.tile(np.eye(3), (3, 1)) + 0.003 * rng.standard_normal((9, 3)))
     assert coincidences(three) == ((0, 3, 6), (1, 4, 7), (2, 5, 8))
@@ -97,7 +96,7 @@ def test_what_names_rest_on_is_said() -> None:
     assert assumption_words(Geometry(np.tile(np.eye(3), (4, 1)))) == ""
 
 
-def test_look_alikes_are_named_in_words() -> None:
+def test_look_alikes_are_named_in_words():
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     assert assess(two_imus(quarter)).alike == [[0, 4], [1, 3], [2, 5]]
     result = assess(two_imus(np.eye(3)))
@@ -111,7 +110,7 @@ def test_look_alikes_are_named_in_words() -> None:
 
 
 @pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
-def test_verb_on_the_bundled_files(name: str, tmp_path: Path, fdi: Run) -> None:
+def test_verb_on_the_bundled_files(name, tmp_path, fdi):
     report = tmp_path / "page.html"
     code, out, _ = fdi("geometry", CONFIG / f"{name}.yaml", "--report", report)
     assert code == 0

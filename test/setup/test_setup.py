@@ -8,20 +8,18 @@ import re
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_messages, write_config, write_mcap
-from commands import Refused, Run
 from scipy.spatial.transform import Rotation
-from vehicles import Vehicle, vehicle
+from vehicles import vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.setup.agreement import find_mounts
-from fdi_ros.setup.blocks import Data, prepare
+from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.run import Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -31,22 +29,22 @@ CONE = ROOT / "bags" / "cone_flight"
 
 
 @cache
-def three() -> Vehicle:
+def three():
     """Three triads, turned by hand."""
     return vehicle(11, "rest and turns")
 
 
-def ready(block: Block) -> Data:
+def ready(block):
     """A recording made ready, gyros of a range of 35 rad/s."""
     return prepare(block, np.full(block.z.shape[1], 35.0))
 
 
-def angle(a: np.ndarray, b: np.ndarray) -> float:
+def angle(a, b):
     """Degrees between two rotations."""
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
 
 
-def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
+def test_mounts_are_found_and_taken_for_square_where_they_are():
     unit = three()
     mounts = find_mounts(ready(unit.block))
     left, _, right = np.linalg.svd(unit.axes[:3].T)
@@ -69,7 +67,7 @@ def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     assert "body x is its z, y is its x, z is its y" in found[1].words
 
 
-def test_a_mount_that_is_not_shown_is_not_known() -> None:
+def test_a_mount_that_is_not_shown_is_not_known():
     unit = three()
     seconds = (unit.block.stamp - unit.block.stamp[0]) * 1e-9
     noise = np.random.default_rng(3).normal(0, 0.003, unit.block.z.shape)
@@ -90,7 +88,7 @@ def test_a_mount_that_is_not_shown_is_not_known() -> None:
         assert words in mount.words
 
 
-def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_path: Path) -> None:
+def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     file = tmp_path / "cone.yaml"
     code, out, _ = fdi("setup", CONE, "--output", file, "--json", tmp_path / "cone.json", "--degrees")
     assert code == 0
@@ -132,7 +130,7 @@ def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
 
 
-def at_rest_then_turning(size: float) -> tuple[np.ndarray, np.ndarray]:
+def at_rest_then_turning(size):
     """Stamps and values of two parallel units, half of the time at rest; turns of a size, rad/s."""
     i = np.arange(1600)
     z = np.random.default_rng(3).normal(0.01, 0.002, (1600, 6))
@@ -150,9 +148,7 @@ def at_rest_then_turning(size: float) -> tuple[np.ndarray, np.ndarray]:
         ([], 0.3, ""),
     ],
 )
-def test_degrees_are_refused(
-    in_degrees: list[int], size: float, words: str, tmp_path: Path, fdi: Run, refused: Refused
-) -> None:
+def test_degrees_are_refused(in_degrees, size, words, tmp_path, fdi, refused):
     stamp, z = at_rest_then_turning(size)
     for unit in in_degrees:
         z[:, 3 * unit : 3 * unit + 3] *= np.degrees(1.0)
@@ -174,7 +170,7 @@ def test_degrees_are_refused(
     assert (code, words in said, made.exists()) == (2, True, False)
 
 
-def test_half_a_second_of_a_long_flight_shows_degrees(tmp_path: Path, fdi: Run) -> None:
+def test_half_a_second_of_a_long_flight_shows_degrees(tmp_path, fdi):
     t = 0.01 * np.arange(9000)
     turn = np.where((t > 50.0) & (t < 51.0), 0.7, 0.3 * np.sin(t))
     z = np.random.default_rng(2).normal(0.0, 0.005, (len(t), 6)) + np.tile([0.2, 0.5, 1.0], 2) * turn[:, None]
@@ -184,7 +180,7 @@ def test_half_a_second_of_a_long_flight_shows_degrees(tmp_path: Path, fdi: Run) 
 
 
 @pytest.mark.parametrize("of_one", [True, False])
-def test_shocks_and_noise_are_no_degrees(of_one: bool, tmp_path: Path, fdi: Run) -> None:
+def test_shocks_and_noise_are_no_degrees(of_one, tmp_path, fdi):
     """Values beyond every range for a moment, and idling motors, are no other unit of measure."""
     stamp, z = at_rest_then_turning(0.3)
     z[1000:1004] = 90.0
@@ -194,7 +190,7 @@ def test_shocks_and_noise_are_no_degrees(of_one: bool, tmp_path: Path, fdi: Run)
 
 
 @pytest.mark.parametrize("ahead", [-1.5, 0.0, 3 * 86_400.0])
-def test_clocks_that_share_no_instants_are_named(ahead: float, tmp_path: Path, fdi: Run, refused: Refused) -> None:
+def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
     off = {TOPICS[0]: 0, TOPICS[1]: round(ahead * 1e9)}
     steps = [START + i * STEP for i in range(1500)]
     rng = np.random.default_rng(4)
@@ -217,7 +213,7 @@ def test_clocks_that_share_no_instants_are_named(ahead: float, tmp_path: Path, f
 
 
 @pytest.mark.parametrize("odd", [0, 1, 2])
-def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, fdi: Run) -> None:
+def test_a_mirrored_unit_is_named_whatever_its_mount(odd, tmp_path, fdi):
     one = vehicle(0, "rest and turns", 3)
     z = one.block.z.copy()
     z[:, 3 * odd] *= -1.0
@@ -227,8 +223,8 @@ def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, f
     assert out.startswith(f"DO NOT USE: imu_{odd + 1} is mirrored: one axis is reversed (a left turn reads as a right")
 
 
-def test_settings_are_never_worse_than_those_before() -> None:
-    all_of_it: Any = SimpleNamespace(judged=1.0, declared=[])
+def test_settings_are_never_worse_than_those_before():
+    all_of_it = SimpleNamespace(judged=1.0, declared=[])
     before, fewer, chance = (Tried(all_of_it, "", {0.1: (isolated, 36)}) for isolated in (30, 28, 29))
     nothing = Tried(None, "only three channels", {})
     for old, new, worse in (
@@ -241,7 +237,7 @@ def test_settings_are_never_worse_than_those_before() -> None:
         assert Proof("", True, 36.0, old, new).worse == worse
 
 
-def test_settings_that_are_worse_are_not_written(fdi: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
     config = ROOT / "config" / "two_imus.yaml"
     monkeypatch.setattr(Proof, "worse", "28 of 54 biases are isolated instead of 30")
     verb = ("calibrate", CONE, "--config", config, "--output", tmp_path / "made.yaml", "--json", tmp_path / "j")
@@ -253,7 +249,7 @@ def test_settings_that_are_worse_are_not_written(fdi: Run, tmp_path: Path, monke
     assert json.loads((tmp_path / "j").read_text())["no_better"] == "28 of 54 biases are isolated instead of 30"
 
 
-def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi: Run, tmp_path: Path) -> None:
+def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi, tmp_path):
     """In motion from the start, at rest in the last part: only there all biases show."""
     one = vehicle(3, "rest and turns")
     t = (one.block.stamp - one.block.stamp[0]) * 1e-9
@@ -266,7 +262,7 @@ def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi: Run, tmp_path: Pa
     np.testing.assert_allclose(found, rest.mean(axis=0), atol=5e-4)
 
 
-def still(seconds: int) -> np.ndarray:
+def still(seconds):
     """Values of two units that lie still."""
     return np.random.default_rng(5).normal([0.01, -0.01, 0.0] * 2, 0.002, (100 * seconds, 6))
 
@@ -291,7 +287,7 @@ UNSHOWN = {
 
 
 @pytest.mark.parametrize("shown", UNSHOWN)
-def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: Path, shown: str) -> None:
+def test_what_cannot_be_found_is_said_and_the_config_loads(fdi, tmp_path, shown):
     topics = None
     z = {"factor": flight(2000)[1] * [1, 1, 1, 10, 10, 10], "still": still(12)}.get(shown, flight()[1])
     stamp = START + STEP * np.arange(len(z))
@@ -319,7 +315,7 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
 
 
 @pytest.mark.parametrize("how", ["identical", "turned", "scaled", "later"])
-def test_one_sensor_on_two_topics_is_no_redundancy(how: str, fdi: Run, refused: Refused, tmp_path: Path) -> None:
+def test_one_sensor_on_two_topics_is_no_redundancy(how, fdi, refused, tmp_path):
     z = flight(800)[1]
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     copy = {"identical": z[:, :3], "turned": z[:, :3] @ turn.T, "scaled": 1.01 * z[:, :3], "later": z[:, :3]}[how]
@@ -347,6 +343,6 @@ def test_one_sensor_on_two_topics_is_no_redundancy(how: str, fdi: Run, refused: 
     assert Config.from_file(tmp_path / "own.yaml").imus.topics == TOPICS
 
 
-def test_a_reference_that_is_no_unit_is_refused(refused: Refused, tmp_path: Path) -> None:
+def test_a_reference_that_is_no_unit_is_refused(refused, tmp_path):
     said = refused("setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
     assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
