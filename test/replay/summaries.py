@@ -1,9 +1,35 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Summaries of replays for the tests."""
+"""What comes of replays, for the tests."""
 
+import numpy as np
+
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
+
+
+class Keep(Sink):
+    """Keeps all that passes."""
+
+    def __init__(self):
+        self.outputs, self.blocks = [], []
+
+    def add(self, block, output, pipeline):
+        self.blocks.append(block.z)
+        self.outputs.append(output)
+
+    @property
+    def z(self):
+        """What the monitor was given, (N, n) rad/s."""
+        return np.concatenate(self.blocks)
+
+    @property
+    def output(self):
+        """All that it said."""
+        rows = np.concatenate([output.rows for output in self.outputs])
+        return Output(rows, self.outputs[0].n, [event for output in self.outputs for event in output.events])
 
 
 def summary_of(scores, bag="bag"):

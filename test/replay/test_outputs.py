@@ -5,45 +5,34 @@
 
 from collections import defaultdict
 from dataclasses import astuple
-from pathlib import Path
 
 import numpy as np
 import pytest
 from bag.recordings import ARRAY, IMU, STORE
 from mcap.reader import make_reader
+from replay.summaries import Keep
 from rosbags.highlevel import AnyReader
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import ChannelState
 from fdi_ros.replay.outputs import OutputBag
-from fdi_ros.replay.run import Sink, replay
+from fdi_ros.replay.run import replay
 
-ROOT = Path(__file__).parents[2]
 NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
 
 
-class Keep(Sink):
-    def __init__(self):
-        self.outputs = []
-
-    def add(self, block, output, pipeline):
-        self.outputs.append(output)
-
-
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def written(tmp_path_factory, root, flight):
     """The bundled flight with a fault, and what the pipeline said of it."""
     path = tmp_path_factory.mktemp("written") / "out"
-    config = Config.from_file(ROOT / "config" / "two_imus.yaml")
-    fault = parse_fault("channel=imu_1.y kind=bias size=0.2 start=20")
-    request = (ROOT / "bags" / "cone_flight", config, (fault,))
+    config = Config.from_file(root / "config" / "two_imus.yaml")
+    request = (flight, config, (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),))
     keep = Keep()
     with OutputBag(path, config, 6) as bag:
         summary = replay(*request, sinks=[bag, keep])
-    events = [event for output in keep.outputs for event in output.events]
-    output = Output(np.concatenate([output.rows for output in keep.outputs]), 6, events)
+    output = keep.output
     integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])
     return path, output, integrity, summary, request
 

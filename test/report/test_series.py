@@ -67,14 +67,6 @@ def test_a_channel_that_gives_nothing_leaves_the_others():
     assert spectrum(values).section() is None
 
 
-def fed(time, values, most, cuts):
-    store = PageStore(dict.fromkeys("abc"[: values.shape[1]], FINE), most)
-    edges = sorted({0, len(time), *(min(cut, len(time)) for cut in cuts)})
-    for first, last in itertools.pairwise(edges):
-        store.add(time[first:last], values[first:last])
-    return store
-
-
 @given(
     rows=st.integers(1, 400),
     most=st.integers(2, 40),
@@ -86,8 +78,14 @@ def test_every_value_lies_within_its_span_and_every_extreme_is_reached(rows, mos
     time = np.cumsum(random.uniform(0.1, 1, rows))
     values = random.normal(size=(rows, 3))
     values[random.random(rows) < 0.2, 1] = np.nan
-    start, low, high = fed(time, values, most, cuts).spans()
+    store = PageStore(dict.fromkeys("abc", FINE), most)
+    for first, last in itertools.pairwise(sorted({0, rows, *(min(cut, rows) for cut in cuts)})):
+        store.add(time[first:last], values[first:last])
+    start, low, high = store.spans()
     assert len(start) <= most + 1
+    if rows <= most:
+        # What fits is kept as it is.
+        np.testing.assert_array_equal(start, time)
     assert (np.diff(start) > 0).all()
     span = np.searchsorted(start, time, side="right") - 1
     for k in range(len(start)):
@@ -99,11 +97,3 @@ def test_every_value_lies_within_its_span_and_every_extreme_is_reached(rows, mos
             else:
                 assert np.isnan(low[k, column])
                 assert np.isnan(high[k, column])
-
-
-def test_what_fits_is_kept_as_it_is():
-    time, values = np.arange(50.0), np.random.default_rng(0).normal(size=(50, 2))
-    start, low, high = fed(time, values, 50, [7, 20]).spans()
-    np.testing.assert_array_equal(start, time)
-    np.testing.assert_array_equal(low, values)
-    np.testing.assert_array_equal(high, values)
