@@ -18,11 +18,14 @@ spectra, and are not read.
 Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
 TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
 
+FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted.
+
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -47,7 +50,13 @@ _TYPES = (
 )
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
-_TYPES_OF = {"Message": "Z", "I": "B"}  # columns that are read and may not be any number, and their types
+_TYPES_OF = {
+    "Message": "Z",
+    "Label": "Z",
+    "UnitIds": "N",
+    "MultIds": "N",
+    "I": "B",
+}  # columns that are read and may not be any number, and their types
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
 _VALUES = {
@@ -57,6 +66,8 @@ _VALUES = {
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
 _TEXTS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode")}  # columns of what the autopilot says
+_UNITS = {"FMTU": ("FmtType", "UnitIds", "MultIds"), "UNIT": ("Id", "Label"), "MULT": ("Id", "Mult")}
+"""Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
 _OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
@@ -135,6 +146,8 @@ class DataflashLog(FlightLog):
         self._names: dict[int, str] = {}
         self._layouts: dict[int, np.dtype[np.void]] = {}  # columns that are read of records of each message
         self._lacking: dict[int, str] = {}  # of messages that cannot be read: why
+        self._columns: dict[int, list[str]] = {}  # all columns of each message that is read
+        self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _UNITS}
         offset = lost = 0
         while True:
             self.file.seek(offset)
@@ -169,13 +182,17 @@ class DataflashLog(FlightLog):
             if k in self._lacking:
                 self.unread[self._names[k]] = self._lacking[k]
         samples: list[tuple[Source, ImuSamples]] = []
-        for k, layout in self._layouts.items():
-            if k not in starts:
-                continue
-            name = self._names[k]
+        # Units before the samples: in a short log both are in one portion.
+        for k in sorted(starts.keys() & self._layouts.keys(), key=lambda k: self._names[k] not in _UNITS):
+            name, layout = self._names[k], self._layouts[k]
             rows = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[starts[k]].view(layout)[:, 0]
             if (sensor := _SENSORS.fullmatch(name)) is not None:
-                samples += _samples(Source(sensor[1], int(sensor[2] or 1) - 1), rows, begin + starts[k])
+                source = Source(sensor[1], int(sensor[2] or 1) - 1)
+                samples += _samples(source, rows, begin + starts[k], *self._factors(k, source))
+            elif name in _UNITS:
+                number, *columns = (rows[column] for column in _UNITS[name])
+                for at, *told in zip(number.astype(np.int64).tolist(), *map(list, columns), strict=True):
+                    self._told[name].setdefault(at, told)
             elif name in _TEXTS:
                 self._take_texts(name, rows)
             elif self.start_utc is None:
@@ -190,9 +207,10 @@ class DataflashLog(FlightLog):
             return
         self._names[number] = name
         sensor = _SENSORS.fullmatch(name)
-        if sensor or _GPS.fullmatch(name) or name in _TEXTS:
+        if sensor or _GPS.fullmatch(name) or name in _TEXTS or name in _UNITS:
+            self._columns[number] = columns.split(",")
             try:
-                self._layouts[number] = _layout(name, size, types, columns.split(","))
+                self._layouts[number] = _layout(name, size, types, self._columns[number])
             except ValueError as error:
                 if sensor:
                     self._lacking[number] = str(error)
@@ -206,6 +224,19 @@ class DataflashLog(FlightLog):
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
+
+    def _factors(self, number: int, source: Source) -> Iterator[Array]:
+        """Return what rate and acceleration of a message are to be multiplied by, (3,) each, for rad, m and s."""
+        units, multipliers = self._told["FMTU"].get(number, (b"", b""))
+        for columns in _VALUES[source.kind]:
+            factors = np.ones(3)
+            for i, k in enumerate(self._columns[number].index(one) for one in columns if one in self._columns[number]):
+                (said,) = self._told["MULT"].get(multipliers[k], (1.0,)) if k < len(multipliers) else (1.0,)
+                # 0 stands for none.
+                factors[i] = said if math.isfinite(said) and said > 0 else 1.0
+                if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[0].startswith(b"deg"):
+                    factors[i] *= math.pi / 180.0
+            yield factors
 
 
 def _error_text(subsystem: float, code: float) -> str:
@@ -222,7 +253,7 @@ def _layout(name: str, size: int, types: str, columns: Sequence[str]) -> np.dtyp
         raise ValueError("its FMT record is damaged")
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
-    needed = {*_TEXTS.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
+    needed = {*{**_TEXTS, **_UNITS}.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
     fields: dict[str, tuple[str, int]] = {}
     at = _HEAD
     for column, kind in zip(columns, types, strict=True):
@@ -240,14 +271,21 @@ def _layout(name: str, size: int, types: str, columns: Sequence[str]) -> np.dtyp
     return np.dtype(layout)
 
 
-def _samples(source: Source, rows: Rows, start: Int) -> list[tuple[Source, ImuSamples]]:
-    """Return the samples of each instance in the records (k,) of one message, which begin at `start` (k,)."""
+def _samples(
+    source: Source, rows: Rows, start: Int, of_rate: Array, of_acceleration: Array
+) -> list[tuple[Source, ImuSamples]]:
+    """Return the samples of each instance in the records (k,) of one message, which begin at `start` (k,).
+
+    ``of_rate``, ``of_acceleration`` (3,): what the values are multiplied by.
+    """
     columns = rows.dtype.names or ()
     rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
         acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else acceleration * np.nan
-    samples = imu_samples(_stamp(rows), rate * FLU, acceleration * FLU, start + rows.itemsize)
+    samples = imu_samples(
+        _stamp(rows), rate * of_rate * FLU, acceleration * of_acceleration * FLU, start + rows.itemsize
+    )
     if "I" not in columns:
         return [(source, samples)]
     return [(Source(source.kind, k), samples[rows["I"] == k]) for k in np.unique(rows["I"]).tolist()]

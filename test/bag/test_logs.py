@@ -158,6 +158,32 @@ def test_pymavlink_reads_the_same(tmp_path, kind):
         assert np.abs(theirs[name][:, 0] - stamp * 1e-9).max() < 2e-6
 
 
+@pytest.mark.parametrize(
+    ("units_of", "multipliers", "factor"),
+    [(b"s#EEEooo", b"F-000000", 1.0), (b"s#kkkooo", b"F-000000", np.pi / 180), (b"s#EEEooo", b"F-CCC000", 1e-3)],
+)
+def test_units_and_multipliers_are_those_that_the_log_says(tmp_path, units_of, multipliers, factor):
+    tables = {"UNIT": (67, "QbZ", "TimeUS,Id,Label"), "MULT": (68, "Qbd", "TimeUS,Id,Mult")}
+    tables["FMTU"] = (69, "QBNN", "TimeUS,FmtType,UnitIds,MultIds")
+    extra = b"".join(format_record(number, name, *form) for name, (number, *form) in tables.items())
+    for letter, label in (("E", b"rad/s"), ("k", b"deg/s"), ("o", b"m/s/s"), ("s", b"s")):
+        extra += HEAD + struct.pack("<BQb64s", 67, 1, ord(letter), label)
+    for letter, value in (("-", 0.0), ("0", 1.0), ("F", 1e-6), ("C", 1e-3)):
+        extra += HEAD + struct.pack("<BQbd", 68, 1, ord(letter), value)
+    extra += HEAD + struct.pack("<BQB16s16s", 69, 1, logs.MESSAGES["IMU"][0], units_of, multipliers)
+    made = units(seconds=8.0)
+    found, _ = messages(log(tmp_path, "IMU", made, extra=extra))
+    np.testing.assert_allclose(found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_number_of_a_unit_or_an_error_that_is_none_is_no_defect(tmp_path, number):
+    extra = format_record(67, "UNIT", "fZ", "Id,Label") + HEAD + struct.pack("<Bf64s", 67, number, b"deg/s")
+    extra += format_record(90, "ERR", "Qff", "TimeUS,Subsys,ECode") + HEAD + struct.pack("<BQff", 90, 1, number, 1.0)
+    found, damage = messages(log(tmp_path, "IMU", units(seconds=8.0), extra=extra))
+    assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
+
+
 def test_what_was_appended_is_read_from_its_offset(tmp_path):
     """As after a crash: the message before it is cut off. pyulog confirms how many samples there are."""
     pyulog = pytest.importorskip("pyulog", reason="the extra 'test' brings pyulog")
