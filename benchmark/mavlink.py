@@ -221,7 +221,8 @@ def cpu(seconds: float) -> None:
 def failover(trials: int) -> None:
     """Strike any axis of any of three IMUs; measure until the autopilot has the PARAM_SET, both nodes and link live."""
     from mavlink.autopilots import PARAMETERS, Autopilot, OverUdp, free_port
-    from ros.harness import listening, wait
+    from ros.harness import listening
+    from ros.processes import wait
 
     random = np.random.default_rng(0)
     print(f"onset to PARAM_SET, s, of {trials} biases each; load of the machine {os.getloadavg()[0]:.1f}")
@@ -266,7 +267,6 @@ def storms(minutes: float, seconds: float, seed: int) -> None:
         while time.monotonic() < end:
             kind = KINDS[seed % len(KINDS)]
             over.listener.clear()
-            over.reports.clear()
             time.sleep(2.5)
             cost = weather(over, kind, seconds, seed) | {"load of the machine": os.getloadavg()[0]}
             print(f"{seed:4} {kind:10}", "  ".join(f"{name} {value:.4g}" for name, value in cost.items()), flush=True)

@@ -13,8 +13,6 @@ ArduPilot's parameters outlive a restart, come as float, are said to all wheneve
 value when that is refused; it flies with the first IMU that is in use.
 """
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import math
@@ -59,14 +57,7 @@ def milli(value: float) -> int:
     return int(np.clip(value * 1000.0, -32768, 32767))
 
 
-MESSAGES = {
-    26: ("scaled_imu", 0),
-    27: ("raw_imu", 0),
-    105: ("highres_imu", 0),
-    116: ("scaled_imu2", 1),
-    129: ("scaled_imu3", 2),
-}
-"""Name and unit by the number of the message."""
+MESSAGES = {26: "scaled_imu", 27: "raw_imu", 105: "highres_imu", 116: "scaled_imu2", 129: "scaled_imu3"}
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 
 
@@ -168,8 +159,7 @@ class Autopilot:
     def _imu(self, number: int, now: int, out: list[bytes]) -> None:
         if number not in MESSAGES or (number == 27 and self.stack == "px4"):
             return
-        name, unit = MESSAGES[number]
-        encode = getattr(self.mav, f"{name}_encode")
+        encode, unit = getattr(self.mav, f"{MESSAGES[number]}_encode"), {116: 1, 129: 2}.get(number, 0)
         if unit >= self.units:
             if unit < self.compasses:
                 self._send(encode(self.clock(now) // 1000, *(0,) * 6, 200, -30, 410), out)
@@ -219,7 +209,7 @@ class Autopilot:
         if message.target_system != self.system:
             return
         number, interval = int(message.param1), int(message.param2)
-        known = {26, 105, 116, 129} if self.stack == "px4" else {26, 27, 105, 116, 129}
+        known = MESSAGES.keys() - ({27} if self.stack == "px4" else set())
         if message.command != 511 or number not in known or number in self.refuses:
             self._send(self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_FAILED), out)
             return
@@ -231,10 +221,14 @@ class Autopilot:
 
 
 class Driver:
-    """Runs autopilots on a real link, in a thread of its own; end: file descriptor of the link."""
+    """Runs autopilots on a real link, in a thread of its own, from its time on; end: file descriptor of the link."""
 
     def __init__(self, end: int, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
         self.ends, self.autopilots, self.garbage = [end], autopilots, garbage
+        for autopilot in autopilots:
+            # It may have been on another link before.
+            if autopilot.boot < 0:
+                autopilot.boot = autopilot.start = time.monotonic_ns() + autopilot.boot
         self.silent = False  # the link is cut
         os.set_blocking(end, False)
         self._done = threading.Event()
@@ -365,7 +359,7 @@ class Conversation:
         """Bytes from anybody reach us now."""
         self.samples += [(self.now, sample) for sample in self.vehicle.feed(peer, data, self.now)]
 
-    def run(self, seconds: float) -> Conversation:
+    def run(self, seconds: float) -> "Conversation":
         end = self.now + round(seconds * NS)
         while self.now < end:
             self.now += 1_000_000

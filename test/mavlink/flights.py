@@ -8,8 +8,6 @@ same parameters; link, monitor, autopilot and companion fall silent or start ane
 nothing healthy and nothing last is taken out, and after the landing that all of ours is back.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Callable

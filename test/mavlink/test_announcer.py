@@ -3,8 +3,6 @@
 
 """What the ground station is told: declarations, soon, in few words, and never more than a link bears."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -3,8 +3,6 @@
 
 """Failover: never a healthy IMU, never the last, always put back; and the conversation by which that is done."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path
@@ -32,8 +30,6 @@ MS = 1_000_000
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = range(6)
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 
-
-# The policy --------------------------------------------------------------------------------------------------------
 
 HEALTHY = FailoverUnit(use=True, heard=1, ok=True, well=1, delivers=True)
 FAULT = HEALTHY._replace(declared=10 * NS, ok=False, well=None)
@@ -117,9 +113,6 @@ def test_nothing_healthy_nothing_last_and_all_back_whatever_happens(seeds: range
     assert min(done[kind] for kind in ("out", "back", "changed", "stays")) > 5
 
 
-# The conversation ----------------------------------------------------------------------------------------------------
-
-
 class Monitored(Conversation):
     """A conversation with failover and a monitor that says what it is told to, at 50 Hz."""
 
@@ -129,7 +122,7 @@ class Monitored(Conversation):
         self.states = [OK] * 9
         self.failover.is_alone = self.reports = True
 
-    def run(self, seconds: float) -> Monitored:
+    def run(self, seconds: float) -> "Monitored":
         for _ in range(round(seconds * 50)):
             super().run(0.02)
             self.failover.reported = self.now if self.reports else self.failover.reported
@@ -137,7 +130,7 @@ class Monitored(Conversation):
             self.failover.turn(self.now)
         return self
 
-    def declare(self, channel: str, seconds: float = 0.0, state: int = FAULTY) -> Monitored:
+    def declare(self, channel: str, seconds: float = 0.0, state: int = FAULTY) -> "Monitored":
         """Have a channel declared, and let so many seconds go by."""
         self.states[CHANNELS.index(channel)] = state
         return self.run(seconds)

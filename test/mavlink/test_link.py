@@ -3,8 +3,6 @@
 
 """Links on real sockets and a real terminal: never waiting, opened again, and no more waits to be sent than is said."""
 
-from __future__ import annotations
-
 import os
 import pty
 import socket

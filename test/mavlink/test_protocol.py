@@ -3,8 +3,6 @@
 
 """Messages of IMUs are as pymavlink lays them out; the offset of a clock is true within the error that is stated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -13,18 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.protocol import (
-    ARDUPILOT,
-    MESSAGES,
-    MS,
-    NS,
-    PX4,
-    BootClock,
-    TimeSync,
-    read,
-    system_ahead,
-    understood,
-)
+from fdi_ros.mavlink.protocol import MESSAGES, MS, NS, BootClock, TimeSync, read, system_ahead, understood
 
 OVER = (1 << 32) * MS
 SHORT = st.integers(-32768, 32767)
@@ -67,9 +54,9 @@ def test_a_gyro_that_is_not_new_is_no_sample(updated: int) -> None:
 
 
 def test_raw_counts_have_no_unit_but_from_ardupilot() -> None:
-    assert understood("RAW_IMU", ARDUPILOT)
-    assert not understood("RAW_IMU", PX4)
-    assert understood("SCALED_IMU", PX4)
+    assert understood("RAW_IMU", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA)
+    assert not understood("RAW_IMU", mavlink.MAV_AUTOPILOT_PX4)
+    assert understood("SCALED_IMU", mavlink.MAV_AUTOPILOT_PX4)
 
 
 BEGIN = 10**16
@@ -127,7 +114,7 @@ def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answ
         assert not taken or off <= 30 * MS + abs(1 - pace) * NS // 2
 
 
-@given(wrong=st.integers(-(10**12), 10**12), trip=st.integers(0, MS), count=st.integers(1, 2))
+@given(st.integers(-(10**12), 10**12), st.integers(0, MS), st.integers(1, 2))
 def test_one_or_two_wrong_answers_change_nothing(wrong: int, trip: int, count: int) -> None:
     """However short the way that they seem to have taken; three in a row are believed."""
     sync, now = TimeSync(), BEGIN

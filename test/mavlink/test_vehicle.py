@@ -3,8 +3,6 @@
 
 """The conversation with simulated autopilots: what comes out, what is asked for, and what is refused."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable
@@ -26,8 +24,9 @@ MS = 1_000_000
 KEY = bytes(range(32))
 
 
-def check_flight(talk: Conversation, autopilot: Autopilot, rate: float = 50.0, since: float = 3.0) -> None:
+def check_flight(talk: Conversation, rate: float = 50.0, since: float = 3.0, number: int = 0) -> None:
     """All units at their rate; every sample is the motion's at its stamp, within resolution and error of the clock."""
+    autopilot = talk.autopilots[number]
     for unit in range(autopilot.units):
         samples = talk.of_unit(unit, since)
         assert len(samples) == pytest.approx(since * rate, rel=0.1, abs=2)
@@ -51,7 +50,7 @@ def test_every_unit_comes_at_the_rate_asked_for(stack: str, kind: str) -> None:
     assert set(autopilot.intervals) == {26, 116, 129}
     tried = set() if kind else {105, 27} if stack == "ardupilot" else {105}
     assert {number for _, number, _ in autopilot.commands} == {26, 116, 129} | tried
-    check_flight(talk, autopilot, 100.0)
+    check_flight(talk, 100.0)
     assert talk.vehicle.sync.error(talk.now) <= 3.2 * MS
     # Requests alone, as is checked of each: an answer to PX4's own would make it follow our clock.
     assert talk.sent["TIMESYNC"] > 5
@@ -76,18 +75,18 @@ def test_one_imu_is_never_its_own_witness_and_a_compass_is_none(autopilot: Calla
     assert talk.vehicle.magnetometers == ({2} if kind else set())
 
 
-def reboot(talk: Conversation, autopilot: Autopilot) -> None:
-    autopilot.reboot(talk.now)
+def reboot(talk: Conversation) -> None:
+    talk.autopilots[0].reboot(talk.now)
     talk.run(25.0)
 
 
-def step(talk: Conversation, autopilot: Autopilot, seconds: float) -> None:
+def step(talk: Conversation, seconds: float) -> None:
     """The motion goes on; only the clock is another."""
-    autopilot.boot -= round(seconds * NS)
+    talk.autopilots[0].boot -= round(seconds * NS)
     talk.run(8.0)
 
 
-def cut(talk: Conversation, autopilot: Autopilot) -> None:
+def cut(talk: Conversation) -> None:
     talk.cut, before = True, len(talk.samples)
     talk.run(20.0)
     assert not talk.vehicle.in_reach
@@ -98,8 +97,9 @@ def cut(talk: Conversation, autopilot: Autopilot) -> None:
     assert [word for word in words if word.startswith(("nothing of ", "again"))] == words[-2:]
 
 
-def lower(talk: Conversation, autopilot: Autopilot) -> None:
+def lower(talk: Conversation) -> None:
     """Somebody else lowers the rate: it is asked for again."""
+    autopilot = talk.autopilots[0]
     autopilot.intervals = dict.fromkeys(autopilot.intervals, 500_000)
     talk.run(16.0)
 
@@ -110,12 +110,11 @@ def lower(talk: Conversation, autopilot: Autopilot) -> None:
     [(reboot, {0, 1}), *((partial(step, seconds=by), {1}) for by in (-3000.0, -5.0, 20.0)), (cut, {0}), (lower, {0})],
 )
 def test_after_whatever_happens_all_units_come_as_before(stack: str, trouble: Callable, restarts: set[int]) -> None:
-    autopilot = Autopilot(stack, boot=-4000 * NS)
-    talk = Conversation(autopilot).run(5.0)
-    trouble(talk, autopilot)
+    talk = Conversation(Autopilot(stack, boot=-4000 * NS)).run(5.0)
+    trouble(talk)
     assert talk.vehicle.clock.restarts in restarts
     assert ("stepped" in " ".join(talk.vehicle.events)) == bool(talk.vehicle.clock.restarts)
-    check_flight(talk, autopilot)
+    check_flight(talk)
 
 
 def jitter(now: int) -> int:
@@ -142,7 +141,7 @@ def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(latency: Cal
 def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
     one, other = Autopilot("px4", system=3), Autopilot("ardupilot", system=7, rates={26: 50, 116: 50, 129: 50}, seed=9)
     talk = Conversation(one, other, system=3).run(6.0)
-    check_flight(talk, one)
+    check_flight(talk)
     assert [*talk.vehicle.others] == [7]
     assert other.intervals == {26: 20000, 116: 20000, 129: 20000}
     # The one in use is not changed for the other, even when it falls silent.
@@ -161,22 +160,22 @@ def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> N
     talk.inject(beat)
     other.step, steps = lambda now: [], other.step
     talk.run(9.0)
-    check_flight(talk, one, since=2.0)
+    check_flight(talk, since=2.0)
     for _ in range(20):
         talk.inject(beat)
         talk.run(0.2)
-    check_flight(talk, one)
+    check_flight(talk)
     one.step, other.step = other.step, steps
     one.take = lambda data, now: []
     talk.run(17.0)
     assert (talk.vehicle.system, talk.vehicle.kind) == (7, "SCALED_IMU")
-    check_flight(talk, other)
+    check_flight(talk, number=1)
 
 
 def test_the_same_system_from_another_address_is_left_aside() -> None:
     one, other = Autopilot("px4"), Autopilot("px4", seed=5, rates={26: 50, 116: 50, 129: 50})
     talk = Conversation(one, other, peers=(("a", 1), ("b", 2))).run(6.0)
-    check_flight(talk, one)
+    check_flight(talk)
     assert talk.vehicle.counts["from elsewhere"] > 500
     assert not other.commands
 
@@ -194,7 +193,7 @@ def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> 
     assert talk.sent["COMMAND_LONG"] <= 20
     assert not talk.vehicle.sync.synchronised
     # It is used all the same, at the rate it gives.
-    check_flight(talk, deaf, 10.0)
+    check_flight(talk, 10.0)
 
 
 def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> None:
@@ -202,14 +201,11 @@ def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> Non
     for kind in ("", "SCALED_IMU"):
         deaf = Autopilot("ardupilot", rates={27: 20, 116: 20, 129: 20})
         deaf.take = lambda data, now: []
-        check_flight(Conversation(deaf, kind=kind).run(12.0), deaf, 20.0)
+        check_flight(Conversation(deaf, kind=kind).run(12.0), 20.0)
     refusing = Autopilot("ardupilot", refuses={26})
     talk = Conversation(refusing).run(12.0)
     assert refusing.intervals.keys() == {27, 116, 129}
-    check_flight(talk, refusing)
-
-
-# Signing ---------------------------------------------------------------------------------------------------------
+    check_flight(talk)
 
 
 HEX = KEY.hex().encode()
@@ -235,7 +231,7 @@ def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach_and_is_never_shown(
 def test_with_a_key_only_what_is_signed_with_it_counts() -> None:
     autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
     talk = Conversation(autopilot, key=KEY).run(6.0)
-    check_flight(talk, autopilot)
+    check_flight(talk)
     # It takes signed commands alone, and ours were taken.
     assert autopilot.inbound.signing.goodsig_count > 10
     assert not autopilot.inbound.signing.badsig_count
@@ -262,7 +258,7 @@ def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
     assert talk.vehicle.counts["unsigned"] == 256 + 2
     assert len(talk.vehicle._verifier._latest) == 1
     talk.run(4.0)
-    check_flight(talk, autopilot)
+    check_flight(talk)
 
 
 def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
@@ -279,12 +275,11 @@ def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
     assert autopilot.inbound.signing.goodsig_count > 1
     autopilot.mav.signing.timestamp = autopilot.inbound.signing.timestamp
     talk.run(6.0)
-    check_flight(talk, autopilot)
+    check_flight(talk)
 
 
 def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
-    autopilot = Autopilot("px4")
-    talk = Conversation(autopilot).run(3.0)
+    talk = Conversation(Autopilot("px4")).run(3.0)
     talk.cut = True
     unknown = struct.pack("<BBBBBBBHB", 0xFD, 4, 0, 0, 7, 1, 1, 0x1234, 0x56) + bytes(6)
     for _ in range(50):
@@ -294,29 +289,24 @@ def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
     assert not talk.vehicle.in_reach
 
 
-# Anything --------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=12)
 @given(pieces=st.lists(st.binary(max_size=300), max_size=30), seed=st.integers(0, 999))
 @example(pieces=600 * [b"\xfd\xff\x00"], seed=0)
 @example(pieces=600 * [struct.pack("<BBB", 0xFD, 9, 1)], seed=1)
 def test_garbage_between_messages_does_no_harm_and_what_is_left_of_it_does_not_grow(pieces, seed) -> None:
-    autopilot = Autopilot("ardupilot", seed=seed)
-    talk = Conversation(autopilot).run(3.0)
+    talk = Conversation(Autopilot("ardupilot", seed=seed)).run(3.0)
     for piece in pieces:
         talk.inject(piece)
         talk.run(0.01)
     assert all(len(parser.buf) < 8192 for parser in talk.vehicle._parsers.values())
     talk.run(4.0)
-    check_flight(talk, autopilot)
+    check_flight(talk)
 
 
 def test_addresses_of_strangers_take_no_memory() -> None:
-    autopilot = Autopilot("px4")
-    talk = Conversation(autopilot, peers=(("a", 1),)).run(4.0)
+    talk = Conversation(Autopilot("px4"), peers=(("a", 1),)).run(4.0)
     for k in range(5000):
         talk.inject(b"\xfd\xff\x00", ("stranger", k))
     assert len(talk.vehicle._parsers) <= 9
     talk.run(3.0)
-    check_flight(talk, autopilot)
+    check_flight(talk)

@@ -3,8 +3,6 @@
 
 """What the operator is told: never more than is known, in words and figures that can be acted on."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace
@@ -173,8 +171,6 @@ def test_a_wrong_sample_rate_is_told_once_it_is_measured():
         right.check(100 * k, 10**9 * (k + 1))
     assert not right.words
 
-
-# In flight: units as a whole, biases that wander, noise, and what outlives a restart of it ----------------------------
 
 CONFIG = Path(__file__).parents[2] / "config/two_imus.yaml"
 NOISE = 0.003
@@ -420,9 +416,6 @@ def test_copies_are_found_where_messages_are_lost_and_no_others(change, size: fl
     change(block.z)
     pipeline.process(block)
     assert pipeline.status().copies == ((("imu_1 (/imu_1)", "imu_3 (/imu_3)"),) if change is lossy else ())
-
-
-# As a message ---------------------------------------------------------------------------------------------------------
 
 
 TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9)

@@ -12,8 +12,7 @@ from monitor.streams import START, config, parallel, run, stream
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.monitor import output
-from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState, Encoder, SampleOutput, Topic
+from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.sources import ChannelsSource, ImuSource
@@ -53,28 +52,6 @@ def messages(block, units):
     for stamp, row in zip(block.stamp.tolist(), block.z.reshape(len(block), units, 3).tolist(), strict=True):
         for unit in range(units):
             yield unit, template.fill(stamp + unit * 500_000, row[unit], (0.0,) * 9)
-
-
-def test_a_row_of_the_outputs_is_published_live_and_written_to_a_bag(monkeypatch):
-    def fill(out, row, n, shift):
-        out.fill([row["statistic"], int(row["stamp"]) - shift])
-
-    topic = Topic("~/more", "std_msgs/msg/Float64MultiArray")
-    ratio = SampleOutput(topic, lambda frame_id, n: ChannelsTemplate(2), fill)
-    monkeypatch.setattr(output, "OUTPUTS", (*output.OUTPUTS, ratio))
-    pipeline = Pipeline(parallel(2))
-    block, ear, live = stream(pipeline.geometry, 40), Ear(pipeline), []
-    for unit, data in messages(block, 2):
-        samples = len(ear.integrity)
-        ear.take(unit, data)
-        if len(ear.integrity) > samples:
-            live.append(ear.receiver.message(ratio))
-    results = Pipeline(parallel(2)).process(block)
-    written = [data for topic, _, data in Encoder("body", 6).encode(results) if topic is ratio.topic]
-    assert len(live) >= 38
-    stamps = [float(stamp) for stamp in block.stamp]
-    assert [ChannelsSource.parse(data, 2)[1][1] for data in written] == stamps
-    assert {ChannelsSource.parse(data, 2)[1][1] for data in live} <= set(stamps)
 
 
 @pytest.mark.parametrize("units", [2, 3, 4])

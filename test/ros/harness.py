@@ -1,24 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The real node in its own process on real DDS, and what is needed to talk to it."""
-
-from __future__ import annotations
+"""What talks to a real monitor on real DDS."""
 
 import contextlib
 import os
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -28,6 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros.processes import PATIENCE, ROOT, Process, parameter_file, running, wait
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -37,7 +31,6 @@ from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.sources import ChannelsSource, ImuSource
 
-ROOT = Path(__file__).parents[2]
 RATE = 250.0
 SIGMA = 0.0025
 TWO_IMUS = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced(
@@ -56,25 +49,6 @@ TWO_IMUS = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced(
 )
 GEOMETRY = Geometry.from_triads(np.array(TWO_IMUS.imus.mounts).reshape(-1, 3, 3))
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-PATIENCE = 60.0
-"""How long something that must come is waited for, s: a machine that is busy with other things makes no test fail."""
-
-
-def wait(until: Callable[[], object], seconds: float = PATIENCE) -> bool:
-    """Wait for something; whether it came."""
-    end = time.monotonic() + seconds
-    while not until():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
-
-
-def rest(count: Callable[[], int]) -> None:
-    """Wait until nothing more comes."""
-    before = -1
-    while before != (before := count()):
-        time.sleep(0.3)
 
 
 def healthy(count: int, seed=0, size=0.5, rate=RATE, start=0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -83,92 +57,39 @@ def healthy(count: int, seed=0, size=0.5, rate=RATE, start=0.0) -> tuple[np.ndar
     return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
 
 
-def parameter_file(config: Config, folder: Path, **more: object) -> Path:
-    """Write all settings as a ROS 2 parameter file."""
-    flat = {name: list(value) if isinstance(value, tuple) else value for name, value in config.parameters().items()}
-    flat = {name: value for name, value in flat.items() if value != []}
-    path = folder / "parameters.yaml"
-    path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {**flat, **more}}}))
-    return path
+def struck(count: int, start: int, **options: float) -> tuple[np.ndarray, np.ndarray]:
+    """As `healthy`, with a bias of 0.3 rad/s on channel 4, imu_2.y or g5, from a sample on."""
+    omega, z = healthy(count, **options)
+    z[start:, 4] += 0.3
+    return omega, z
 
 
-class Process:
-    """A node of ours in a process of its own; in names of parameters two underscores stand for a dot."""
-
-    def __init__(self, name: str, file: Path, *remaps: str, **parameters: object) -> None:
-        self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1])
-        words = ["-m", "fdi_ros.ros.process", name, "--ros-args", "--params-file", str(file)]
-        words += [word for remap in remaps for word in ("-r", remap)]
-        for key, value in parameters.items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            words += ["-p", f"{key.replace('__', '.')}:={text}"]
-        with self.output.open("w") as output:
-            self.popen = subprocess.Popen([sys.executable, *words], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
-
-    def said(self) -> str:
-        return self.output.read_text()
-
-    def end(self, number: int = signal.SIGINT) -> int:
-        """Send a signal and return the exit code."""
-        if self.popen.poll() is None:
-            self.popen.send_signal(number)
-        try:
-            return self.popen.wait(PATIENCE)
-        finally:
-            self.popen.kill()
-
-    def memory(self) -> float:
-        """Resident memory, MB."""
-        pages = int(Path(f"/proc/{self.popen.pid}/statm").read_text().split()[1])
-        return pages * 4096 / 1e6
-
-
-@contextlib.contextmanager
-def running(name: str, file: Path, *remaps: str, **parameters: object) -> Iterator[Process]:
-    """A node of ours that must end well when it is asked to."""
-    process = Process(name, file, *remaps, **parameters)
-    try:
-        yield process
-    finally:
-        code = process.end()
-    assert code == 0, process.said()
-    assert "Traceback" not in process.said()
-
-
-def assert_refused(name: str, starts: dict[str, str], *first: str) -> None:
-    """Each of some starts of a node, all in one process, is refused in one line with some words in it."""
-    code = f"""
-import sys
-from fdi_ros.ros.process import run
-for arguments in {[[*first, *words.split()] for words in starts]!r}:
-    print("=====", run({name!r}, arguments), file=sys.stderr)
-"""
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    # rcl itself has a line to say of a file that it cannot read.
-    said = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
-    assert said[1::2] == ["===== 2"] * len(starts), done.stderr
-    for line, words in zip(said[::2], starts.values(), strict=True):
-        assert line.startswith(f"{name}: ")
-        assert words in line
+def stamps_of(messages: list[bytes]) -> list[int]:
+    """Stamps of Imu messages, ns."""
+    return [ImuSource.parse(data, 3)[0] for data in list(messages)]
 
 
 class Listener(Node):
     """Publishes the inputs of a monitor and keeps all it says."""
 
+    speaker = "fdi_node"
+    """Whose statuses are meant where none is named."""
+
     def __init__(self, topics, kind) -> None:
         super().__init__("listener")
         self.outputs = [self.create_publisher(kind, topic, DEEP) for topic in topics]
-        self.fused: list[bytes] = []
-        self.integrity: list[bytes] = []
+        self.fused, self.integrity = self.hear("fused"), self.hear("fdi_node/integrity", Float64MultiArray)
         self.diagnostics: list[tuple[float, DiagnosticArray]] = []
-        self.create_subscription(Imu, "fused", self.fused.append, DEEP, raw=True)
-        self.create_subscription(Float64MultiArray, "fdi_node/integrity", self.integrity.append, DEEP, raw=True)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda message: self.diagnostics.append((time.monotonic(), message)), 100
+        )
         self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        if any(status.name == "fdi_node: monitor" for status in message.status):
-            self.diagnostics.append((time.monotonic(), message))
+    def hear(self, topic: str, kind: type = Imu) -> list[bytes]:
+        """Messages that come on a topic from now on."""
+        heard: list[bytes] = []
+        self.create_subscription(kind, topic, heard.append, DEEP, raw=True)
+        return heard
 
     def clear(self) -> None:
         for kept in (self.fused, self.integrity, self.diagnostics):
@@ -197,7 +118,7 @@ class Listener(Node):
             # One motion through all pauses, as of a vehicle: a delay is learned from it.
             last = self.play(healthy(25, int(1e3 * now), start=now)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
-            wait(lambda last=last: self.fused and ImuSource.parse(self.fused[-1], 3)[0] == last, 1.0)
+            wait(lambda last=last: self.stamps()[-1:] == [last], 1.0)
             if self.integrity and not self.states()[-1].any():
                 return True
         print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
@@ -217,9 +138,13 @@ class Listener(Node):
             self.send_channels([0.0] * 6)
             time.sleep(1 / RATE)
 
-    def rates(self) -> dict[int, tuple[float, float, float]]:
-        """Fused rates by stamp."""
-        return dict(ImuSource.parse(data, 3) for data in list(self.fused))
+    def stamps(self) -> list[int]:
+        """Stamps of the fused rates, ns."""
+        return stamps_of(self.fused)
+
+    def rates(self) -> np.ndarray:
+        """Fused rates, (N, 3) rad/s."""
+        return np.array([ImuSource.parse(data, 3)[1] for data in list(self.fused)])
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
@@ -240,8 +165,8 @@ class Listener(Node):
         return [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in list(self.diagnostics)]
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
-        # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
-        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
+        names = (name, f"{self.speaker}: {name}")
+        return [status for _, array in list(self.diagnostics) for status in array.status if status.name in names]
 
     def says(self, name: str, words: str) -> str:
         """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
@@ -297,21 +222,13 @@ def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
     listener = make(topics, kind)
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
-
-    done = threading.Event()
-
-    def spin() -> None:
-        while not done.is_set():
-            executor.spin_once(timeout_sec=0.05)
-
-    thread = threading.Thread(target=spin, daemon=True)
+    thread = threading.Thread(target=executor.spin, daemon=True)
     thread.start()
     try:
         yield listener
     finally:
-        done.set()
+        executor.shutdown()
         thread.join()
-        executor.remove_node(listener)
         listener.destroy_node()
 
 

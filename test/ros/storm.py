@@ -6,8 +6,6 @@
 `python benchmark/mavlink.py storms` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import random
@@ -19,14 +17,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions
-from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
+from mavlink.autopilots import Autopilot, OverUdp, free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring, running, wait
+from rclpy.parameter import Parameter as Given
+from ros.harness import DEEP, TRANSITIONS, Listener, monitoring
+from ros.processes import ROOT, Process, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -44,57 +43,22 @@ NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_value
 WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)
 WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
-
-
+FITTING = [
+    *(Given("detector.false_alarms_per_hour", value=value) for value in (0.01, 0.1, 1.0)),
+    *(Given("detector.name", value=value) for value in ("sequential", "likelihood_ratio", "cusum")),
+    *(Given("publish_under_doubt", value=value) for value in (False, True)),
+    *(Given("excluded_channels", Given.Type.STRING_ARRAY, value) for value in ([], ["imu_1.z"])),
+]
 PACKETS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
-BURST, FLOOD = 20, 2000  # packets sent at once
 NUMBERS = sorted(number for number in dialect.mavlink_map if number >= 0)
-
-
-class Attacker:
-    """Sends hostile packets, in kinds, to a MAVLink port of this machine; seed: of all choices."""
-
-    def __init__(self, port: int, seed: int = 0) -> None:
-        self._port, self._draw = port, np.random.default_rng(seed)
-        self._own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._codec = dialect.MAVLink(None)
-
-    def burst(self, kind: str) -> int:
-        """Send some packets of a kind; how many."""
-        if kind == "strangers":
-            # Each from a port of its own.
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-                return self._send(stranger, [self._packet(kind)])
-        made = [self._packet(kind) for _ in range(BURST if kind != "flood" else FLOOD // 10)]
-        return self._send(self._own, made if kind != "flood" else 10 * made)
-
-    def close(self) -> None:
-        self._own.close()
-
-    def _send(self, source: socket.socket, packets: list[bytes]) -> int:
-        for packet in packets:
-            with contextlib.suppress(OSError):
-                source.sendto(packet, ("127.0.0.1", self._port))
-        return len(packets)
-
-    def _packet(self, kind: str) -> bytes:
-        """Make any message of the dialect, with any payload, of a system; or what is none."""
-        draw, codec = self._draw, self._codec
-        if kind == "garbage":
-            return draw.bytes(int(draw.integers(1, 400)))
-        message = dialect.mavlink_map[int(draw.choice(NUMBERS))]
-        payload = draw.bytes(message.unpacker.size) if draw.random() < 0.7 else bytes(message.unpacker.size)
-        codec.srcSystem = 1 if kind in ("any message in its name", "strangers") else int(draw.integers(2, 256))
-        codec.srcComponent, codec.seq = int(draw.choice([1, 1, 1, draw.integers(256)])), int(draw.integers(256))
-        data = bytes(dialect.MAVLink_message(message.id, message.msgname)._pack(codec, message.crc_extra, payload))
-        return data[: int(draw.integers(1, len(data)))] if kind == "cut messages" else data
 
 
 class Storm:
     """Sends what one kind of storm is made of, by a listener that spins; port: of the link to the autopilot."""
 
     def __init__(self, listener: Listener, port: int, seed: int) -> None:
-        self.listener, self.draw, self.attacker = listener, random.Random(seed), Attacker(port, seed)
+        self.listener, self.draw, self.port = listener, random.Random(seed), port
+        self.socket, self.codec = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), dialect.MAVLink(None)
         self.sent = self.answered = 0
         self._clients: dict[str, Any] = {}
         self._waiting: list[Any] = []
@@ -110,7 +74,7 @@ class Storm:
             self.listener.change({"unconfigured": 1, "inactive": 3}[now])
         for client in self._clients.values():
             self.listener.destroy_client(client)
-        self.attacker.close()
+        self.socket.close()
 
     def ask(self, kind: type, service: str, request: Any, node: str = NODES[0]) -> None:
         """Send a request as soon as not too many wait."""
@@ -127,8 +91,6 @@ class Storm:
         self.answered += len(self._waiting) - len(left)
         self._waiting = left
         return len(left)
-
-    # What storms are made of ------------------------------------------------------------------------------------------
 
     def value(self) -> ParameterValue:
         choice = self.draw.choice
@@ -147,16 +109,7 @@ class Storm:
     def parameter(self) -> Parameter:
         draw = self.draw
         if draw.random() < 0.2:
-            # One that fits.
-            name, kind, value = draw.choice(
-                (
-                    ("detector.false_alarms_per_hour", 3, {"double_value": draw.choice((0.01, 0.1, 1.0))}),
-                    ("detector.name", 4, {"string_value": draw.choice(("sequential", "likelihood_ratio", "cusum"))}),
-                    ("publish_under_doubt", 1, {"bool_value": draw.random() < 0.5}),
-                    ("excluded_channels", 9, {"string_array_value": draw.choice(([], ["imu_1.z"]))}),
-                )
-            )
-            return Parameter(name=name, value=ParameterValue(type=kind, **value))
+            return draw.choice(FITTING).to_parameter_msg()
         odd = (*WORDS, "detector.nmae", "b" * 100_000)
         return Parameter(name=draw.choice(NAMES if draw.random() < 0.7 else odd), value=self.value())
 
@@ -173,8 +126,7 @@ class Storm:
                 (ListParameters, ListParameters.Request(prefixes=names[:3], depth=choice((0, 1, 2**63)))),
             )
         )
-        service = re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower()
-        self.ask(kind, service, request, choice(NODES))
+        self.ask(kind, re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower(), request, choice(NODES))
 
     def send_services(self) -> None:
         self.ask(Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request())
@@ -188,10 +140,8 @@ class Storm:
 
     def send_links(self) -> None:
         """Publishers that come, say what is true, false, damaged or nothing, and go."""
-        draw = self.draw
-        topic = draw.choice(CONFIG.topics)
-        output = self.listener.create_publisher(Imu, topic, DEEP)
-        template = ImuTemplate("imu")
+        draw, template = self.draw, ImuTemplate("imu")
+        output = self.listener.create_publisher(Imu, draw.choice(CONFIG.topics), DEEP)
         kind = draw.choice(("true", "true", "noise", "damaged", "late", "flood"))
         for _ in range(draw.choice((0, 3, 100)) if kind != "flood" else 5000):
             stamp = time.time_ns() - (draw.choice((10**9, 10**12, -(10**15))) if kind == "late" else 0)
@@ -205,12 +155,31 @@ class Storm:
         self.listener.destroy_publisher(output)
 
     def send_mavlink(self) -> None:
-        """Packets of all kinds to the link."""
+        """Packets of a kind to the link; each stranger has an address of its own."""
         kind = self.draw.choice(PACKETS)
         for _ in range(self.draw.choice((1, 50)) if kind != "flood" else 1):
-            self.sent += self.attacker.burst(kind)
+            made = [self.packet(kind) for _ in range({"strangers": 1, "flood": 200}.get(kind, 20))]
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+                source = stranger if kind == "strangers" else self.socket
+                for packet in made * (10 if kind == "flood" else 1):
+                    with contextlib.suppress(OSError):
+                        source.sendto(packet, ("127.0.0.1", self.port))
+                    self.sent += 1
             time.sleep(0.02)
         self.answered = self.sent
+
+    def packet(self, kind: str) -> bytes:
+        """Any message of the dialect, with any payload, of any system, perhaps cut; or what is none."""
+        draw, codec = self.draw, self.codec
+        if kind == "garbage":
+            return draw.randbytes(draw.randrange(1, 400))
+        message = dialect.mavlink_map[draw.choice(NUMBERS)]
+        size = message.unpacker.size
+        payload = draw.randbytes(size) if draw.random() < 0.7 else bytes(size)
+        codec.srcSystem = 1 if kind in ("any message in its name", "strangers") else draw.randrange(2, 256)
+        codec.srcComponent, codec.seq = draw.choice((1, 1, 1, draw.randrange(256))), draw.randrange(256)
+        data = bytes(dialect.MAVLink_message(message.id, message.msgname)._pack(codec, message.crc_extra, payload))
+        return data[: draw.randrange(1, len(data))] if kind == "cut messages" else data
 
 
 class Vehicle(NamedTuple):
@@ -220,40 +189,32 @@ class Vehicle(NamedTuple):
     monitor: Process
     link: Process
     port: int
-    reports: list[float]
-    """When the node of the link reported."""
 
 
 @contextlib.contextmanager
 def vehicle(folder: Path) -> Iterator[Vehicle]:
     """Three gyros of a simulated PX4 over UDP, monitored."""
-    port, reports = free_port(), []
-    autopilot = Autopilot("px4", boot=time.monotonic_ns() - 100 * NS)
-
-    def hear(message: DiagnosticArray) -> None:
-        if message.status and message.status[0].name.startswith("mavlink_node: "):
-            reports.append(time.monotonic())
-
-    with OverUdp(port, autopilot), monitoring(CONFIG, folder, prime=False) as (listener, monitor):
-        listener.create_subscription(DiagnosticArray, "/diagnostics", hear, 100)
-        with running("mavlink_node", STACK, url=f"udpin:127.0.0.1:{port}") as link:
-            assert listener.says("monitor", "9 of 9 channels healthy")
-            yield Vehicle(listener, monitor, link, port, reports)
+    port = free_port()
+    with (
+        OverUdp(port, Autopilot("px4")),
+        monitoring(CONFIG, folder, prime=False) as (listener, monitor),
+        running("mavlink_node", STACK, url=f"udpin:127.0.0.1:{port}") as link,
+    ):
+        assert listener.says("monitor", "9 of 9 channels healthy")
+        yield Vehicle(listener, monitor, link, port)
 
 
 def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
     """Let one storm loose; what it cost."""
-    processes = {"monitor": over.monitor, "link": over.link}
-    lines = {name: process.said().count("\n") for name, process in processes.items()}
+    nodes = {"monitor": ("fdi_node: ", over.monitor), "link": ("mavlink_node: ", over.link)}
+    lines = {name: process.said().count("\n") for name, (_, process) in nodes.items()}
     begun, storm = time.monotonic(), Storm(over.listener, over.port, seed)
     storm.rage(kind, seconds)
-    end = time.monotonic()
+    end, heard = time.monotonic(), [(at, array.status[0].name) for at, array in list(over.listener.diagnostics)]
     told: dict[str, float] = {"sent": storm.sent, "answered": storm.answered}
-    reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], "link": over.reports}
-    for name, came in reports.items():
-        times = [at for at in list(came) if begun - 2 <= at]
+    for name, (prefix, process) in nodes.items():
+        times = [at for at, status in heard if status.startswith(prefix) and begun - 2 <= at]
         told[f"{name}: longest gap of the diagnostics, s"] = max(np.diff([*times, end]), default=math.inf)
-    for name, process in processes.items():
         told[f"{name}: lines of the log a second"] = (process.said().count("\n") - lines[name]) / (end - begun)
         told[f"{name}: memory, MB"] = process.memory()
     return told

@@ -3,8 +3,6 @@
 
 """Launch files and the files beside them, read as their programs read them."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json
@@ -207,8 +205,6 @@ def test_layouts_are_well_formed() -> None:
     assert all(panel in used for panel in layout["configById"])
     ElementTree.parse(ROOT / "config" / "plotjuggler.xml")
 
-
-# The policy for SROS2 ----------------------------------------------------------------------------------------------
 
 GRAPH = """
 import sys, rclpy

@@ -3,8 +3,6 @@
 
 """mavlink_node on real links, with simulated autopilots: Imu topics out, declarations back, nothing waits."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterator
@@ -14,35 +12,23 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from diagnostic_msgs.msg import DiagnosticArray
 from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
-from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, running, wait
+from ros.harness import Listener, listening, stamps_of
+from ros.processes import ROOT, Process, assert_refused, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
-
-from fdi_ros.sources import ImuSource
 
 TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
 
 
 class Ears(Listener):
-    """Hears what the node of the link publishes, and what all nodes say last."""
+    """Hears what the node of the link publishes."""
+
+    speaker = "mavlink_node"
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
-        self.imu: list[list[bytes]] = [[] for _ in TOPICS]
-        for kept, topic in zip(self.imu, TOPICS, strict=True):
-            self.create_subscription(Imu, topic, kept.append, DEEP, raw=True)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self.diagnostics.append((time.monotonic(), message))
-
-    def _statuses(self, name: str) -> list:
-        names = (name, f"mavlink_node: {name}")
-        return [s for _, array in list(self.diagnostics) for s in array.status if s.name in names][-1:]
-
-    def stamps(self, unit: int) -> np.ndarray:
-        return np.array([ImuSource.parse(data, 3)[0] for data in list(self.imu[unit])])
+        self.imu = [self.hear(topic) for topic in TOPICS]
 
 
 @contextlib.contextmanager
@@ -75,13 +61,9 @@ def struck(autopilot: Autopilot, unit: int, axis: int) -> Callable[[], None]:
     return lambda: strikes.append(True)
 
 
-def boot() -> int:
-    return time.monotonic_ns() - 100 * NS
-
-
 def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compiled) -> None:
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
-    autopilot, other = (Autopilot("px4", system=system, boot=boot(), seed=system) for system in (2, 1))
+    autopilot, other = (Autopilot("px4", system=system, seed=system) for system in (2, 1))
     strike = struck(autopilot, 1, 1)
     with (
         running("fdi_node", ROOT / "config" / "px4.yaml") as monitor,
@@ -95,7 +77,7 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
         # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
         now = time.time_ns()
         assert wait(lambda: len(ears.imu[0]) > 50)
-        assert abs(int(ears.stamps(0)[-1]) - now) < 30 * NS
+        assert abs(stamps_of(ears.imu[0])[-1] - now) < 30 * NS
         assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
         assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
         strike()
@@ -108,7 +90,7 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
 
 def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain, compiled, tmp_path) -> None:
     """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
-    autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
+    autopilot = Autopilot("ardupilot", armed=True)
     strike = struck(autopilot, 0, 1)
     remaps, failover = ("/fdi_node/integrity:=/verdict",), {"failover": "ardupilot", "failover_file": tmp_path / "out"}
     with (
@@ -133,7 +115,7 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain
 
 
 def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tmp_path) -> None:
-    autopilot, file = Autopilot("ardupilot", boot=boot(), armed=True), tmp_path / "out.json"
+    autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
     file.write_text('{"system_id": 1, "out_of_use": [2]}')
     with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (ears, _):
@@ -149,7 +131,7 @@ def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tm
 def test_ardupilot_over_a_serial_line_that_comes_late_with_garbage_cuts_and_a_restart(quiet_domain, tmp_path) -> None:
     pytest.importorskip("serial", reason="serial lines need pyserial")
     random, device = np.random.default_rng(0), tmp_path / "device"
-    autopilot = Autopilot("ardupilot", boot=boot(), loss=0.02)
+    autopilot = Autopilot("ardupilot", loss=0.02)
 
     def garbage() -> bytes:
         return random.bytes(int(random.integers(1, 40))) if random.random() < 0.02 else b""
@@ -169,8 +151,7 @@ def test_ardupilot_over_a_serial_line_that_comes_late_with_garbage_cuts_and_a_re
             assert ears.says("unit imu_1", "Hz of 50 asked for")
             count = len(ears.imu[2])
             assert wait(lambda: len(ears.imu[2]) > count + 100)
-            for unit in range(3):
-                assert (np.diff(ears.stamps(unit)) > 0).all()
+            assert all((np.diff(stamps_of(heard)) > 0).all() for heard in ears.imu)
             assert ears.value("link", "restarts of the autopilot's time") == "1"
     assert "has started anew" in process.said()
 

@@ -3,8 +3,6 @@
 
 """A monitor of its own for each test, that no other has taught anything: start and end, life cycle, clocks, input."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
@@ -22,36 +20,18 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from ros.harness import (
-    GEOMETRY,
-    RATE,
-    ROOT,
-    TRANSITIONS,
-    TWO_IMUS,
-    Process,
-    assert_refused,
-    connect,
-    healthy,
-    listening,
-    monitoring,
-    parameter_file,
-    rest,
-    running,
-    wait,
-)
+from ros.harness import GEOMETRY, RATE, TRANSITIONS, TWO_IMUS, connect, healthy, listening, monitoring, struck
+from ros.processes import ROOT, Process, assert_refused, parameter_file, rest, running, wait
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.decision import ChannelState
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sources import ImuSource
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
 
 
 REFUSED = {
@@ -78,10 +58,8 @@ REFUSED = {
 
 
 def test_what_would_be_left_aside_refuses_the_start_in_one_line(tmp_path) -> None:
-    other = tmp_path / "other.yaml"
-    other.write_text(
-        "{another_node: {ros__parameters: {sample_rate: 5.0}}, a: {fdi_node: {ros__parameters: {sample_rate: 5.0}}}}"
-    )
+    other, held = tmp_path / "other.yaml", "{ros__parameters: {sample_rate: 5.0}}"
+    other.write_text(f"{{another_node: {held}, a: {{fdi_node: {held}}}}}")
     assert_refused("fdi_node", {start.replace("OTHER", str(other)): words for start, words in REFUSED.items()})
 
 
@@ -138,17 +116,14 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         assert not refused.successful
         assert "imu_9.x" in refused.reason
         assert wait(lambda: f"parameters refused: {refused.reason}" in process.said())
-        # As often one that is possible as one that mostly is not, or that does not exist.
-        for _ in range(30):
+        # As often one that is possible as one that mostly is not, or that does not exist; until it is where it was.
+        while refusals < 10 or now != "unconfigured":
             wanted = int(random.choice(list(TRANSITIONS[now]) if random.random() < 0.5 else [1, 2, 3, 4, 9, 60, 255]))
             goal = TRANSITIONS[now].get(wanted)
             assert change(wanted) == (goal is not None), (now, wanted)
             refusals += goal is None
             now = goal or now
             assert state() == now
-        assert refusals > 5
-        for wanted in {"active": (4, 2), "inactive": (2,), "unconfigured": ()}[now]:
-            assert change(wanted)
         # Not more lines a second than the log is bounded to; how many there were is said.
         assert wait(lambda: " refused: not possible while " in process.said()), process.said()
         left_out = sum(map(int, re.findall(r"and ([0-9]+) more lines", process.said())))
@@ -174,7 +149,7 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         begin = time.time_ns() - 3600 * 10**9
         listener.play(healthy(250)[1], start=begin)
         assert wait(lambda: len(listener.fused) > 100)
-        assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - begin) < 2 * 10**9
+        assert abs(listener.stamps()[-1] - begin) < 2 * 10**9
         for wanted in (4, 2, 1, 3):
             assert change(wanted)
         connect(listener, process)
@@ -205,7 +180,7 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         z = healthy(200, rate=50.0)[1].tolist()
         end = play(z, origin)
         assert wait(lambda: len(listener.fused) > 150)
-        assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - end) < 10**9
+        assert abs(listener.stamps()[-1] - end) < 10**9
 
         def only_the_second_is_silent() -> bool:
             levels = {s.name: s.level for s in listener.diagnostics[-1][1].status}
@@ -230,61 +205,37 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         assert "FATAL" not in process.said()
 
 
-def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(tmp_path) -> None:
+def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) -> None:
     """Here by the SingleThreadedExecutor, elsewhere by the EventsExecutor."""
-    # By a node of its own, as what the default learns of noise and delays outlives a reset.
-    alike = TWO_IMUS.replaced({"detector.name": "likelihood_ratio"})
-    z = healthy(400, 5)[1]
-    z[150:, 4] += 0.05
-    with monitoring(alike, tmp_path, executor="single") as (listener, process):
-        listener.calm()
-        stamps = listener.play(z, skew=300_000)
-        assert wait(lambda: len(listener.fused) == 400)
-        states, rates = listener.states(), listener.rates()
-        # At the end comes another signal, of the other kind, and it is as well as after one.
-        process.popen.send_signal(signal.SIGTERM)
-    sent = np.column_stack([stamps, stamps + 300_000]).ravel()
-    block = Alignment(2, 2_000_000, 300_000_000).push_block(np.tile([0, 1], 400), sent, z.reshape(-1, 3))
-    pipeline = Pipeline.from_config(alike)
-    # As the node's, it has seen healthy samples.
-    pipeline.process(Block(stamps[0] - 4_000_000 * np.arange(50, 0, -1), healthy(50, seed=99)[1]))
-    output = pipeline.process(block)
-    assert block.stamp.tolist() == stamps.tolist()
-    np.testing.assert_array_equal(states, output.state)
-    assert [rates[stamp] for stamp in stamps.tolist()] == list(map(tuple, output.rate.tolist()))
-
-
-def test_channels_in_one_array(tmp_path) -> None:
-    config = TWO_IMUS.replaced(
-        {
-            "input": "channels",
-            "channels.topic": "gyros",
-            "geometry.preset": "axes",
-            "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
-            "health.stale_timeout": 0.3,
-        }
-    )
-    with monitoring(config, tmp_path) as (listener, process):
+    axes = {"geometry.preset": "axes", "geometry.axes": GEOMETRY.axes.reshape(-1).tolist()}
+    # The default learns of noise and delays, each node its own.
+    detector = {"detector.name": "likelihood_ratio"}
+    config = TWO_IMUS.replaced({"input": "channels", "channels.topic": "gyros", **axes, **detector})
+    with monitoring(config, tmp_path, executor="single") as (listener, process):
         # The first samples are not checked yet.
         assert wait(lambda: listener.prime() or not listener.states()[-1].any())
         rest(lambda: len(listener.fused))
         listener.clear()
-        # A name waits for half a second.
-        z = healthy(450)[1]
-        z[150:, 4] += 0.3
+        z = struck(450, 150)[1]
         for k, values in enumerate(z.tolist()):
             listener.send_channels(values)
             if k == 100:
                 for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
                     listener.outputs[0].publish(Float64MultiArray(data=wrong))
             time.sleep(1 / RATE)
-        assert wait(lambda: len(listener.fused) == 450), len(listener.fused)
-        stamps = [ImuSource.parse(data, 3)[0] for data in listener.fused]
+        assert wait(lambda: len(listener.fused) >= 450), len(listener.fused)
+        # A busy machine may have kept one of those before.
+        rest(lambda: len(listener.fused) + len(listener.integrity))
+        stamps, states, rates = (told[-450:] for told in (listener.stamps(), listener.states(), listener.rates()))
         assert stamps == sorted(set(stamps))
         assert listener.says("g5", "isolated")
         assert wait(lambda: listener.value("input gyros", "malformed") == "4")
-        # Stamped when they come, which a busy machine makes uneven.
-        assert not np.isin(listener.states()[:, [0, 1, 2, 3, 5]], ChannelState.FAULTY).any()
+        pipeline = Pipeline.from_config(config)
+        # As the node's, it has seen healthy samples.
+        pipeline.process(Block(stamps[0] - 4_000_000 * np.arange(50, 0, -1), healthy(50, seed=99)[1]))
+        output = pipeline.process(Block(np.array(stamps), z))
+        np.testing.assert_array_equal(states, output.state)
+        np.testing.assert_array_equal(rates, output.rate)
         # A clock that goes forth and back by decades runs the stamps of the samples out of their range, in the end.
         clock = listener.create_publisher(Clock, "/clock", 10)
         assert listener.set(use_sim_time=True).successful
@@ -299,6 +250,8 @@ def test_channels_in_one_array(tmp_path) -> None:
         listener.clear()
         listener.send_channels(z[0].tolist())
         assert wait(lambda: listener.fused)
+        # At the end comes another signal, of the other kind, and it is as well as after one.
+        process.popen.send_signal(signal.SIGTERM)
 
 
 def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(tmp_path, compiled) -> None:
@@ -338,16 +291,14 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         listener.play(healthy(500)[1])
         for name in ("imu_1", "imu_2"):
             assert wait(lambda name=name: listener.status(f"input {name}").message == "delivers")
-            assert listener.status(f"input {name}").level == DiagnosticStatus.OK
 
         # Both far from now: the time begins anew when both units agree on it.
         listener.clear()
-        start, z = time.time_ns() - 3600 * 10**9, healthy(1100)[1]
-        z[300:, 4] += 0.3
+        start, z = time.time_ns() - 3600 * 10**9, struck(1100, 300)[1]
         listener.play(z[:300], start=start)
         assert listener.says("input imu_1", "behind the clock")
         assert wait(lambda: len(listener.fused) > 250)
-        late = [ImuSource.parse(data, 3)[0] for data in listener.fused[-200:]]
+        late = listener.stamps()[-200:]
         assert late == sorted(set(late))
         assert abs(late[-1] - start) < 10e9
         listener.play(z[300:], start=start + 300 * 4_000_000)

@@ -6,8 +6,6 @@
 The long form of the storms, with the times, is benchmark/mavlink.py storms.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest
@@ -42,26 +40,20 @@ def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(t
         assert over.listener.says("monitor", "of 9 channels healthy")
 
 
-# The log -----------------------------------------------------------------------------------------------------------
-
-
 class Paper:
     """Takes lines of all severities, and has the time, s."""
 
     def __init__(self) -> None:
         self.lines: list[tuple[str, str]] = []
         self.now = 100.0
+        self.changes = ChangeLog(self, NAMES, lambda: self.now)
 
     def __getattr__(self, severity: str):
         return lambda words: self.lines.append((severity, words))
 
 
-@pytest.fixture
-def paper() -> Paper:
-    return Paper()
-
-
-def test_a_log_is_bounded_and_says_how_much_was_left_out(paper) -> None:
+def test_a_log_is_bounded_and_says_how_much_was_left_out() -> None:
+    paper = Paper()
     log = BoundedLog(paper, lambda: paper.now)
     for k in range(1000):
         (log.info, log.warning, log.error)[k % 3](f"line {k}\n" + "x" * 10**5)
@@ -74,50 +66,40 @@ def test_a_log_is_bounded_and_says_how_much_was_left_out(paper) -> None:
     assert paper.lines[-2:] == [("warning", f"and {1000 - 3 * MOST_LINES} more lines, left out"), ("info", "again")]
 
 
-@pytest.fixture
-def changes(paper) -> ChangeLog:
-    return ChangeLog(paper, NAMES, lambda: paper.now)
-
-
 def events(before, after, *channels: int, why=Reason.NONE) -> list[Event]:
     group = channels if after is AMBIGUOUS else ()
     return [Event(12 * 10**9, channel, before, after, why, group or (channel,), 0.0) for channel in channels]
 
 
-def test_channels_that_change_alike_share_a_line(changes, paper) -> None:
-    changes.add(events(UNCHECKED, OK, 0, 1, 3) + events(OK, FAULTY, 2, why=Reason.DISAGREES), 2 * 10**9, None)
-    assert paper.lines == [
-        ("info", "imu_1.x, imu_1.y, imu_2.y: UNCHECKED -> OK at 10.000 s"),
-        ("error", f"imu_2.x: OK -> FAULTY at 10.000 s: {Reason.DISAGREES.value}"),
-    ]
-
-
-def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_counted(changes, paper) -> None:
+def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_counted() -> None:
+    paper = Paper()
     for k in range(2000):
-        changes.add(events(OK, UNCHECKED, k % 4) if k % 2 else events(UNCHECKED, OK, k % 4), 0, None)
-        changes.check()
+        paper.changes.add(events(OK, UNCHECKED, k % 4) if k % 2 else events(UNCHECKED, OK, k % 4), 0, None)
+        paper.changes.check()
         paper.now += 0.01
     # 100 changes a second for 20 s: one line a channel in 5 s.
     assert len(paper.lines) <= len(NAMES) * (20 / QUIET + 1)
     paper.now += QUIET
-    changes.check()
+    paper.changes.check()
     (last,) = [line for _, line in paper.lines[-2:] if "imu_2.y" in line]
     assert "UNCHECKED now, after" in last
     assert "more changes" in last
     count = len(paper.lines)
     paper.now += 10 * QUIET
-    changes.check()
+    paper.changes.check()
     assert len(paper.lines) == count
 
 
-def test_what_becomes_worse_is_said_at_once(changes, paper) -> None:
+def test_what_becomes_worse_is_said_at_once_and_channels_that_change_alike_share_a_line() -> None:
+    paper = Paper()
     pair = ApartStatus(("imu_1.x", "imu_2.x"), "the x axis of imu_1 or imu_2,", 0.1, 0.002)
     before = OK
     for after, channels in ((UNCHECKED, (0,)), (SUSPECT, (0,)), (OK, (0,)), (SUSPECT, (0,)), (AMBIGUOUS, (0, 2))):
-        changes.add(events(before, after, *channels), 0, pair)
+        paper.changes.add(events(before, after, *channels), 0, pair)
         before = after
         paper.now += 0.05
-    changes.add(events(AMBIGUOUS, FAULTY, 0), 0, None)
+    paper.changes.add(events(AMBIGUOUS, FAULTY, 0, why=Reason.DISAGREES), 2 * 10**9, None)
+    assert paper.lines[-1] == ("error", f"imu_1.x: AMBIGUOUS -> FAULTY at 10.000 s: {Reason.DISAGREES.value}")
     assert [line.split(" at ")[0] for _, line in paper.lines] == [
         "imu_1.x: OK -> UNCHECKED",
         "imu_1.x: UNCHECKED -> SUSPECT",

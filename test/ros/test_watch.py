@@ -3,8 +3,6 @@
 
 """fdi watch: what it finds, says and draws of a real monitor in a namespace."""
 
-from __future__ import annotations
-
 import io
 import math
 import re
@@ -23,7 +21,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from ros.harness import ROOT, TWO_IMUS, Listener, healthy, listening, parameter_file, running, wait
+from ros.harness import TWO_IMUS, Listener, healthy, listening
+from ros.processes import ROOT, parameter_file, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
