@@ -7,6 +7,7 @@ import ast
 import importlib.util
 import json
 import re
+import runpy
 import subprocess
 import sys
 from inspect import Parameter, Signature
@@ -67,10 +68,8 @@ def load(monkeypatch):
     monkeypatch.delitem(sys.modules, "fdi_ros.ros.launching", raising=False)
 
     def run(name: str, **given: str) -> dict[str, dict]:
-        spec = importlib.util.spec_from_file_location(name, ROOT / "launch" / f"{name}.launch.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        (*declared, function) = module.generate_launch_description().given["initial_entities"]
+        described = runpy.run_path(str(ROOT / "launch" / f"{name}.launch.py"))["generate_launch_description"]()
+        (*declared, function) = described.given["initial_entities"]
         values = {one.given["name"]: one.given.get("default_value") for one in declared}
         assert given.keys() <= values.keys()
         values |= given
@@ -100,8 +99,7 @@ def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(load, flight
     assert all(Path(node["parameters"][0]).is_file() for node in nodes.values())
     assert nodes["mavlink_node"]["on_exit"].__name__ == "end"
     assert {"url", "system_id", "signing_key", "named_values", "failover"} == parameters(nodes["mavlink_node"]).keys()
-    for name in ("fdi", "mavlink", "replay"):
-        bag = {"bag": str(flight)} if name == "replay" else {}
+    for name, bag in (("fdi", {}), ("mavlink", {}), ("replay", {"bag": str(flight)})):
         with pytest.raises(RuntimeError, match=r"cannot read config /nowhere\.yaml"):
             load(name, config="/nowhere.yaml", **bag)
     with pytest.raises(RuntimeError, match="no recording at /nowhere"):
