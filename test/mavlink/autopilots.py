@@ -223,8 +223,8 @@ class Autopilot:
 class Driver:
     """Runs autopilots on a real link, in a thread of its own, from its time on; end: file descriptor of the link."""
 
-    def __init__(self, end: int, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
-        self.ends, self.autopilots, self.garbage = [end], autopilots, garbage
+    def __init__(self, end: int, *autopilots: Autopilot) -> None:
+        self.ends, self.autopilots = [end], autopilots
         for autopilot in autopilots:
             # It may have been on another link before.
             if autopilot.boot < 0:
@@ -249,42 +249,38 @@ class Driver:
             select.select(self.ends[:1], [], [], 0.002)
             now = time.monotonic_ns()
             while data := self.read():
-                for autopilot in self.autopilots:
-                    for answer in [] if self.silent else autopilot.take(data, time.monotonic_ns()):
-                        self.write(answer)
+                for autopilot in self.autopilots if not self.silent else ():
+                    self.write(autopilot.take(data, time.monotonic_ns()))
             for autopilot in self.autopilots:
-                for message in autopilot.step(now):
-                    if not self.silent:
-                        self.write(message)
-            if self.garbage is not None:
-                self.write(self.garbage())
+                self.write(autopilot.step(now))
 
     def read(self) -> bytes:
         with contextlib.suppress(OSError):
             return os.read(self.ends[0], 2048)
         return b""
 
-    def write(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):
-            os.write(self.ends[0], data)
+    def write(self, messages: list[bytes]) -> None:
+        for data in messages if not self.silent else ():
+            with contextlib.suppress(OSError):
+                os.write(self.ends[0], data)
 
 
 class OverUdp(Driver):
     """Sends to a port of this machine, as an autopilot does to its companion."""
 
-    def __init__(self, port: int, *autopilots: Autopilot, **options) -> None:
+    def __init__(self, port: int, *autopilots: Autopilot) -> None:
         link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         link.connect(("127.0.0.1", port))
-        super().__init__(link.detach(), *autopilots, **options)
+        super().__init__(link.detach(), *autopilots)
 
 
 class OverPty(Driver):
     """At the other end of a serial line."""
 
-    def __init__(self, *autopilots: Autopilot, **options) -> None:
+    def __init__(self, *autopilots: Autopilot) -> None:
         end, line = pty.openpty()
         tty.setraw(line)
-        super().__init__(end, *autopilots, **options)
+        super().__init__(end, *autopilots)
         self.device = os.ttyname(line)
         # The line stays open when the node closes it.
         self.ends.append(line)

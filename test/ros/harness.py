@@ -72,18 +72,18 @@ def stamps_of(messages: list[bytes]) -> list[int]:
 class Listener(Node):
     """Publishes the inputs of a monitor and keeps all it says."""
 
-    speaker = "fdi_node"
-    """Whose statuses are meant where none is named."""
-
     def __init__(self, topics, kind) -> None:
         super().__init__("listener")
+        self.speaker = "fdi_node"  # whose statuses are meant where none is named
         self.outputs = [self.create_publisher(kind, topic, DEEP) for topic in topics]
         self.fused, self.integrity = self.hear("fused"), self.hear("fdi_node/integrity", Float64MultiArray)
-        self.diagnostics: list[tuple[float, DiagnosticArray]] = []
-        self.create_subscription(
-            DiagnosticArray, "/diagnostics", lambda message: self.diagnostics.append((time.monotonic(), message)), 100
-        )
+        self.diagnostics: list[tuple[float, int, DiagnosticArray]] = []
+        """With the time at which each was heard, s, and the number of samples heard before it."""
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.diagnostics.append((time.monotonic(), len(self.integrity), message))
 
     def hear(self, topic: str, kind: type = Imu) -> list[bytes]:
         """Messages that come on a topic from now on."""
@@ -118,7 +118,7 @@ class Listener(Node):
             # One motion through all pauses, as of a vehicle: a delay is learned from it.
             last = self.play(healthy(25, int(1e3 * now), start=now)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
-            wait(lambda last=last: self.stamps()[-1:] == [last], 1.0)
+            wait(lambda last=last: stamps_of(self.fused[-1:]) == [last], 1.0)
             if self.integrity and not self.states()[-1].any():
                 return True
         print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
@@ -162,11 +162,11 @@ class Listener(Node):
 
     def reports(self) -> list[dict[str, DiagnosticStatus]]:
         """All statuses of each report, by name."""
-        return [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in list(self.diagnostics)]
+        return [{s.name.removeprefix("fdi_node: "): s for s in m.status} for *_, m in list(self.diagnostics)]
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         names = (name, f"{self.speaker}: {name}")
-        return [status for _, array in list(self.diagnostics) for status in array.status if status.name in names]
+        return [status for *_, array in list(self.diagnostics) for status in array.status if status.name in names]
 
     def says(self, name: str, words: str) -> str:
         """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
@@ -211,7 +211,7 @@ TRANSITIONS = {
 
 
 @contextlib.contextmanager
-def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
+def listening(topics=(), kind=Imu) -> Iterator[Listener]:
     """A listener that spins in a thread, in the ROS domain that processes started now have."""
     context = rclpy.get_default_context()
     # A test before may have had another domain.
@@ -219,7 +219,7 @@ def listening(topics=(), kind=Imu, make=Listener) -> Iterator[Listener]:
         rclpy.shutdown()
     if not context.ok():
         rclpy.init()
-    listener = make(topics, kind)
+    listener = Listener(topics, kind)
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
     thread = threading.Thread(target=executor.spin, daemon=True)

@@ -210,7 +210,7 @@ def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, fl
     lines = {name: process.said().count("\n") for name, (_, process) in nodes.items()}
     begun, storm = time.monotonic(), Storm(over.listener, over.port, seed)
     storm.rage(kind, seconds)
-    end, heard = time.monotonic(), [(at, array.status[0].name) for at, array in list(over.listener.diagnostics)]
+    end, heard = time.monotonic(), [(at, array.status[0].name) for at, _, array in [*over.listener.diagnostics]]
     told: dict[str, float] = {"sent": storm.sent, "answered": storm.answered}
     for name, (prefix, process) in nodes.items():
         times = [at for at, status in heard if status.startswith(prefix) and begun - 2 <= at]

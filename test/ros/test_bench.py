@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the nodes need ROS 2")
 
 from bag.recordings import IMU, imu, write_mcap
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer
 from ros.harness import RATE, TWO_IMUS, healthy, listening, stamps_of
 from ros.processes import PATIENCE, ROOT, Process, assert_refused, parameter_file, rest, running, wait
@@ -29,6 +29,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.sources import ImuSource
 
+STATUS = "injector_node: injector"
 FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)
 
@@ -127,19 +128,18 @@ def test_what_cannot_be_played_is_said_in_one_line() -> None:
 
 @pytest.fixture(scope="module")
 def injector(tmp_path_factory):
-    """(listener, what came out of each topic, the injector's last status)."""
+    """(listener, what came out of each topic)."""
     file = parameter_file(TWO_IMUS, tmp_path_factory.mktemp("injector"))
     with listening(TWO_IMUS.topics) as listener, running("injector_node", file) as process:
-        out, said = [listener.hear(f"{topic}_faulty") for topic in TWO_IMUS.topics], []
-        listener.create_subscription(DiagnosticArray, "/diagnostics", lambda m: said.append(m.status[0]), 10)
+        out = [listener.hear(f"{topic}_faulty") for topic in TWO_IMUS.topics]
         assert wait(lambda: all(p.get_subscription_count() for p in listener.outputs)), process.said()
         assert wait(lambda: (listener.play(healthy(5)[1]), all(out))[1])
-        yield listener, out, said
+        yield listener, out
 
 
 def flow(injector, z: np.ndarray) -> tuple[np.ndarray, list[list[bytes]]]:
     """Stamps of samples that are sent, and what comes of them."""
-    listener, out, _ = injector
+    listener, out = injector
     rest(lambda: sum(map(len, out)))
     for kept in out:
         kept.clear()
@@ -157,13 +157,14 @@ def test_off_it_passes_every_byte(injector) -> None:
 
 
 def test_on_it_strikes_as_the_same_faults_do_offline(injector) -> None:
-    listener, _, said = injector
+    listener, _ = injector
     faults = "channel=imu_2.y kind=bias size=0.2 start=0.2; channel=imu_1 kind=triad_loss start=0.4 stop=0.6"
     assert listener.set("injector_node", faults=faults).successful
     assert listener.call(Trigger, "injector_node/start").success
     z = healthy(200)[1]
     stamps, out = flow(injector, z)
-    assert wait(lambda: said[-1].level == DiagnosticStatus.WARN and "INJECTING" in said[-1].message)
+    assert listener.says(STATUS, "INJECTING")
+    assert listener.status(STATUS).level == DiagnosticStatus.WARN
     names = [f"imu_{k}.{axis}" for k in (1, 2) for axis in "xyz"]
     struck = Injector([parse_fault(text) for text in faults.split(";")], names).apply(Block(stamps, z))
     for unit, axes in ((0, slice(3)), (1, slice(3, 6))):
@@ -173,13 +174,13 @@ def test_on_it_strikes_as_the_same_faults_do_offline(injector) -> None:
         np.testing.assert_array_equal(rates, struck.z[passed, axes])
     assert len(out[0]) == 200 - round(0.2 * RATE)
     assert listener.call(Trigger, "injector_node/stop").success
-    assert wait(lambda: said[-1].message == "off")
+    assert wait(lambda: listener.status(STATUS).message == "off")
     stamps, out = flow(injector, z[:20])
     assert stamps_of(out[0]) == stamps.tolist()
 
 
 def test_a_fault_that_does_not_fit_is_refused(injector) -> None:
-    listener, _, _ = injector
+    listener, _ = injector
     for text, words in (("channel=imu_9.x kind=bias size=1", "imu_9.x"), ("kind=bias", "channel"), ("", "nothing")):
         result = listener.set("injector_node", faults=text, enabled=True)
         assert not result.successful

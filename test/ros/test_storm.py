@@ -37,6 +37,7 @@ def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(t
                 assert told[f"{name}: lines of the log a second"] < 3 * MOST_LINES + THROTTLED, process.said()
                 assert told[f"{name}: memory, MB"] < 400
         assert over.listener.trigger("reset").success
+        over.listener.clear()
         assert over.listener.says("monitor", "of 9 channels healthy")
 
 
