@@ -24,7 +24,7 @@ ubuntu: ## what flies, with no more than a live node needs and in the versions o
 
 fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
 	@$(RUN) python -m fdi_ros.cli compile
-	@cd test && bash ../tools/run.sh python -m bag.fuzz $(N) $(ARGS)
+	@FUZZ_CASES=$(N) $(RUN) python -m pytest -n $(WORKERS) -o faulthandler_timeout=60 test/bag/test_limits.py -k hostile_file $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

@@ -7,8 +7,6 @@ Each case is drawn from its number alone. A case passes if the verb ends by itse
 in one clear line, prints nothing that a terminal obeys, and leaves whole outputs or none.
 """
 
-import argparse
-import faulthandler
 import io
 import itertools
 import json
@@ -17,10 +15,8 @@ import os
 import random
 import resource
 import shutil
-import signal
 import sqlite3
 import struct
-import sys
 import tempfile
 import time
 import traceback
@@ -28,7 +24,6 @@ import warnings
 import zlib
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
 
 import lz4.frame
 import zstandard
@@ -53,21 +48,21 @@ SCALARS = (
     "[.nan, 1.0]", "[a, 1, null]", "{<<: 3}", "'" + "x" * 3000 + "'", "!!binary xx", "!!float zz", "? [a]\n: b", "- a",
     "cone_99999999999", "[[1, 0, 0]]", "1e308", "-1", "0", "3", "1000000000", "\x07", "\u0085", "0o17", "1_000",
 )  # fmt: skip
+PLAIN = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+UNTYPED = "CREATE TABLE messages(id, topic_id, timestamp, data)"
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+COMPUTED = {
+    "computed": "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000)))",
+    "view": f"CREATE VIEW messages AS {ENDLESS}"
+    " SELECT x AS id, 1 AS topic_id, x AS timestamp, zeroblob(1000) AS data FROM c",
+    "virtual": "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+}
+"""Tables of messages that another program has made to compute."""
 SCENARIO = """\
 faults:
   - {channel: imu_1.y, kind: bias, size: 0.2, start: 0.1, stop: 0.4}
   - {channel: imu_2, kind: triad_loss, start: 0.2}
 """
-
-
-class Case(NamedTuple):
-    """What one case came to."""
-
-    number: int
-    words: list[str]
-    wrong: str
-    """Empty: it passes."""
-    seconds: float
 
 
 class Draw(random.Random):
@@ -200,16 +195,8 @@ def database(draw, path):
         base.execute("INSERT INTO topics VALUES(?, ?, ?, ?)", (number, odd, kind, "cdr"))
     if draw.odd():
         base.execute("UPDATE topics SET name = CAST(x'fffe2f00' AS TEXT)")
-    plain = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
-    tables = {
-        "untyped": "CREATE TABLE messages(id, topic_id, timestamp, data)",
-        "computed": "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000)))",
-        "view": "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
-        " SELECT x AS id, 0 AS topic_id, x AS timestamp, zeroblob(1000) AS data FROM c",
-        "virtual": "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
-    }
-    form = draw.choice((*["plain"] * 6, "zeroblob", *tables))
-    base.execute(tables.get(form, plain))
+    form = draw.choice((*["plain"] * 6, "zeroblob", "untyped", *COMPUTED))
+    base.execute({"untyped": UNTYPED, **COMPUTED}.get(form, PLAIN))
     if form in ("plain", "untyped", "zeroblob"):
         packed = draw.random() < 0.2
         rows = []
@@ -377,12 +364,12 @@ def write(path, text):
 # Cases ---------------------------------------------------------------------------------------------------------------
 
 
-def run_case(number, seed="fdi"):
-    """Make a case, run it, and look at what it leaves."""
+def run_case(number):
+    """Make a case, run it, and look at what it leaves: the command line and what is wrong, empty if nothing."""
     folder = Path(tempfile.mkdtemp(prefix="fdi_fuzz_"))
     try:
         (folder / "out").mkdir()
-        words = words_of(Draw(f"{seed} {number}"), folder)
+        words = words_of(Draw(f"fdi {number}"), folder)
         given = inputs(folder)
         out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
         begun, before = time.process_time(), peak()
@@ -394,7 +381,7 @@ def run_case(number, seed="fdi"):
                 code, wrong = -1, traceback.format_exc()
         seconds, growth = time.process_time() - begun, peak() - before
         said, errors = (stream.buffer.getvalue().decode() for stream in (out, err))
-        wrong = (
+        return words, (
             wrong
             or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
             or look(folder, code, said, errors)
@@ -402,7 +389,6 @@ def run_case(number, seed="fdi"):
             or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
             or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
         )
-        return Case(number, words, wrong, seconds)
     finally:
         shutil.rmtree(folder)
 
@@ -440,34 +426,3 @@ def look(folder, code, said, errors):
     except (FdiError, ValueError, ZeroDivisionError) as error:
         return f"wrote a {name} that cannot be read: {error}"
     return ""
-
-
-def main():
-    """Run many cases and report."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("count", type=int)
-    parser.add_argument("--first", type=int, default=0)
-    given = parser.parse_args()
-    # A case that does not end is shown, and ends the run.
-    faulthandler.register(signal.SIGPROF, chain=True)
-    # What is compiled and imported once counts to no case, and edits meanwhile do not matter.
-    for number in range(40):
-        run_case(number, "warm")
-    begun, slowest, wrong, done = time.monotonic(), 0.0, 0, 0
-    for number in range(given.first, given.first + given.count):
-        # By the time of the processor, which other programs may take; faulthandler's own timer goes by the wall.
-        signal.setitimer(signal.ITIMER_PROF, 3 * MOST_SECONDS)
-        case = run_case(number)
-        slowest, done, wrong = max(slowest, case.seconds), done + 1, wrong + bool(case.wrong)
-        if case.wrong:
-            print(f"case {number}: {' '.join(case.words)}\n{case.wrong}\n", flush=True)
-        took = time.monotonic() - begun
-        if done % 1000 == 0:
-            print(f"{done} cases, {wrong} wrong, {took:.0f} s", flush=True)
-    signal.setitimer(signal.ITIMER_PROF, 0.0)
-    print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {peak() >> 20} MB, {took:.0f} s")
-    return int(wrong > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

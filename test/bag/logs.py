@@ -10,7 +10,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEAD = b"\xa3\x95"
-FORMATS = {"B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4", "Q": "<u8", "L": "<i4", "Z": "S64"}
+FORMATS = {"b": "i1", "B": "u1", "H": "<u2", "I": "<u4", "E": "<u4", "Q": "<u8", "f": "<f4", "d": "<f8"}
+FORMATS |= dict.fromkeys("hc", "<i2") | dict.fromkeys("iLe", "<i4") | {"n": "S4", "N": "S16", "Z": "S64"}
 ULOG_HEAD = b"ULog\x01\x12\x35\x01"
 WEEK, MS = 2200, 345_600_000
 """GPS time of the first fix: Thursday, 10 March 2022, 00:00:00 GPS."""
@@ -59,6 +60,7 @@ def record_type(form, columns):
 
 
 MESSAGES = {
+    "FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"),
     "PARM": (64, "QNff", "TimeUS,Name,Value,Default"),
     "GPS": (65, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
     "MSG": (66, "QZ", "TimeUS,Message"),
@@ -74,82 +76,63 @@ INSTANCES = {
 }
 """Before 4.1 each instance is a message of its own: IMU, IMU2, IMU3; the last two are those before 3.3."""
 OLD_GPS = (65, "BIHBcLLeeEefI", "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T")
-SIZES = {"n": 4, "N": 16, "c": 2, "L": 4, "e": 4, "E": 4, "b": 1, "d": 8} | {
-    c: np.dtype(kind).itemsize for c, kind in FORMATS.items()
-}
+
+
+def records(message, count=1, **logged):
+    """Records of a message; of what is logged it takes what it has columns for, and the others are zero."""
+    number, form, columns = message
+    out = np.zeros(count, dtype=record_type(form, columns))
+    for name in {"head", "type", *logged} & {*out.dtype.names}:
+        out[name] = {"head": HEAD, "type": number, **logged}[name]
+    return out
 
 
 def format_record(number, name, form, columns):
-    size = 3 + sum(SIZES[c] for c in form)
-    return HEAD + struct.pack("<BBB4s16s64s", 128, number, size, name.encode(), form.encode(), columns.encode())
+    size = record_type(form, columns).itemsize
+    return records(MESSAGES["FMT"], Type=number, Length=size, Name=name, Format=form, Columns=columns).tobytes()
 
 
 def write_dataflash(path, units, kind="IMU", gps=True, extra=b""):
     """A log as ArduPilot writes it; kind IMU or GYR (with instances), or one of `INSTANCES`."""
     old = kind in ("TimeMS", "GYR1")
-    described = {"PARM": MESSAGES["PARM"], "GPS": OLD_GPS if old else MESSAGES["GPS"], "MSG": MESSAGES["MSG"]}
+    messages = {name: MESSAGES[name] for name in ("FMT", "PARM", "GPS", "MSG")} | ({"GPS": OLD_GPS} if old else {})
     if kind in INSTANCES:
         name, form, columns = INSTANCES[kind]
-        own = [f"{name}{k or 1}" if kind == "GYR1" or k else name for k in (0, 2, 3)]
-        sensors = {one: (72 + k, form, columns) for k, one in enumerate(own)}
+        names = [f"{name}{k or 1}" if kind == "GYR1" or k else name for k in (0, 2, 3)]
+        sensors = {name: (72 + k, form, columns) for k, name in enumerate(names)}
     else:
         sensors = {kind: MESSAGES[kind]}
-    out = [format_record(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")]
-    out += [
-        format_record(number, name, form, columns) for name, (number, form, columns) in (described | sensors).items()
-    ]
-    out.append(HEAD + struct.pack("<BQ16sff", 64, 1_000_000, b"LOG_BITMASK", 180_222.0, 176_126.0))
-    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, b"ArduCopter V4.5.7"))
+    out = [format_record(number, name, *rest) for name, (number, *rest) in (messages | sensors).items()]
+    out.append(
+        records(messages["PARM"], TimeUS=1_000_000, Name="LOG_BITMASK", Value=180_222, Default=176_126).tobytes()
+    )
+    out.append(records(messages["MSG"], TimeUS=1_000_000, Message="ArduCopter V4.5.7").tobytes())
     out.append(extra)
     samples = np.concatenate([_samples(unit, k, tuple(sensors.values())) for k, unit in enumerate(units)])
     time = "TimeMS" if old else "TimeUS"
     samples = samples[np.argsort(samples[time], kind="stable")]
     cut = np.searchsorted(samples[time], samples[time][0] + (500 if old else 500_000))
-    fix = FIX + 200_000 * np.arange(5)
-    fixes = [_old_fix(int(at)) if old else _fix(int(at)) for at in fix] if gps else []
-    out += [samples[:cut].tobytes(), *fixes, samples[cut:].tobytes()]
+    at = FIX + 200_000 * np.arange(5)
+    # Before 3.3 a fix has its own time in T, and that of the week in TimeMS.
+    week = {"TimeMS" if old else "GMS": MS + (at - FIX) // 1000, "Week": WEEK, "GWk": WEEK}
+    fixes = records(messages["GPS"], len(at), Status=3, TimeUS=at, T=at // 1000, **week)
+    out += [samples[:cut].tobytes(), fixes.tobytes() if gps else b"", samples[cut:].tobytes()]
     path.write_bytes(b"".join(out))
     return path
 
 
 def _samples(unit, k, messages):
-    number, form, columns = messages[k % len(messages)]
-    out = np.zeros(len(unit.stamp), dtype=record_type(form, columns))
-    names = out.dtype.names
-    out["head"], out["type"] = HEAD, number
-    if "I" in names:
-        out["I"] = k
-    if "SampleUS" in names:
-        out["SampleUS"] = unit.stamp
-    if "TimeUS" in names:
-        # Of 32 bits before 3.3.
-        out["TimeUS"] = (unit.stamp + 150 * ("SampleUS" in names)).astype(out["TimeUS"].dtype)
-    if "TimeMS" in names:
-        out["TimeMS"] = unit.stamp // 1000
-    for letter, times, values, deltas in (("A", "DelaT", unit.rate, "Gyr"), ("V", "DelvT", unit.acceleration, "Acc")):
-        step = np.float32(np.median(np.diff(unit.stamp)) * 1e-6) if times in names else 0.0
-        if times in names:
-            out[times] = step
-        for a, axis in enumerate("XYZ"):
-            if f"Del{letter}{axis}" in names:
-                out[f"Del{letter}{axis}"] = values[:, a] * step
-            if f"{deltas}{axis}" in names:
-                out[f"{deltas}{axis}"] = values[:, a]
-    return out
-
-
-def _old_fix(at):
-    """A GPS record before 3.3: its own time in T, that of the week in TimeMS."""
-    values = (3, MS + (at - FIX) // 1000, WEEK, 14, 80, 473977420, 85455940, 0, 48800, 10, 0, 0.0, at // 1000)
-    return HEAD + struct.pack("<BBIHBhiiiiIifI", 65, *values)
-
-
-def _fix(at):
-    """A GPS record with a 3D fix."""
-    ms = MS + (at - FIX) // 1000
-    return HEAD + struct.pack(
-        "<BQBBIHBhiiiffffB", 65, at, 0, 3, ms, WEEK, 14, 80, 473977420, 85455940, 48800, 0.1, 0.0, 0.0, 0.0, 1
-    )
+    message = messages[k % len(messages)]
+    # GYR is written some time after its samples were taken.
+    written = unit.stamp + 150 * ("SampleUS" in message[2])
+    logged = {"I": k, "TimeUS": written, "SampleUS": unit.stamp, "TimeMS": unit.stamp // 1000}
+    for a, axis in enumerate("XYZ"):
+        logged |= {f"Gyr{axis}": unit.rate[:, a], f"Acc{axis}": unit.acceleration[:, a]}
+    if "DelaT" in message[2]:
+        logged["DelaT"] = logged["DelvT"] = step = np.float32(np.median(np.diff(unit.stamp)) * 1e-6)
+        for axis in "XYZ":
+            logged |= {f"DelA{axis}": logged[f"Gyr{axis}"] * step, f"DelV{axis}": logged[f"Acc{axis}"] * step}
+    return records(message, len(unit.stamp), **logged)
 
 
 # ULog ----------------------------------------------------------------------------------------------------------------
@@ -187,37 +170,40 @@ def ulog_type(name):
     return np.dtype(fields)
 
 
-def write_ulog(path, units, kind="sensor_gyro", gps=True, extra=b""):
+def write_ulog(path, units, kind="sensor_gyro", gps=True):
     """A log as PX4 writes it."""
     out = [ULOG_HEAD, struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)), ulog_message(b"B", bytes(40))]
-    out.append(extra)
     key = b"char[3] sys_name"
     out.append(ulog_message(b"I", bytes([len(key)]) + key + b"PX4"))
     out += [ulog_message(b"F", f"{name}:{form}".encode()) for name, form in ULOG_FORMATS.items()]
     out.append(ulog_message(b"P", b"\x15" + b"int32_t SDLOG_PROFILE" + struct.pack("<i", 1)))
-    topics = [(kind, k) for k in range(len(units))]
-    topics.append(("sensor_gps", 0))
+    topics = [*((kind, k) for k in range(len(units))), ("sensor_gps", 0)]
     out += [ulog_message(b"A", struct.pack("<BH", k, n) + name.encode()) for n, (name, k) in enumerate(topics)]
-    parts = [_ulog_samples(unit, n, kind) for n, unit in enumerate(units)]
-    out += [_gps(len(topics) - 1, FIX + 200_000 * k) for k in range(5)] if gps else []
-    out += _interleaved(parts)
+    fixes = _data("sensor_gps", len(units), FIX + 200_000 * np.arange(5))
+    fixes["time_utc_usec"], fixes["fix_type"] = UTC // 1000 + fixes["timestamp"] - FIX, 3
+    samples = np.concatenate([_ulog_samples(unit, n, kind) for n, unit in enumerate(units)])
+    out += [fixes.tobytes() if gps else b"", samples[np.argsort(samples["timestamp"], kind="stable")].tobytes()]
     path.write_bytes(b"".join(out))
     return path
 
 
-def _interleaved(parts):
-    samples = np.concatenate(parts)
-    return [samples[np.argsort(samples["timestamp"], kind="stable")].tobytes()]
+def _data(kind, number, stamp, late=0):
+    """Data messages of a topic, of values that are zero as yet."""
+    out = np.zeros(len(stamp), dtype=ulog_type(kind))
+    out["size"], out["kind"], out["id"], out["timestamp"] = out.dtype.itemsize - 3, b"D", number, stamp + late
+    if "timestamp_sample" in out.dtype.names:
+        out["timestamp_sample"] = stamp
+    return out
 
 
 def _ulog_samples(unit, number, kind):
     if kind == "sensor_gyro_fifo":
         return _fifo(unit, number)
-    out = _empty(kind, len(unit.stamp), number)
     if kind == "vehicle_imu_status":
-        out["timestamp"], out["mean_gyro"] = unit.stamp, unit.rate
+        out = _data(kind, number, unit.stamp)
+        out["mean_gyro"] = unit.rate
         return out
-    out["timestamp"], out["timestamp_sample"] = unit.stamp + 300, unit.stamp
+    out = _data(kind, number, unit.stamp, late=300)
     if kind == "vehicle_imu":
         step = int(np.clip(np.median(np.diff(unit.stamp)), 1, 10**6))
         out["delta_angle"], out["delta_angle_dt"] = unit.rate * np.float32(step * 1e-6), step
@@ -231,28 +217,15 @@ def _ulog_samples(unit, number, kind):
 def _fifo(unit, number):
     """Eight samples a message; its time is that of the last of them."""
     full = len(unit.stamp) // FIFO_SAMPLES
-    stamp = unit.stamp[: full * FIFO_SAMPLES].reshape(full, FIFO_SAMPLES)
     steps = np.clip(np.nan_to_num(np.round(unit.rate[: full * FIFO_SAMPLES] / SCALE)), -32768, 32767)
     raw = steps.astype("i2").reshape(full, FIFO_SAMPLES, 3)
-    out = _empty("sensor_gyro_fifo", full, number)
-    out["timestamp"], out["timestamp_sample"] = stamp[:, -1] + 300, stamp[:, -1]
+    out = _data(
+        "sensor_gyro_fifo", number, unit.stamp[: full * FIFO_SAMPLES][FIFO_SAMPLES - 1 :: FIFO_SAMPLES], late=300
+    )
     out["dt"], out["scale"], out["samples"] = np.median(np.diff(unit.stamp)), SCALE, FIFO_SAMPLES
     for a, axis in enumerate("xyz"):
         out[axis][:, :FIFO_SAMPLES] = raw[..., a]
     return out
-
-
-def _empty(kind, count, number):
-    out = np.zeros(count, dtype=ulog_type(kind))
-    out["size"], out["kind"], out["id"] = out.dtype.itemsize - 3, b"D", number
-    return out
-
-
-def _gps(number, at):
-    out = _empty("sensor_gps", 1, number)
-    out["timestamp"] = out["timestamp_sample"] = at
-    out["time_utc_usec"], out["fix_type"] = UTC // 1000 + at - FIX, 3
-    return out.tobytes()
 
 
 # Telemetry log ------------------------------------------------------------------------------------------------------

@@ -5,8 +5,11 @@
 
 import contextlib
 import json
+import resource
 import shutil
 import struct
+import time
+from functools import partial
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
@@ -90,7 +93,7 @@ def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.N
 
 def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **options):
     """A bare MCAP file written by the mcap library, in small chunks."""
-    options = {"chunk_size": 16_384, **options}
+    path, options = path.with_suffix(".mcap"), {"chunk_size": 16_384, **options}
     with path.open("wb") as file:
         writer = McapWriter(file, compression=compression, **options)
         writer.start("ros2", "test")
@@ -118,6 +121,7 @@ def split(path, messages, storage):
 
 def write_ros1(path, messages, compression=None, types=None):
     """A bag of ROS 1, as its recorder or roscpp write it; a message that is none of the type is written as it is."""
+    path = path.with_suffix(".bag")
     writer = Ros1Writer(path)
     if compression is not None:
         writer.set_compression(compression)
@@ -133,28 +137,26 @@ def write_ros1(path, messages, compression=None, types=None):
     return path
 
 
+SQLITE3 = partial(write_bag, storage=StoragePlugin.SQLITE3)
 MAKES = {
-    "ros 1": lambda path, m: write_ros1(path.with_suffix(".bag"), m),
-    "ros 1, bz2": lambda path, m: write_ros1(path.with_suffix(".bag"), m, Ros1Writer.CompressionFormat.BZ2),
-    "ros 1, lz4": lambda path, m: write_ros1(path.with_suffix(".bag"), m, Ros1Writer.CompressionFormat.LZ4),
-    "rosbag2 mcap": lambda path, m: write_bag(path, m),
-    "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
-    "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(
-        path, m, StoragePlugin.SQLITE3, CompressionMode.MESSAGE
-    ),
-    "rosbag2 sqlite3, file compressed": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3, CompressionMode.FILE),
-    "rosbag2 mcap, file compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.FILE),
-    "rosbag2 mcap, storage compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.STORAGE),
-    "three mcap files": lambda path, m: split(path, m, StoragePlugin.MCAP),
-    "three sqlite3 files": lambda path, m: split(path, m, StoragePlugin.SQLITE3),
-    "zstd chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m),
-    "lz4 chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.LZ4),
-    "plain chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE),
-    "no chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, use_chunking=False),
-    "no checksums": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE, enable_crcs=False),
-    "no summary": lambda path, m: write_mcap(
-        path.with_suffix(".mcap"),
-        m,
+    "ros 1": write_ros1,
+    "ros 1, bz2": partial(write_ros1, compression=Ros1Writer.CompressionFormat.BZ2),
+    "ros 1, lz4": partial(write_ros1, compression=Ros1Writer.CompressionFormat.LZ4),
+    "rosbag2 mcap": write_bag,
+    "rosbag2 sqlite3": SQLITE3,
+    "rosbag2 sqlite3, messages compressed": partial(SQLITE3, mode=CompressionMode.MESSAGE),
+    "rosbag2 sqlite3, file compressed": partial(SQLITE3, mode=CompressionMode.FILE),
+    "rosbag2 mcap, file compressed": partial(write_bag, mode=CompressionMode.FILE),
+    "rosbag2 mcap, storage compressed": partial(write_bag, mode=CompressionMode.STORAGE),
+    "three mcap files": partial(split, storage=StoragePlugin.MCAP),
+    "three sqlite3 files": partial(split, storage=StoragePlugin.SQLITE3),
+    "zstd chunks": write_mcap,
+    "lz4 chunks": partial(write_mcap, compression=CompressionType.LZ4),
+    "plain chunks": partial(write_mcap, compression=CompressionType.NONE),
+    "no chunks": partial(write_mcap, use_chunking=False),
+    "no checksums": partial(write_mcap, compression=CompressionType.NONE, enable_crcs=False),
+    "no summary": partial(
+        write_mcap,
         use_statistics=False,
         repeat_channels=False,
         repeat_schemas=False,
@@ -162,4 +164,13 @@ MAKES = {
         use_summary_offsets=False,
     ),
 }
-"""Ways to write the messages of a flight: to a path without a suffix."""
+"""Ways to write the messages of a flight: to a path, which gets the suffix that it needs."""
+
+
+@contextlib.contextmanager
+def bounded(seconds=20.0, growth=600_000):
+    """Time of the processor in s, growth of the memory at its largest in kB."""
+    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert time.process_time() - begun < seconds
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < growth

@@ -6,7 +6,6 @@
 import bz2
 import contextlib
 import os
-import resource
 import shutil
 import sqlite3
 import struct
@@ -22,13 +21,12 @@ from bag.recordings import (
     STEP,
     TOPICS,
     array,
+    bounded,
     flight,
-    split,
     write_bag,
     write_mcap,
     write_ros1,
 )  # fmt: skip
-from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 
@@ -99,15 +97,48 @@ def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     assert samples.malformed == {"gyro_channels": 1}
 
 
-@pytest.mark.parametrize("make", ["zstd chunks", "lz4 chunks", "plain chunks"])
-def test_a_recording_cut_off_by_a_crash_is_read_up_to_the_cut(make, tmp_path):
+def cut_off(path, z):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def with_a_flipped_bit(path, z):
+    data = bytearray(path.read_bytes())
+    data[data.index(z[150, :3].tobytes())] ^= 1
+    path.write_bytes(data)
+
+
+def with_an_empty_file(path, z):
+    (path / "bag_9.mcap").write_bytes(b"")
+
+
+def overwritten(path, z):
+    data, page = bytearray((path / "bag.db3").read_bytes()), 4096
+    middle = len(data) // 2 // page * page
+    data[middle : middle + 20 * page] = b"\xff" * (20 * page)
+    (path / "bag.db3").write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("make", "damage", "least", "most", "words"),
+    [
+        *((make, cut_off, 90, 209, "breaks off in the record at byte") for make in ("zstd chunks", "lz4 chunks")),
+        ("plain chunks", cut_off, 90, 209, "breaks off in the record at byte"),
+        ("plain chunks", with_a_flipped_bit, 240, 299, "fails its checksum and was left out"),
+        # After the gap the aligner wants to see a second message before it believes the first.
+        ("three mcap files", with_an_empty_file, 198, 200, "bag_9.mcap is empty"),
+        ("rosbag2 sqlite3", overwritten, 1, 299, "it is damaged"),
+    ],
+)
+def test_what_is_damaged_is_left_out_and_said(make, damage, least, most, words, tmp_path):
     messages, z = flight(SAMPLES)
     path = MAKES[make](tmp_path / "bag", messages)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    damage(path, z)
     stamp, values, samples = read(path)
-    assert 0.3 * SAMPLES < len(stamp) < 0.7 * SAMPLES
-    np.testing.assert_array_equal(values[:-1], z[: len(stamp) - 1])
-    assert any("breaks off in the record at byte" in line for line in samples.recording.damage.report())
+    assert least <= len(stamp) <= most
+    whole = np.isfinite(values).all(axis=1)
+    assert (~whole).sum() <= 2
+    np.testing.assert_array_equal(values[whole], z[(stamp[whole] - START) // STEP])
+    assert any(words in line for line in samples.recording.damage.report())
 
 
 def contents(folder):
@@ -167,31 +198,6 @@ def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_le
     assert "its last transaction was not finished" in samples.recording.damage.report()[0]
 
 
-def test_a_damaged_chunk_is_left_out_and_said(tmp_path):
-    messages, z = flight(SAMPLES)
-    path = write_mcap(tmp_path / "bag.mcap", messages, CompressionType.NONE)
-    data = bytearray(path.read_bytes())
-    data[data.index(z[150, :3].tobytes())] ^= 1
-    path.write_bytes(data)
-    stamp, _, samples = read(path)
-    assert 0.8 * SAMPLES < len(stamp) < SAMPLES
-    assert STAMP[150] not in stamp
-    (line,) = samples.recording.damage.report()
-    assert "fails its checksum and was left out" in line
-
-
-def test_one_damaged_file_among_several_is_left_out_and_said(tmp_path):
-    messages, z = flight(SAMPLES)
-    path = split(tmp_path / "bag", messages, StoragePlugin.MCAP)
-    (path / "bag_9.mcap").write_bytes(b"")
-    _, values, samples = read(path)
-    np.testing.assert_array_equal(values[:100], z[:100])
-    # After the gap the aligner wants to see a second message before it believes the first.
-    np.testing.assert_array_equal(values[100:], z[300 - len(values[100:]) :])
-    assert len(values) >= 198
-    assert any("bag_9.mcap is empty" in line for line in samples.recording.damage.report())
-
-
 def pointer(path):
     """What git has in the place of a large file."""
     path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 99\n")
@@ -234,20 +240,6 @@ def test_a_topic_of_another_type_is_refused(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", messages, types={TOPICS[0]: ARRAY})
     with pytest.raises(BagError, match=r"is std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/Imu"):
         read(path)
-
-
-def test_a_database_that_another_program_damaged_is_read_as_far_as_it_goes(tmp_path):
-    messages, z = flight(3000)
-    file = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3) / "bag.db3"
-    data, page = bytearray(file.read_bytes()), 4096
-    middle = len(data) // 2 // page * page
-    data[middle : middle + 20 * page] = b"\xff" * (20 * page)
-    file.write_bytes(data)
-    stamp, values, samples = read(file.parent)
-    assert 0 < len(stamp) < 3000
-    assert samples.recording.damage.report()
-    known = np.isin(stamp, START + STEP * np.arange(3000)) & np.isfinite(values).all(axis=1)
-    np.testing.assert_array_equal(values[known], z[(stamp[known] - START) // STEP])
 
 
 def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
@@ -296,13 +288,12 @@ def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
     data = path.read_bytes()
     at = data.index(b"BZh")
     size = struct.unpack_from("<I", data, at - 4)[0]
-    bomb = bz2.compress(bytes(1 << 28))
+    packer = bz2.BZ2Compressor()
+    bomb = b"".join([*map(packer.compress, [bytes(1 << 20)] * 256), packer.flush()])
     assert len(bomb) <= size
     path.write_bytes(data[:at] + bomb + bytes(size - len(bomb)) + data[at + size :])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(BagError, match="has no usable message on"):
+    with bounded(growth=250_000), pytest.raises(BagError, match="has no usable message on"):
         read(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 250_000
 
 
 def test_an_index_without_end_is_refused(tmp_path):

@@ -1,21 +1,26 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where compiled code is kept, and that nothing of it can go wrong in a way that stops a start."""
+"""Where compiled code is kept, that nothing of it can stop a start, and what is seen of compiling."""
 
 import itertools
 import os
 import pickle
+import re
 import shutil
 import stat
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numba
 import pytest
 
 from fdi_ros.compiling.compiled import Real, _Kept, record
+from fdi_ros.compiling.notice import WORDS, announced, clock, compiling_seconds, refused
+from fdi_ros.errors import FdiError
 
 SCRIPT = """
 import logging, sys
@@ -51,23 +56,22 @@ def copy(tmp_path, root):
 
 @pytest.fixture(scope="module")
 def started(tmp_path_factory, root):
-    """A copy in which it was started once, where that has kept what it compiled, and a copy of all."""
+    """A copy in which two were started for the first time at once, what came of them, and a copy of all."""
     folder = tmp_path_factory.mktemp("started")
     package = place(folder / "at", root)
-    kept, says, output = outcome(start(package))
-    assert says == "0 0"
-    assert "compiled it in" in output
+    both = [start(package), start(package)]
+    outcomes = [outcome(process) for process in both]
     shutil.copytree(folder / "at", folder / "kept")
-    return package, kept, folder / "kept"
+    return package, outcomes, folder / "kept"
 
 
 @pytest.fixture
 def warm(started):
     """That copy as it was then, which a test may change, and where its results are: they belong to its place."""
-    package, kept, original = started
+    package, outcomes, original = started
     shutil.rmtree(package.parent)
     shutil.copytree(original, package.parent)
-    return package, kept
+    return package, outcomes[0][0]
 
 
 def start(copy, **environment):
@@ -86,17 +90,16 @@ def outcome(process):
     return Path(lines["kept"].removeprefix("in ")), lines["says"], output
 
 
-def test_first_starts_at_once_then_a_load(copy):
-    both = [start(copy), start(copy)]
-    (kept, says, output), second = (outcome(process) for process in both)
-    assert says == "0 0"
-    assert kept.is_relative_to(copy / "fdi_ros" / "__pycache__")
-    assert second[:2] == (kept, says)
+def test_first_starts_at_once_then_a_load(started, warm):
+    copy, made = warm
+    assert made.is_relative_to(copy / "fdi_ros" / "__pycache__")
+    first, second = started[1]
+    assert first[:2] == second[:2] == (made, "0 0")
     # The slower one may have found all that the faster one had kept.
-    assert "compiled it in" in output + second[2]
-    warm = outcome(start(copy))
-    assert warm[:2] == (kept, says)
-    assert "compiled it in" not in warm[2]
+    assert "compiled it in" in first[2] + second[2]
+    third = outcome(start(copy))
+    assert third[:2] == (made, "0 0")
+    assert "compiled it in" not in third[2]
 
 
 def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
@@ -203,11 +206,16 @@ def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path):
     assert [kept[0].load(key) for key in keys] == [str(key) for key in keys]
 
 
-def test_results_that_cannot_be_kept_are_said_and_stop_nothing(tmp_path, caplog):
-    # A verb that another test ran may have been told to be quiet.
-    caplog.set_level("WARNING", logger="fdi_ros")
+@pytest.fixture
+def said(caplog):
+    """What is logged: a verb that another test ran may have been told to be quiet."""
+    caplog.set_level("INFO", logger="fdi_ros")
+    return caplog
+
+
+def test_results_that_cannot_be_kept_are_said_and_stop_nothing(tmp_path, said):
     _Kept(str(tmp_path / "gone"), "function", "stamp").save("key", "data")
-    assert caplog.messages == [f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"]
+    assert said.messages == [f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"]
 
 
 def test_a_field_may_not_hide_behind_an_attribute_of_plain_records():
@@ -244,3 +252,50 @@ def test_a_planted_lock_is_neither_followed_nor_waited_for(tmp_path):
     os.mkfifo(lock)
     kept.save("key", "data")
     assert kept.load("key") == "data"
+
+
+# What is seen of compiling -------------------------------------------------------------------------------------------
+
+
+def new_function():
+    """One that no call has compiled yet."""
+    return numba.njit(lambda x: x + 1)
+
+
+def test_compiling_is_announced_before_or_refused(said):
+    one, two = new_function(), new_function()
+    with announced():
+        one(1)
+    assert said.messages == [WORDS]
+    with announced(), refused("no"):
+        one(1)
+    with pytest.raises(FdiError, match=r"^not now$"), refused("not now"):
+        two(1)
+    assert two(1) == 2
+    assert said.messages == [WORDS]
+
+
+def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled():
+    wall, own, compiled = time.perf_counter(), clock(), compiling_seconds()
+    new_function()(1)
+    spent = compiling_seconds() - compiled
+    assert spent > 0
+    assert clock() - own <= time.perf_counter() - wall - spent
+    with pytest.raises(FdiError), refused("no"):
+        new_function()(1)
+    before = compiling_seconds()
+    assert compiling_seconds() == before
+
+
+def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
+    """The first on a machine; those after it say nothing."""
+    command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(flight)]
+    # Another kind of compiled code than that of the package, which would be taken over.
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_BOUNDSCHECK": "1"}
+    for said in (WORDS, ""):
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root, env=environment)
+        first, _, rest = done.stderr.partition("\n")
+        assert first == said
+        assert all(re.fullmatch(r"compiling +\d+ % \|[# ]{20}\| \d+ s", line) for line in rest.splitlines())
+        assert done.stdout.startswith("READY: ")
+        assert [*tmp_path.rglob("*.nbi")], "kept in the folder that the user wishes"

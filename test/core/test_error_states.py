@@ -42,17 +42,11 @@ def random_channels(seed, n):
     return rng, axes.copy(), root @ root.T
 
 
-def padded(matrix):
-    full = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
-    full[: len(matrix), : len(matrix)] = matrix
-    return full
-
-
 def estimator(n, units):
-    layout, states, unit = allocate(Layout), allocate(ErrorStates), np.arange(n) * units // n
-    prepare_layout(layout[0], unit, units, PRIORS, WALKS)
-    begin_states(layout[0], states[0], np.full(n, 0.01))
-    return layout[0], states[0], unit
+    layout, states = allocate(Layout)[0], allocate(ErrorStates)[0]
+    prepare_layout(layout, np.arange(n) * units // n, units, PRIORS, WALKS)
+    begin_states(layout, states, np.full(n, 0.01))
+    return layout, states
 
 
 class Measured:
@@ -60,7 +54,7 @@ class Measured:
 
     def __init__(self, seed, n):
         self.rng, self.axes, self.noise = random_channels(seed, n)
-        self.layout, self.states, _ = estimator(n, n // 3)
+        self.layout, self.states = estimator(n, n // 3)
         predict(self.layout, self.states, 3.0)
         self.n, self.count = n, int(self.layout["count"])
         self.x, self.p = self.x_and_p()
@@ -68,8 +62,9 @@ class Measured:
         self.rate = self.rng.normal(0, 1, 3)
         fill_signals(self.layout, self.rate, self.rng.normal(0, 5, MAX_CHANNELS), self.at["signals"])
         project(self.layout, self.states, self.at)
-        known = self.noise + self.at["covariance"][:n, :n]
-        compute_joint_weights(self.parity, n, (1 << n) - 1, padded(known))
+        known = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
+        known[:n, :n] = self.noise + self.at["covariance"][:n, :n]
+        compute_joint_weights(self.parity, n, (1 << n) - 1, known)
         eliminate_rate(self.parity, n, self.axes, 1e-6)
         self.columns = self.at["columns"][:n, : self.count].copy()
         self.information = self.parity["information"][:n, :n].copy()
@@ -122,7 +117,7 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
 @given(seconds=st.floats(0.01, 5000.0))
 def test_time_passes_as_in_the_linear_model(seconds):
     """The mean by the matrix exponential; that the steps are cut does not matter to it."""
-    layout, states, _ = estimator(6, 2)
+    layout, states = estimator(6, 2)
     count, rng = int(layout["count"]), np.random.default_rng(1)
     states["x"][:count] = rng.normal(0, 1, count)
     flow = np.zeros((count, count))

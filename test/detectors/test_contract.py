@@ -316,7 +316,7 @@ AS_MANY = [
     *((name, usual_geometry(name), CONSTANT, 1e-2) for name in RATE_OPTIONS),
     *((name, Geometry.cone(4), FOUR, 1e-2) for name in SEARCHES),
     *((name, geometry, CONSTANT, 1e-3) for name in SEARCHES for geometry in (CONE, DODECAHEDRON)),
-    *(("projector", random_axes(np.random.default_rng(n), n), CONSTANT, 1e-3) for n in (5, 6, 7, 9)),
+    *(("projector", random_axes(np.random.default_rng(n), n), CONSTANT, 1e-3) for n in (5, 6, 7, 9, 12)),
     *(("recursive", *unequal(n, n), 1e-3) for n in (4, 5, 6, 9)),
     ("determinant", *unequal(6, 5), 1e-3),
     ("likelihood_ratio", DODECAHEDRON, UNLIKE, 1e-3),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from detectors.detector_trials import sound
 
-from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros import Geometry, NoiseModel
 from fdi_ros.detectors.papers.cusum import Cusum, threshold_for
 
 UNIT = NoiseModel(1.0)
@@ -17,12 +17,6 @@ MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)
 TWO_SIDES = np.array([[1.0, -1.0], [-1.0, 1.0]])
 TABLE = [(0.25, 66.6, 510), (0.5, 35.5, 138), (1.0, 18.5, 37), (2.0, 9.4, 10)]
 """Shift, threshold for a run length of 3.6e8 samples of one two-sided sum, mean samples until it is found."""
-
-
-def cusum(geometry, noise=UNIT, **options):
-    detector = create_detector("cusum", geometry, noise, **options)
-    assert isinstance(detector, Cusum)
-    return detector
 
 
 def runs_to_alarm(detector, noise, runs, seed, shift=0.0, block=500):
@@ -41,7 +35,7 @@ def runs_to_alarm(detector, noise, runs, seed, shift=0.0, block=500):
 
 def test_scores_are_the_sums():
     geometry, z = Geometry.dodecahedron(), np.random.default_rng(1).normal(0.3, 1, (200, 6))
-    detector = cusum(geometry, shift=0.5)
+    detector = Cusum(geometry, UNIT, shift=0.5)
     w = (z @ geometry.S) / geometry.sensitivity
     up = down = np.zeros(6)
     for row, scores in zip(w, detector.detect(z).scores, strict=True):
@@ -53,7 +47,7 @@ def test_scores_are_the_sums():
 def test_threshold_and_delay_are_those_published(shift, h, published):
     assert threshold_for(3.6e8, shift / 2, TWO_SIDES) == pytest.approx(h, abs=0.06)
     geometry = Geometry.cone(4)
-    detector = cusum(geometry, shift=shift)
+    detector = Cusum(geometry, UNIT, shift=shift)
     # Four channels carry a single statistic: the detector's threshold is that of one two-sided sum.
     assert detector.threshold == pytest.approx(h, abs=0.06)
     fault = shift / geometry.sensitivity[1] * np.eye(4)[1]
@@ -72,7 +66,7 @@ def test_threshold_and_delay_are_those_published(shift, h, published):
 )
 def test_run_length(geometry, noise, shift):
     # 3.6e8 samples take minutes: here shorter ones, where the approximation is worse.
-    detector = cusum(geometry, noise, shift=shift, run_length=1000)
+    detector = Cusum(geometry, noise, shift=shift, run_length=1000)
     lengths = runs_to_alarm(detector, noise, 600, 5)
     assert lengths.mean() == pytest.approx(1000, rel=0.14)
 
@@ -84,7 +78,7 @@ def test_a_scale_factor_error_in_a_long_turn_is_no_drift():
     turn = np.array([1.0, -0.7, 0.5])
     z = rng.normal(0, 0.003, (20_000, 6))
     z[5000:15_000] += (geometry.axes @ turn) * (1 + 0.002 * rng.uniform(-2, 2, 6))
-    detector = cusum(geometry, noise, run_length=1e7)
+    detector = Cusum(geometry, noise, run_length=1e7)
     assert not detector.detect(z).alarm.any()
     drifting = z.copy()
     drifting[15_000:, 3] += 0.003
@@ -99,8 +93,8 @@ def test_what_a_start_up_average_leaves_is_no_drift():
     geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
     noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
     # A small shift has a small k: this is where the bias adds up.
-    aware, unaware = (cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
-    usual, found = cusum(geometry, noise), 0
+    aware, unaware = (Cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
+    usual, found = Cusum(geometry, noise), 0
     for _ in range(12):
         z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
         for detector in (aware, usual, unaware):
@@ -116,7 +110,7 @@ def test_what_a_start_up_average_leaves_is_no_drift():
 
 
 def test_onset():
-    detector, rng, off = cusum(Geometry.dodecahedron(), shift=1.0), np.random.default_rng(11), []
+    detector, rng, off = Cusum(Geometry.dodecahedron(), UNIT, shift=1.0), np.random.default_rng(11), []
     for _ in range(150):
         begin = int(rng.integers(300, 700))
         z = rng.standard_normal((begin + 400, 6))
@@ -138,7 +132,7 @@ def test_no_sound_channel_is_isolated_under_rate_dependent_noise(scale, timing, 
     """A large fault passes for rate in the statistics of the others, and shrinks them."""
     geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(13)
     noise = NoiseModel(0.0025, scale, timing)
-    detector = cusum(geometry, noise)
+    detector = Cusum(geometry, noise)
     for channel in range(6):
         z, acceleration = sound(rng, geometry, noise, 500)
         z[150:, channel] += size

@@ -12,14 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros import FdiError, Geometry, NoiseModel
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 
 
 def guaranteed(geometry, bound=1.0, **options):
-    detector = create_detector("guaranteed", geometry, NoiseModel(1.0, bound=bound), **options)
-    assert isinstance(detector, Guaranteed)
-    return detector
+    return Guaranteed(geometry, NoiseModel(1.0, bound=bound), **options)
 
 
 def sample(rng, geometry, bound, faults):
@@ -190,7 +188,7 @@ SIX = Geometry.two_triad_cone()
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: create_detector("guaranteed", SIX, NoiseModel(1.0)), "needs noise.bound"),
+        (lambda: Guaranteed(SIX, NoiseModel(1.0)), "needs noise.bound"),
         (lambda: guaranteed(Geometry.cone(5), max_faults=2), "max_faults is 2 with 5 channels, expected at most 1"),
         (lambda: guaranteed(Geometry.cone(4), max_faults=1), "max_faults is 1 with 4 channels, expected at most 0"),
         (lambda: guaranteed(Geometry.cone(10)), "guaranteed runs on 4 to 9 channels, got 10"),

@@ -3,6 +3,7 @@
 
 """Naming by odds: the hypotheses against an independent Bayes, the set chosen, and what cannot be told apart."""
 
+from collections import defaultdict
 from itertools import combinations
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros import Geometry, NoiseModel
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
@@ -27,35 +28,37 @@ from fdi_ros.detectors.naming import (
     add_units,
     explain,
 )
+from fdi_ros.detectors.sequential import Sequential
 
 
 class Mean:
     """A mean to be explained, its covariance, and the motion it is of."""
 
-    def __init__(self, geometry, y, covariance):
+    def __init__(self, geometry, y, covariance, rate, acceleration):
         self.geometry, self.n, self.y, self.covariance = geometry, geometry.n, y, covariance
-        self.params = create_detector("sequential", geometry, NoiseModel(1.0)).constants
+        self.params = Sequential(geometry, NoiseModel(1.0)).constants[0]
         self.rows = allocate(Inference)
         own = self.own = self.rows[0]
         own["mask"] = own["judged"] = (1 << self.n) - 1
         own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, covariance
-
-    def moving(self, rate, acceleration):
-        self.own["rate"], self.own["angular_acceleration"][: self.n] = rate, self.geometry.axes @ acceleration
-        return self
+        own["rate"], own["angular_acceleration"][: self.n] = rate, geometry.axes @ acceleration
+        explain(self.params, own)
 
     def hypotheses(self):
-        """Channels, logarithm of the odds and kind of each."""
-        explain(self.params[0], self.own)
+        """Channels, kind and logarithm of the odds of each."""
         self.own["count"] = 0
         add_channels(self.own, self.n)
-        add_units(self.params[0], self.own)
+        add_units(self.params, self.own)
         count = int(self.own["count"])
-        return list(zip(*(self.own[name][:count].tolist() for name in ("members", "odds", "whole")), strict=True))
+        return zip(*(self.own[name][:count].tolist() for name in ("members", "whole", "odds")), strict=True)
 
 
-def channels_of(mask):
-    return {i for i in range(12) if mask >> i & 1}
+def by_channels(hypotheses):
+    """Kinds and odds of the hypotheses of the same channels, in order."""
+    found = defaultdict(list)
+    for members, *kind_and_odds in sorted(hypotheses, key=lambda one: one[:2]):
+        found[members].append(kind_and_odds)
+    return found
 
 
 def evidence(mean, errors):
@@ -84,7 +87,7 @@ def oracle(mean):
             # What can hardly be told apart has no figure worth comparing.
             variance = float((error**2 + np.diag(scatter)).mean()) if np.linalg.cond(scatter) < 1e4 else np.nan
         ratio = evidence(mean, variance * directions @ directions.T) - healthy if variance == variance else np.nan
-        found.append((mask_of(channels), np.log(prior) + ratio - (0.0 if std else spread), int(std > 0)))
+        found.append((mask_of(channels), int(std > 0), np.log(prior) + ratio - (0.0 if std else spread)))
 
     for i in range(n):
         take((i,), 1.0, unit_vectors[:, [i]])
@@ -113,27 +116,21 @@ def random_mean(seed, n):
     root = 1e-3 * (rng.normal(0, 0.4, (n, n)) + np.diag(rng.uniform(0.7, 2.0, n)))
     y = geometry.axes @ rng.normal(0, 1, 3) + root @ rng.standard_normal(n)
     y[rng.integers(n)] += rng.normal(0, 0.01)
-    return Mean(geometry, y, root @ root.T).moving(rng.normal(0, 1, 3), rng.normal(0, 20, 3))
+    return Mean(geometry, y, root @ root.T, rng.normal(0, 1, 3), rng.normal(0, 20, 3))
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
 def test_odds_are_those_of_normal_densities(seed, n):
     mean = random_mean(seed, n)
-    ours = {(m, w, k): o for k, (m, o, w) in enumerate(sorted(mean.hypotheses(), key=lambda one: (one[0], one[2])))}
-    theirs = sorted(oracle(mean), key=lambda one: (one[0], one[2]))
-    kept = {m for m, _, _ in ours}
+    ours, theirs = by_channels(mean.hypotheses()), by_channels(oracle(mean))
     # Pairs that can hardly be told apart are left out.
-    assert all(m.bit_count() == 2 for m, _, _ in theirs if m not in kept)
-    theirs = [one for one in theirs if one[0] in kept]
-    assert [(m, w) for m, w, _ in ours] == [(m, w) for m, _, w in theirs]
-    for mask in kept:
-        mine, expected = (
-            np.sort(list(odds))
-            for odds in ((o for (m, _, _), o in ours.items() if m == mask), (o for m, o, _ in theirs if m == mask))
-        )
+    assert all(channels.bit_count() == 2 for channels in theirs.keys() - ours.keys())
+    for channels, found in ours.items():
+        (kinds, odds), (expected_kinds, expected) = zip(*found, strict=True), zip(*theirs[channels], strict=True)
+        assert kinds == expected_kinds
         if np.isfinite(expected).all():
-            np.testing.assert_allclose(mine, expected, rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(np.sort(odds), np.sort(expected), rtol=1e-4, atol=1e-3)
 
 
 @settings(max_examples=25)
@@ -142,8 +139,7 @@ def test_what_no_hypothesis_explains_blames_all(seed, n):
     """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""
     mean = random_mean(seed, n)
     root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
-    explain(mean.params[0], mean.own)
-    best = sorted(channels_of(int(mean.own["likeliest"])))
+    best = [i for i in range(n) if int(mean.own["likeliest"]) >> i & 1]
     columns = root @ np.hstack([mean.geometry.axes, np.eye(n)[:, best]])
     left = root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
     limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)

@@ -4,17 +4,17 @@
 """Sequential evidence: the sums and their run length, delays, what is no fault, and the bound of a single value."""
 
 import math
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from detectors.detector_trials import random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import RATE, SIGMA, START, declarations, parallel, swing
+from monitor.streams import RATE, SIGMA, START, declarations, mounted, parallel, swing
 from vehicles import vehicle
 
-from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros import FdiError, Geometry, NoiseModel
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
@@ -27,20 +27,7 @@ BOUND = {2.0: 18.8, 4.0: 5.2, 8.0: 1.6}
 
 
 def sequential(geometry=CONE, noise=UNIT, **options):
-    detector = create_detector("sequential", geometry, noise, **options)
-    assert isinstance(detector, Sequential)
-    return detector
-
-
-@cache
-def built():
-    return sequential()
-
-
-def fresh():
-    """A detector without memory; building one anew takes longer than a short stream."""
-    built().reset()
-    return built()
+    return Sequential(geometry, noise, **options)
 
 
 def white(seed, rows, n=6):
@@ -53,26 +40,25 @@ def fault(channel, size, geometry=CONE):
 
 
 @cache
-def noisy():
-    fresh().detect(white(99, 4000))
-    return built().states.copy()
+def built():
+    """One detector for many streams; building one anew takes longer than a short stream."""
+    return sequential()
 
 
 @cache
-def rested():
-    fresh().detect(0.2 * white(16, 20_000))
+def memory(size, rows):
+    built().reset()
+    built().detect(size * white(99, rows))
     return built().states.copy()
 
 
-def after(states):
-    """The detector with that memory."""
-    built().states[:] = states
+def after(size, rows):
+    """The detector after so much noise, of so many standard deviations as expected, which it then knows."""
+    built().states[:] = memory(size, rows)
     return built()
 
 
-def measured():
-    """The same detector after 40 s of noise as expected, which it then knows."""
-    return after(noisy())
+fresh, measured, rested = partial(after, 1.0, 0), partial(after, 1.0, 4000), partial(after, 0.2, 20_000)
 
 
 def test_sums_are_no_more_than_the_number_of_samples_in_the_mean():
@@ -116,9 +102,9 @@ def test_what_has_passed_is_forgotten():
     """Sums are bounded: a fault of any size and length leaves no more than noise takes away in minutes."""
     detector = measured()
     detector.detect(white(7, 5000) + fault(0, 1000.0))
-    after = detector.detect(white(8, 40_000))
-    assert after.alarm[0]
-    assert not after.alarm[-1]
+    alarm = detector.detect(white(8, 40_000)).alarm
+    assert alarm[0]
+    assert not alarm[-1]
 
 
 @settings(max_examples=40)
@@ -165,10 +151,9 @@ def spiky(rng):
     return z
 
 
-RISE = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
 NOISES = {
     "twice as large at once": (measured, [2.0 * white(seed, 600) for seed in range(20)]),
-    "as expected after a long rest": (lambda: after(rested()), [white(seed, 400) for seed in range(20)]),
+    "as expected after a long rest": (rested, [white(seed, 400) for seed in range(20)]),
     "coloured": (fresh, [coloured(seed, one) for seed in range(4) for one in (0.5, 0.9)]),
     "of heavy tails": (fresh, [np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2)]),
     "with spikes now and then": (fresh, [spiky(np.random.default_rng(10))]),
@@ -182,8 +167,9 @@ def test_noise_of_another_kind_is_no_fault(detector, streams):
 
 
 def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
+    growth = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
     for seed in range(20):
-        assert not measured().detect(RISE * white(seed, 600)).isolated.any()
+        assert not measured().detect(growth * white(seed, 600)).isolated.any()
 
 
 def test_nothing_is_found_in_streams_without_noise():
@@ -206,13 +192,16 @@ def test_any_axes_without_alarm_for_20_s(seed, n):
     assert not verdict.alarm.any()
 
 
+def stamped(seconds, z):
+    return Block(START + (seconds * 1e9).astype(np.int64), z)
+
+
 def flown(fault, seed, **changes):
     """Three parallel triads at rest in the monitor, after ten seconds with a bias of so many noise_std on imu_2.y."""
     pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
     z = SIGMA * white(seed, 2500, 9)
     z[1000:, 4] += fault * SIGMA
-    stamp = START + np.arange(len(z), dtype=np.int64) * round(1e9 / RATE)
-    return pipeline, pipeline.process(Block(stamp, z))
+    return pipeline, pipeline.process(stamped(np.arange(2500) / RATE, z))
 
 
 @pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
@@ -255,9 +244,8 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind, value):
 def two_units(seconds, late, seed):
     """Two parallel units in quick motion, of which the second stamps its values late."""
     z = np.hstack([swing(seconds), swing(seconds - late)])
-    z += SIGMA * np.random.default_rng(seed).standard_normal(z.shape)
-    config = parallel(2, detector__name="sequential")
-    return Pipeline.from_config(config), Block(START + (seconds * 1e9).astype(np.int64), z)
+    z += SIGMA * white(seed, *z.shape)
+    return Pipeline.from_config(parallel(2, detector__name="sequential")), stamped(seconds, z)
 
 
 @pytest.mark.parametrize("hole", [0.02, 0.05, 0.1])
@@ -284,7 +272,7 @@ def flown_with_a_hole(units, hole, fault, seed):
     z[seconds > 12.0 + hole / 2, 4] += fault
     there = (seconds < 12.0) | (seconds >= 12.0 + hole)
     pipeline = Pipeline.from_config(parallel(units, detector__name="sequential"))
-    return pipeline.process(Block(START + (seconds[there] * 1e9).astype(np.int64), z[there]))
+    return pipeline.process(stamped(seconds[there], z[there]))
 
 
 @pytest.mark.parametrize("hole", [2.0, 6.0, 20.0])
@@ -312,3 +300,31 @@ def test_after_a_reset_a_clock_that_was_set_is_followed(offset):
     status = pipeline.status()
     assert abs(status.delays[1] - offset) < 4 * status.delay_std[1] + 1e-4
     assert status.delay_std[1] < 0.001
+
+
+def judged_with_biases(axes, faults, seed):
+    """The output on biases from 12 s on, whether the level covers the error a second later, and the level then."""
+    seconds = np.arange(3000) / RATE
+    rate = swing(seconds) * (seconds > 5.0)[:, None]
+    z = rate @ axes.T + SIGMA * white(seed, 3000, len(axes))
+    for channel, bias in faults.items():
+        z[1200:, channel] += bias
+    output = Pipeline(mounted(axes, bias__startup_bias_duration=4.0)).process(stamped(seconds, z))
+    return output, (np.abs(output.rate - rate) <= output.level)[1301:].all(), output.level[1301:]
+
+
+@pytest.mark.parametrize("size", [0.03, 0.3])
+def test_the_level_covers_a_pair_that_has_the_third_named(size):
+    """Two of three parallel gyros that are wrong alike, as parity must see it."""
+    output, covered, level = judged_with_biases(np.tile(np.eye(3), (3, 1)), {0: size, 3: size}, 1)
+    assert [event.channel for event in output.events if event.after is ChannelState.FAULTY] == [6]
+    assert covered
+    assert size < level[:, 0].max() < size + 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_no_others_explain_leaves_the_level_alone(seed):
+    """On the cone no one or two channels look like a large fault of another; what is left is checked by fewer."""
+    output, covered, level = judged_with_biases(CONE.axes, {0: 0.5}, seed)
+    assert covered
+    assert np.median(level) < 3.0 * np.median(output.level[900:1200])
