@@ -33,47 +33,33 @@ LAYERS = (
 )
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 BAG_LIBRARIES = {"rosbags", "mcap"}
-LINK_LIBRARIES = {"pymavlink", "serial"}
-MESSAGES = {
-    "builtin_interfaces",
-    "diagnostic_msgs",
-    "geometry_msgs",
-    "lifecycle_msgs",
-    "rcl_interfaces",
-    "rosgraph_msgs",
-    "sensor_msgs",
-    "std_msgs",
-    "std_srvs",
-}
-ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
+MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "rosgraph", "sensor", "std")}
+SERVICES = {"builtin_interfaces", "rcl_interfaces", "std_srvs"}
+ROS = MESSAGES | SERVICES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
 ONLY_IN = {
     **dict.fromkeys(ROS, ("ros", "only ros does")),
     **dict.fromkeys(BAG_LIBRARIES, ("bag", "only bag opens bag files, and replay.outputs writes them")),
-    **dict.fromkeys(LINK_LIBRARIES, ("mavlink", "only mavlink talks to autopilots")),
+    **dict.fromkeys(("pymavlink", "serial"), ("mavlink", "only mavlink talks to autopilots")),
 }
 """The only part that imports a library, in words."""
-COMPILER = {"numba", "llvmlite"}
 ASKED_FOR = {"monitor.output": ("pandas",)}
 """Libraries imported only where a user asks for what they make."""
 NUMPY_ALONE = {"model", "compiling", "core", "estimator", "detectors", "sources", "monitor", "errors"}
 
 
-def imports(tree):
-    """Full names of all modules that a module imports, wherever it does."""
-    for node in ast.walk(tree):
+@cache
+def imports(path):
+    """Full names of all modules that a file imports, wherever it does."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "imports are absolute"
             if node.module != "fdi_ros":
-                yield str(node.module)
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-
-
-@cache
-def imported(path):
-    """Full names of all modules that a file imports."""
-    return tuple(imports(ast.parse(path.read_text())))
+                found.append(str(node.module))
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return found
 
 
 def violations(module, names):
@@ -89,7 +75,7 @@ def violations(module, names):
                 found.append(f"{part} imports {name} through the package's own front")
         elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.outputs":
             found.append(f"{module} imports {name}: {ONLY_IN[package][1]}")
-        elif package in COMPILER:
+        elif package in ("numba", "llvmlite"):
             if part != "compiling":
                 found.append(f"{module} imports {name}: only compiling knows the compiler")
         elif part in NUMPY_ALONE and package not in {"numpy", *ASKED_FOR.get(module, ())} | sys.stdlib_module_names:
@@ -106,7 +92,7 @@ def modules():
 def test_no_import_points_up():
     known = modules()
     assert {module.split(".")[1] for module in known} - LEVEL.keys() == set(), "they have no place in the layers"
-    found = {module: violations(module.partition(".")[2], imported(path)) for module, path in known.items()}
+    found = {module: violations(module.partition(".")[2], imports(path)) for module, path in known.items()}
     assert {module: told for module, told in found.items() if told} == {}
 
 
@@ -116,7 +102,7 @@ def test_no_import_goes_in_a_circle():
     def there(name):
         return next((one for one in (name, f"{name}.__init__") if one in known), None)
 
-    graph = {module: {there(name) for name in imported(path)} - {None, module} for module, path in known.items()}
+    graph = {module: {there(name) for name in imports(path)} - {None, module} for module, path in known.items()}
     graphlib.TopologicalSorter(graph).prepare()
 
 

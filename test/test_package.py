@@ -3,7 +3,6 @@
 
 """The package as a ROS workspace and the Dockerfile build it: installed where ros2 run and ros2 launch look."""
 
-import ast
 import importlib
 import json
 import os
@@ -130,7 +129,7 @@ def test_the_manifest_names_every_ros_package_in_use(root):
         name.partition(".")[0]
         for folder in ("fdi_ros", "launch")
         for path in (root / folder).rglob("*.py")
-        for name in imports(ast.parse(path.read_text()))
+        for name in imports(path)
     } & ROS
     assert used <= named
 

@@ -46,15 +46,19 @@ UNTOLD = 4
 FAULT = "channel=g2 kind=bias size=0.2 start=20"
 
 
-def test_replay_prints_a_table_and_writes_the_summary(tmp_path, replay):
-    code, out, err = replay("--fault", FAULT, "--json", tmp_path / "s.json")
+def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sample(tmp_path, replay):
+    code, out, err = replay("--fault", FAULT, "--json", tmp_path / "s.json", "--csv", tmp_path / "s.csv")
     assert (code, err) == (0, "")
     assert "\r" not in out
     assert out.startswith("1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated")
     assert re.search(r"^  1\. g2 FAULTY from 20\.[01]\d\d s \([+]0\.20", out, re.MULTILINE)
     assert "\n       injected there: bias on g2\n" in out
     assert json.loads((tmp_path / "s.json").read_text())["faults"][0]["declared_channels"] == ["g2"]
-    assert os.listdir(tmp_path) == ["s.json"]
+    rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
+    assert len(rows) == 6001
+    assert (rows[0]["rate_x"], rows[0]["g1.state"], rows[999]["g1.state"]) == ("", "UNCHECKED", "OK")
+    assert abs(float(rows[999]["g1"])) < 4
+    assert sorted(os.listdir(tmp_path)) == ["s.csv", "s.json"]
 
 
 def test_scenario_and_fault_add_up(root, replay):
@@ -243,14 +247,6 @@ def test_every_help_has_examples_that_can_be_typed_and_all_choices(capsys, verb)
     assert not [choice for choice in CHOICES.get(verb, ()) if choice not in said]
 
 
-def test_csv_has_a_line_for_every_sample(tmp_path, replay):
-    replay("--csv", tmp_path / "s.csv", "--end", 10)
-    rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
-    assert len(rows) == 1000
-    assert (rows[0]["rate_x"], rows[0]["g1.state"], rows[-1]["g1.state"]) == ("", "UNCHECKED", "OK")
-    assert abs(float(rows[-1]["g1"])) < 4
-
-
 def test_compile_leaves_nothing_to_compile(fdi, refused):
     code, out, err = fdi("compile", "--detector", "max_residual", "guaranteed", "--json", "-")
     said, _, folder = err.rstrip("\n").rpartition(" in ")
@@ -282,15 +278,13 @@ print({name for name, _ in forms() - before})
 """Compiled functions that verbs call with other types than `fdi compile` does."""
 
 
-RUNS_HERE = tuple(name for name in DETECTORS if name != "determinant")
-"""determinant is of five channels, the bundled flight has six."""
-
-
 def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_path):
     units, out = root / "config" / "two_imus.yaml", tmp_path / "out.yaml"
+    # Of five channels, and the bundled flight has six.
+    here = [name for name in DETECTORS if name != "determinant"]
     used = [
         ["replay", flight, "--config", config, "--end", 21, "--fault", FAULT],
-        *(["replay", flight, "--config", config, "--end", 4, "--detector", name] for name in RUNS_HERE),
+        *(["replay", flight, "--config", config, "--end", 4, "--detector", name] for name in here),
         ["replay", flight, "--config", units, "--output", tmp_path / "bag"],
         ["setup", flight, "--output", out],
         ["inspect", flight],
@@ -320,12 +314,6 @@ def test_results_are_replaced_if_asked_for(tmp_path, refused, flight, config):
         assert json.loads(there.read_text())["samples"] == 100
         assert sorted(os.listdir(bag)) == ["metadata.yaml", "out.mcap"]
         assert sorted(os.listdir(tmp_path)) == ["link.json", "out", "s.json"]
-
-
-def test_what_is_open_already_is_written_through(fdi, config, tmp_path):
-    with (tmp_path / "figures.json").open("wb") as file:
-        assert fdi("geometry", config, "--quiet", "--json", f"/proc/self/fd/{file.fileno()}").code == 0
-    assert json.loads((tmp_path / "figures.json").read_text())["channels"]
 
 
 def test_outputs_of_a_replay_that_fails_are_not_there(refused, flight, config, tmp_path):
@@ -453,7 +441,7 @@ def test_help_and_usage_errors_wait_for_no_compiler():
     assert set(loaded).isdisjoint({"numba", "yaml"})
 
 
-def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
+def test_devices_pipes_and_open_files_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
     words = ["replay", str(flight), "--config", str(config), "--end", "1"]
     assert command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == UNTOLD
     assert Path("/dev/null").is_char_device()
@@ -467,6 +455,9 @@ def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinar
         assert command_line.main([*words, "--json", str(pipe)]) == UNTOLD
         assert json.loads(read.result(60))["samples"] == 100
     assert pipe.is_fifo()
+    with (tmp_path / "figures.json").open("wb") as file:
+        assert command_line.main([*words, "--json", f"/proc/self/fd/{file.fileno()}"]) == UNTOLD
+    assert json.loads((tmp_path / "figures.json").read_text())["samples"] == 100
     capsysbinary.readouterr()
 
     assert command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == UNTOLD

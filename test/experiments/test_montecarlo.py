@@ -28,7 +28,7 @@ from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.outcomes import added, quantiles, share
 from fdi_ros.system import jobs
-from fdi_ros.system.files import MADE_BY, plain, write_json
+from fdi_ros.system.files import MADE_BY, plain
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -67,16 +67,17 @@ def distributed():
 ONE_WORKER = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
 
 
-def as_text(result, folder):
-    write_json(folder / "result.json", plain(result))
-    return (folder / "result.json").read_text()
+def written(folder, *words):
+    """What `fdi montecarlo` writes of the small study."""
+    result = folder / "result.json"
+    assert main(["montecarlo", str(study_file(folder, SMALL)), *words, "--json", str(result)]) == 0
+    return result.read_text()
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
-    """Result of the small study in this process, as text."""
-    folder = tmp_path_factory.mktemp("expected")
-    return as_text(run_study(load_study(study_file(folder, SMALL)), workers=1), folder)
+    """Result of the small study in this process."""
+    return written(tmp_path_factory.mktemp("expected"), "--workers", "1")
 
 
 @pytest.fixture
@@ -102,10 +103,8 @@ def killing(monkeypatch):
 def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, killing, distributed):
     with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
         came = killing(lambda: next(iter(cluster.workers.values())).pid)
-        study = load_study(study_file(tmp_path, SMALL))
-        result = run_study(study, cluster=cluster.scheduler_address)
+        assert written(tmp_path, "--scheduler", cluster.scheduler_address) == expected
     assert len(came) > 3
-    assert as_text(result, tmp_path) == expected
 
 
 def worker_process():
@@ -116,10 +115,9 @@ def worker_process():
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
 def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed(tmp_path, expected, killing):
-    result, came = tmp_path / "result.json", killing(worker_process)
-    assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]) == 0
+    came = killing(worker_process)
+    assert written(tmp_path, "--workers", "2") == expected
     assert len(came) > 3
-    assert result.read_text() == expected
 
 
 WORK = """

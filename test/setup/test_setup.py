@@ -39,11 +39,6 @@ def ready(block):
     return prepare(block, np.full(block.z.shape[1], 35.0))
 
 
-def angle(a, b):
-    """Degrees between two rotations."""
-    return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
-
-
 def test_mounts_are_found_and_taken_for_square_where_they_are():
     unit = three()
     mounts = find_mounts(ready(unit.block))
@@ -52,7 +47,8 @@ def test_mounts_are_found_and_taken_for_square_where_they_are():
     for mount, axes in zip(mounts, unit.axes.reshape(-1, 3, 3), strict=True):
         left, _, right = np.linalg.svd(axes.T)
         assert mount.rotation is not None
-        assert angle(mount.rotation, first @ left @ right) < 1.5
+        off = Rotation.from_matrix(mount.rotation @ (first @ left @ right).T)
+        assert off.magnitude() < np.radians(1.5)
         assert mount.error < np.radians(1.5)
     # The same units as if mounted otherwise: the second along the axes of the first, 3 degrees off, the third any way.
     square = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -125,6 +121,8 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     # Lines, for people, are those of the table.
     for role in ("found", "not_found", "warnings"):
         assert figures[role] == [one["words"] for one in figures["findings"] if one["role"] == role]
+    said = refused("setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
+    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
     # Nothing that exists is overwritten, and nothing is left half done.
     assert "exists already; --force overwrites it" in refused("setup", CONE, "--output", file)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
@@ -262,11 +260,6 @@ def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi, tmp_path):
     np.testing.assert_allclose(found, rest.mean(axis=0), atol=5e-4)
 
 
-def still(seconds):
-    """Values of two units that lie still."""
-    return np.random.default_rng(5).normal([0.01, -0.01, 0.0] * 2, 0.002, (100 * seconds, 6))
-
-
 UNSHOWN = {
     "short": ["NOT CALIBRATED: the recording is 6.0 s long", "mounts: 1 of 1"],
     "still": [
@@ -289,7 +282,8 @@ UNSHOWN = {
 @pytest.mark.parametrize("shown", UNSHOWN)
 def test_what_cannot_be_found_is_said_and_the_config_loads(fdi, tmp_path, shown):
     topics = None
-    z = {"factor": flight(2000)[1] * [1, 1, 1, 10, 10, 10], "still": still(12)}.get(shown, flight()[1])
+    still = np.random.default_rng(5).normal([0.01, -0.01, 0.0] * 2, 0.002, (1200, 6))
+    z = {"factor": flight(2000)[1] * [1, 1, 1, 10, 10, 10], "still": still}.get(shown, flight()[1])
     stamp = START + STEP * np.arange(len(z))
     messages = imu_messages(stamp, z)
     if shown == "array":
@@ -341,8 +335,3 @@ def test_one_sensor_on_two_topics_is_no_redundancy(how, fdi, refused, tmp_path):
     assert code in (3, 4)
     assert f"/third gives the values of {TOPICS[0]}: one sensor on two topics" in out
     assert Config.from_file(tmp_path / "own.yaml").imus.topics == TOPICS
-
-
-def test_a_reference_that_is_no_unit_is_refused(refused, tmp_path):
-    said = refused("setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
-    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
