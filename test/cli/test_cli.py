@@ -316,15 +316,6 @@ def test_results_are_replaced_if_asked_for(tmp_path, refused, flight, config):
         assert sorted(os.listdir(tmp_path)) == ["link.json", "out", "s.json"]
 
 
-def test_outputs_of_a_replay_that_fails_are_not_there(refused, flight, config, tmp_path):
-    broken, out = tmp_path / "in.mcap", tmp_path / "out"
-    broken.write_bytes(next(flight.glob("*.mcap")).read_bytes()[:200])
-    out.mkdir()
-    outputs = ("--output", out / "bag", "--csv", out / "s.csv", "--json", out / "s.json")
-    refused("replay", broken, "--config", config, *outputs)
-    assert os.listdir(out) == []
-
-
 REPLAY = "replay FLIGHT --config CONFIG"
 SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
 
@@ -493,6 +484,7 @@ REPLACED = [
     ("montecarlo STUDY --json STUDY --force", "which is read"),
     ("montecarlo STUDY --report no/r.html", "there is no folder"),
     ("montecarlo STUDY --json CONFIG", "exists already"),
+    ("replay broken.mcap --config CONFIG --output bag --csv s.csv --json s.json", "broken.mcap"),
     ("geometry CONFIG --json CONFIG --force", ""),
     # A recording that lies outside its folder: named so, or linked.
     ("replay NAMED --config CONFIG --force --json OUTSIDE", ""),
@@ -511,6 +503,7 @@ def places(flight, root, tmp_path, monkeypatch):
         ("home/settings.yaml", b"mine: 1"),
         ("file", b"\x89MCAP0\r\n"),
         ("package", b'{"name": "mine"}'),
+        ("broken.mcap", next(flight.glob("*.mcap")).read_bytes()[:200]),
         ("page", b"<!DOCTYPE html>\n<html>mine</html>"),
         ("config", (root / "config" / "two_imus.yaml").read_bytes()),
         ("study", (root / "config" / "studies" / "roc.yaml").read_bytes()),
@@ -532,7 +525,7 @@ def under(folder):
 
 
 @pytest.mark.parametrize(("words", "said"), REPLACED)
-def test_only_a_former_result_is_replaced_and_nothing_that_is_read(words, said, refused, places, tmp_path):
+def test_only_a_former_result_is_replaced_and_nothing_else_is_touched(words, said, refused, places, tmp_path):
     words = words.replace("REPLAY", "replay FLIGHT --config CONFIG --end 1 --force")
     given = [re.sub(r"^[A-Z]+", lambda found: str(places[found[0]]), word) for word in words.split()]
     before = under(tmp_path)

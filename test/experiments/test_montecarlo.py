@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from fdi_ros.experiments.contenders import cusum_run_length, moustakides_delay
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.replay.outcomes import added, quantiles, share
+from fdi_ros.replay.outcomes import quantiles, share
 from fdi_ros.system import jobs
 from fdi_ros.system.files import MADE_BY, plain
 
@@ -399,16 +398,6 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, refused):
         assert f"workers is {workers}, expected 1 to 256" in refused("montecarlo", path, "--workers", workers)
     assert "give one" in refused("montecarlo", path, "--workers", 2, "--scheduler", "tcp://a:1")
     assert "there is no folder" in refused("montecarlo", path, "--workers", 1, "--json", tmp_path / "no" / "r")
-
-
-@given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))
-def test_blocks_add_up_wherever_they_are_cut(counts, cut):
-    parts = [{"trials": 1, "counts": c, "deep": {"none": None, "a": {str(c[0]): 1}}} for c in counts]
-    whole = reduce(added, parts)
-    assert reduce(added, [reduce(added, part) for part in (parts[:cut], parts[cut:]) if part]) == whole
-    assert whole["counts"] == np.sum(counts, axis=0).tolist()
-    assert whole["deep"] == {"none": None, "a": {str(k): [c[0] for c in counts].count(k) for k, *_ in counts}}
-    assert json.loads(json.dumps(whole)) == whole
 
 
 @given(st.integers(1, 10_000), st.floats(0, 1))

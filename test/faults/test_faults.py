@@ -40,7 +40,8 @@ def during(block, start=1, stop=3):
 
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
-def test_ground_truth_covers_all_that_is_changed(kind):
+def test_ground_truth_covers_all_that_is_changed_and_words_of_a_fault_read_back(kind):
+    assert parse_fault(str(EXAMPLES[kind])) == EXAMPLES[kind]
     block, given = stream(), stream()
     faulty, injector = inject(EXAMPLES[kind], given)
     np.testing.assert_array_equal(given.z, block.z, err_msg="it is left as it is")
@@ -138,11 +139,6 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
     received = [np.ones(p.z.shape, bool) if p.received is None else p.received for p in pieces]
     expected = np.ones(whole.z.shape, bool) if whole.received is None else whole.received
     np.testing.assert_array_equal(np.concatenate(received), expected)
-
-
-@pytest.mark.parametrize("kind", FAULT_KINDS)
-def test_a_fault_says_itself_in_words_that_read_back(kind):
-    assert parse_fault(str(EXAMPLES[kind])) == EXAMPLES[kind]
 
 
 @pytest.mark.parametrize(

@@ -151,17 +151,14 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
 # What an autopilot says of itself stands beside it, whatever log it is in ---------------------------------------------
 
 
-def dataflash(path):
+def test_errors_and_words_of_a_log_are_told_at_their_times(tmp_path, fdi):
     """Three IMUs from 10 s on; a switch of the lane at 12 s, an error that is over at 13 s, words at 11 s."""
     extra = logs.format_record(5, "ERR", "QBB", "TimeUS,Subsys,ECode")
     for second, subsystem, code in ((12, 24, 1), (13, 16, 0)):
         extra += logs.HEAD + struct.pack("<BQBB", 5, second * 1_000_000, subsystem, code)
     extra += logs.HEAD + struct.pack("<BQ64s", 66, 11_000_000, b"EKF3 IMU0 is using GPS\r\n")
-    return logs.write_dataflash(path, logs.units(3, seconds=6.0, start=10.0), extra=extra)
-
-
-def test_errors_and_words_of_a_log_are_told_at_their_times(tmp_path, fdi):
-    log, config, page = dataflash(tmp_path / "log.bin"), tmp_path / "config.yaml", tmp_path / "page.html"
+    log = logs.write_dataflash(tmp_path / "log.bin", logs.units(3, seconds=6.0, start=10.0), extra=extra)
+    config, page = tmp_path / "config.yaml", tmp_path / "page.html"
     fdi("inspect", log, "--output", config, "--quiet")
     told = json.loads(fdi("replay", log, "--config", config, "--json", "-", "--report", page, "--quiet").out)
     assert [(round(one["at_s"], 2), one["kind"], one["text"]) for one in told["autopilot"]] == [
