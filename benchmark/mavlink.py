@@ -104,8 +104,8 @@ class Told(NamedTuple):
 def judged(config: Config, messages: Messages, struck: bool) -> Told:
     """Let the monitor judge a flight."""
     from fdi_ros.core.alignment import Alignment
+    from fdi_ros.core.sources import source_of
     from fdi_ros.monitor.pipeline import Pipeline
-    from fdi_ros.sources import source_of
 
     pipeline = Pipeline.from_config(config)
     declared = pipeline.process(Alignment(*source_of(config).alignment).push_block(*messages)).events

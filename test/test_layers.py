@@ -21,7 +21,7 @@ LAYERS = (
     ("config",),
     ("model", "compiling"),
     ("core",),
-    ("estimator", "sources"),
+    ("estimator",),
     ("detectors",),
     ("monitor",),
     ("report", "faults", "mavlink"),
@@ -44,7 +44,7 @@ ONLY_IN = {
 """The only part that imports a library, in words."""
 ASKED_FOR = {"monitor.output": ("pandas",)}
 """Libraries imported only where a user asks for what they make."""
-NUMPY_ALONE = {"model", "compiling", "core", "estimator", "detectors", "sources", "monitor", "errors"}
+NUMPY_ALONE = {"model", "compiling", "core", "estimator", "detectors", "monitor", "errors"}
 
 
 @cache

@@ -37,8 +37,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
+from fdi_ros.core.sources import source_of_type
 from fdi_ros.errors import BagError
-from fdi_ros.sources import source_of_type
 from fdi_ros.system.files import (
     CHANNELS,
     CHUNK_BYTES,

@@ -24,8 +24,8 @@ from fdi_ros.bag.library_logs import Tlog, Ulog
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import MADE_BY_FDI, BagFile, Batch, Damage, LogText, Topic, find_files
 from fdi_ros.config.config import is_topic
+from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
-from fdi_ros.sources import SOURCES, source_of_type
 from fdi_ros.system.files import CHANNELS, LATEST, max_unpacked_bytes, open_regular
 from fdi_ros.system.text import shown
 

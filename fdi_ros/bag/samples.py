@@ -17,10 +17,10 @@ from fdi_ros.bag.raw import NO_HORIZON, Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
+from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.pipeline import build_geometry
-from fdi_ros.sources import source_of
 
 _TOGETHER = 16384  # messages handed on together: enough that calls do not count, little enough for the cache
 _HELD = 1 << 20  # messages that wait for earlier ones at most

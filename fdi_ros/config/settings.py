@@ -123,7 +123,7 @@ class Input(NamedTuple):
 
     section: str
     """Of its settings: ``channels`` for messages of all channels, ``imus`` for messages of three-axis units."""
-    source: str  # class in `fdi_ros.sources` that reads it
+    source: str  # class in `fdi_ros.core.sources` that reads it
 
 
 INPUTS = {"channels": Input("channels", "ChannelsSource"), "imus": Input("imus", "ImuSource")}

@@ -65,23 +65,6 @@ _NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
 _IDLE, _FORMING, _RESTARTING = range(3)
 
 
-def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> NDArray[Any]:
-    """Return an `Aligner`, (1,), of a number of units.
-
-    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent for longer than this by the
-    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,);
-    empty: not at all.
-    """
-    if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= 10**13 and 1 <= timeout <= 10**13):
-        raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
-    rows = allocate(Aligner)
-    if len(delays) not in (0, units):
-        raise ConfigError(f"cannot align {units} triads with {len(delays)} delays, expected one each, or none")
-    rows["n"], rows["max_skew"], rows["timeout"], rows["bridge"] = units, max_skew, timeout, int(MAX_BRIDGE * timeout)
-    rows["units"]["delay"][0, : len(delays)] = [round(1e9 * delay) for delay in delays]
-    return rows
-
-
 # Messages in --------------------------------------------------------------------------------------------------------
 
 
@@ -420,11 +403,22 @@ def align_messages(
 
 
 class Alignment:
-    """An aligner for messages in arrays; parameters as for `new_aligner`."""
+    """Aligns the messages of a number of units.
+
+    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent for longer than this by the
+    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,);
+    empty: not at all.
+    """
 
     def __init__(self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> None:
-        self.rows = new_aligner(units, max_skew, timeout, delays)  # the `Aligner`, (1,)
-        self.units = units
+        if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= 10**13 and 1 <= timeout <= 10**13):
+            raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
+        if len(delays) not in (0, units):
+            raise ConfigError(f"cannot align {units} triads with {len(delays)} delays, expected one each, or none")
+        self.units, self.rows = units, allocate(Aligner)  # the record, (1,)
+        row = self.rows[0]
+        row["n"], row["max_skew"], row["timeout"], row["bridge"] = units, max_skew, timeout, int(MAX_BRIDGE * timeout)
+        row["units"]["delay"][: len(delays)] = [round(1e9 * delay) for delay in delays]
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
         """Take one message and return the samples that it completes, mostly none or one, (S,) `Sample`."""
@@ -442,6 +436,11 @@ class Alignment:
     def is_live(self, unit: int) -> bool:
         """Whether a unit is waited for."""
         return bool(is_live(self.rows[0], unit))
+
+    @property
+    def are_parted(self) -> bool:
+        """Whether the clocks of the only two units that deliver went apart."""
+        return bool(are_parted(self.rows[0]))
 
     @property
     def counters(self) -> tuple[dict[str, int], ...]:

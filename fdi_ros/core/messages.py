@@ -4,7 +4,7 @@
 """Elements of CDR messages: reading and writing what all kinds of messages share, and the messages that are published.
 
 Reading takes only what is needed out of the bytes, whatever else they hold; what is special to one kind of message is
-in its source (`fdi_ros.sources`). Writing fills a template. Bytes may come from anywhere: every length in them is
+in its source (`fdi_ros.core.sources`). Writing fills a template. Bytes may come from anywhere: every length in them is
 checked against the bytes that are there before it is believed.
 
 Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the second of which is 1 for little and

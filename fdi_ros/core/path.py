@@ -9,7 +9,7 @@
 constants of the detector for just the channels present are still to be prepared, which happens once for each set of
 channels.
 
-Each kind of input has a compiled `receive` (`fdi_ros.sources`), made of its reading and `receive_stamped` or
+Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), made of its reading and `receive_stamped` or
 `receive_arrived`. The samples that are complete then go through `process`.
 """
 

@@ -369,9 +369,7 @@ class Sequential(Detector):
     ) -> None:
         if not 0.5 < confidence < 1:
             raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
-        self.run_length = FalseAlarmRate(
-            per_hour=false_alarms_per_hour, run_length=run_length, sample_rate=sample_rate
-        ).mean_run_length()
+        self.run_length = FalseAlarmRate(run_length, None, false_alarms_per_hour, sample_rate).mean_run_length()
         self.sample_rate = 100.0 if sample_rate is None else sample_rate
         walk = np.broadcast_to(np.asarray(bias_walk, dtype=np.float64), geometry.n)
         super().__init__(

@@ -48,7 +48,9 @@ class ChiSquare:
         length = np.linalg.norm(basis, axis=1)
         scale = np.where(geometry.detectable, length, np.inf)
         self._normalised = (self._parity.T @ basis.T / scale).T
-        self.threshold = chi2_isf(FalseAlarmRate(false_alarm_probability).per_sample(), geometry.n - 3)
+        self.threshold = chi2_isf(
+            FalseAlarmRate(false_alarm_probability=false_alarm_probability).per_sample(), geometry.n - 3
+        )
 
     def detect(self, z: Array) -> Verdict:
         """Verdicts on samples z (N, n) rad/s: square of the whitened parity vector against its quantile."""
@@ -128,7 +130,7 @@ class Contenders(NamedTuple):
 def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
     """Options of a method with a threshold of a given false-alarm probability per sample, or a loose one."""
     accepted = accepted_options(METHODS[name])
-    stated = FalseAlarmRate(alarm_probability).as_options(accepted)
+    stated = FalseAlarmRate(false_alarm_probability=alarm_probability).as_options(accepted)
     if stated:
         return dict(stated)
     return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}

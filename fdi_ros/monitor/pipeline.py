@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate, reported
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS, Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits, restart_bias
@@ -21,6 +21,7 @@ from fdi_ros.core.decision import REASONS, RETURN_MEAN, ChannelState, Reason, cl
 from fdi_ros.core.fusion import update_level
 from fdi_ros.core.path import Path, begin_bias, run
 from fdi_ros.core.records import Core, EventRow, OutputRow, Sample
+from fdi_ros.core.sources import source_of
 from fdi_ros.core.subsets import (
     describe_sensors,
     mask_of,
@@ -38,7 +39,6 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Event, Output, events_of
 from fdi_ros.monitor.status import Status, status_of
-from fdi_ros.sources import source_of
 from fdi_ros.system.text import html_table
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
@@ -93,8 +93,8 @@ def _false_alarm_rate(config: Config, by_run_length: bool = False) -> FalseAlarm
     if by_run_length and settings.run_length > 0:
         return FalseAlarmRate(run_length=settings.run_length, sample_rate=rate)
     if settings.false_alarm_probability > 0:
-        return FalseAlarmRate(settings.false_alarm_probability, sample_rate=rate)
-    return FalseAlarmRate(per_hour=settings.false_alarms_per_hour, sample_rate=rate)
+        return FalseAlarmRate(false_alarm_probability=settings.false_alarm_probability, sample_rate=rate)
+    return FalseAlarmRate(false_alarms_per_hour=settings.false_alarms_per_hour, sample_rate=rate)
 
 
 _RATES = {"false_alarms_per_hour", "false_alarm_probability", "run_length"}
@@ -357,9 +357,8 @@ class Pipeline:
             raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
-            with reported(f"the sample path and {config.detector.name}"):
-                detector = build_detector(config, self.geometry, self.noise)
-                _ = detector.bank
+            detector = build_detector(config, self.geometry, self.noise)
+            _ = detector.bank
         else:
             detector = self.detector
         if before is None or alarm_probability(config) != alarm_probability(before):

@@ -16,21 +16,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import Callback, allocate, reported
+from fdi_ros.compiling.compiled import Callback, allocate
 from fdi_ros.config.config import Config
-from fdi_ros.core.alignment import Alignment, are_parted, is_live, new_aligner
+from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.health import copies_among
 from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import MORE, NEVER, process
 from fdi_ros.core.records import EventRow, Live
+from fdi_ros.core.sources import SOURCES, Source, source_of
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import FUSED, INTEGRITY, Encoder, Event, SampleOutput, events_of
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sources import SOURCES, Source, source_of
 
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
 RATE_WINDOWS = 4  # so many measurements in a row must agree with each other: a pause or a loss is no rate
@@ -91,8 +91,6 @@ class SampleRateCheck:
             )
 
 
-COUNTERS = ("duplicate", "backward", "ahead", "jumped", "late", "interpolated", "missing")
-"""What alignment counts of each unit beside the messages received."""
 _NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
 
 
@@ -107,7 +105,7 @@ class Receiver:
         config, n = pipeline.config, pipeline.geometry.n
         self.pipeline = pipeline
         self.source = source_of(config)
-        self.aligner = new_aligner(*self.source.alignment)  # record of the alignment, (1,)
+        self.alignment = Alignment(*self.source.alignment)
         self.live = allocate(Live)  # record of what was received, (1,)
         self.errors = [""] * len(self.source.topics)  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
@@ -123,7 +121,7 @@ class Receiver:
     def _update_detector(self) -> None:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
         self._detector = self.pipeline.detector
-        self._records = (self.aligner, self.live, self._events, self._fused.bytes, self._integrity.bytes)
+        self._records = (self.alignment.rows, self.live, self._events, self._fused.bytes, self._integrity.bytes)
         self._process: Callable[[], int] = partial(process, self.pipeline.path, *self._records)
 
     def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
@@ -131,7 +129,8 @@ class Receiver:
         if self.pipeline.detector is not self._detector:
             self._update_detector()
         # Bytes: arrays of what can be written would be compiled once more.
-        flags = self.source.receive(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+        message = np.frombuffer(bytes(data), dtype=np.uint8)
+        flags = self.source.receive(self.alignment.rows, self.live, inlet, message, stamp)
         return self._process() if flags & MORE else flags
 
     def go_on(self) -> int:
@@ -170,7 +169,7 @@ class Receiver:
     @property
     def restarts(self) -> int:
         """How often the time of all inputs began anew."""
-        return int(self.aligner["restarts"][0] + self.live["restarts"][0])
+        return int(self.alignment.rows["restarts"][0] + self.live["restarts"][0])
 
     @property
     def rate(self) -> NDArray[np.float64]:
@@ -178,34 +177,25 @@ class Receiver:
         rate: NDArray[np.float64] = self.pipeline.core["last"]["rate"][0]
         return rate if self.pipeline.core["samples"][0] else np.full(3, np.nan)
 
-    def is_live(self, unit: int) -> bool:
-        """Whether a unit is waited for."""
-        return bool(is_live(self.aligner[0], unit))
-
-    @property
-    def are_parted(self) -> bool:
-        """Whether the clocks of the only two units that deliver went apart."""
-        return bool(are_parted(self.aligner[0]))
-
     def counts(self, unit: int) -> dict[str, int]:
         """All that was not taken as it came, by kind."""
         malformed = {"malformed": int(self.live["inlets"]["malformed"][0, unit])}
         if not self.source.stamped:
             return malformed
-        counters = self.aligner["units"]["counters"][0, unit]
-        return malformed | {name: int(counters[name]) for name in COUNTERS}
+        counters = self.alignment.counters[unit]
+        del counters["received"]
+        return malformed | counters
 
     def warm(self, kind: Source | type[Source]) -> None:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
         path: Any = tuple(one.copy() for one in self.pipeline.path)
         aside: Any = tuple(one.copy() for one in self._records)
-        with reported("the way from message to message"):
-            kind.receive(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
-            process(path, *aside)
-            self.encoder.fill(INTEGRITY, path[0][0]["last"])
-            is_live(self.aligner[0], 0)
-            are_parted(self.aligner[0])
-            clear_declarations(path[0])
+        kind.receive(self.alignment.rows.copy(), self.live.copy(), 0, _NOTHING, 0)
+        process(path, *aside)
+        self.encoder.fill(INTEGRITY, path[0][0]["last"])
+        self.alignment.is_live(0)
+        _ = self.alignment.are_parted
+        clear_declarations(path[0])
 
 
 _FEW = 5  # channels for a method that does not take six

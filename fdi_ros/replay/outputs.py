@@ -21,12 +21,12 @@ from fdi_ros.bag.raw import MADE_BY_FDI, Batch
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.sources import source_of
 from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS, InputStatus, describe, encode_diagnostics
 from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
-from fdi_ros.sources import source_of
 from fdi_ros.system.files import LATEST
 
 _STATES = np.array([state.name for state in ChannelState])

@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.config.settings import INJECTOR
 from fdi_ros.core.messages import MessageError
+from fdi_ros.core.sources import source_of
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.model.samples import Block
@@ -26,7 +27,6 @@ from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros.node import CheckedNode
-from fdi_ros.sources import source_of
 
 LOOK_PERIOD = 0.05  # how often it is looked whether an output has found its first subscriber, s
 

@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.config.settings import MAVLINK
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
+from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
@@ -36,7 +37,6 @@ from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, Status
 from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros.node import REPORT_PERIOD, CheckedNode, message_class, read_diagnostics
 from fdi_ros.ros.process import Stop, guarded, make_executor
-from fdi_ros.sources import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
 NAMES = ("imu_1", "imu_2", "imu_3")  # of units where the settings name none, each on the topic ``NAME/data_raw``

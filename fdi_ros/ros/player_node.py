@@ -24,10 +24,10 @@ from std_srvs.srv import Trigger
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.settings import PLAYER
 from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop, guarded
-from fdi_ros.sources import source_of
 
 PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
 SETTLING = 0.3  # time for the subscribers that were found to have found the player, s

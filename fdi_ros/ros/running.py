@@ -126,7 +126,7 @@ class InputTopic:
             received=received,
             rate=watchdog.rate,
             silent=watchdog.seconds(now) if received else None,
-            live=receiver.is_live(self._number) and not watchdog.silent,
+            live=receiver.alignment.is_live(self._number) and not watchdog.silent,
             arrives=watchdog.seconds(now) < ARRIVES,
             lag=max(lag, 0) / 1e9,
             max_lag=receiver.source.max_lag,
@@ -135,7 +135,7 @@ class InputTopic:
             recent={kind: count - self._reported_counts.get(kind, 0) for kind, count in counts.items()},
             error=receiver.errors[self._number],
             unstamped=self._is_unstamped,
-            parted=receiver.are_parted,
+            parted=receiver.alignment.are_parted,
             sources=self._sources,
         )
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import LEAST_NOISE
+from fdi_ros.core.sources import source_of
 from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
@@ -29,7 +30,6 @@ from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, S
 from fdi_ros.setup.blocks import NOT_SHIFTED, Data, flag_runs, prepare, resampled, spikes
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.noise import projector
-from fdi_ros.sources import source_of
 
 UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere: the root of a third
 UNMEASURED = SCALE_STD / 2  # uncertainty of the axes along a direction of the body from which they are not measured

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from fdi_ros.core.sources import source_of
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
@@ -45,7 +46,6 @@ from fdi_ros.setup.starting_config import (
     topic_findings,
     verdict_of,
 )
-from fdi_ros.sources import source_of
 from fdi_ros.system.text import LINE, shown
 
 SHOWN_AXES = UNMEASURED / 2  # uncertainty of the axes along a direction of the body from which they are not well shown

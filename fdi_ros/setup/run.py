@@ -21,6 +21,7 @@ import numpy as np
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
+from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
@@ -40,7 +41,6 @@ from fdi_ros.setup.starting_config import (
     refuse_degrees,
     starting_config,
 )
-from fdi_ros.sources import source_of
 from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s

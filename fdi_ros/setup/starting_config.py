@@ -25,6 +25,7 @@ from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.compiled import MAX_CHANNELS
 from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config, is_plain_name, parameter_file
 from fdi_ros.core.alignment import MAX_BRIDGE
+from fdi_ros.core.sources import SOURCES, input_of
 from fdi_ros.errors import BagError
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
@@ -36,7 +37,6 @@ from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, SHARED, SQUAR
 from fdi_ros.setup.blocks import WINDOW
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, GAP, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
-from fdi_ros.sources import SOURCES, input_of
 from fdi_ros.system.text import LINE, shown
 
 

@@ -21,8 +21,8 @@ from pymavlink.DFReader import DFReader_binary
 from fdi_ros.bag import dataflash, flight_log, library_logs
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
+from fdi_ros.core.sources import ImuSource
 from fdi_ros.errors import BagError, FdiError
-from fdi_ros.sources import ImuSource
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.alignment import MAX_BRIDGE, MAX_STAMP, Alignment, are_parted, as_block
+from fdi_ros.core.alignment import MAX_BRIDGE, MAX_STAMP, Alignment, as_block
 from fdi_ros.core.records import MAX_PENDING
 from fdi_ros.errors import ConfigError
 
@@ -368,7 +368,7 @@ def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd):
     # A clock that leaps shows by itself that it is the wrong one.
     assert given[:, 1 - odd].all() == given[:, 1 - odd].any() == (clock == "leaping")
     assert not given[:, odd].any()
-    assert are_parted(aligner.rows[0]) == (clock != "leaping")
+    assert aligner.are_parted == (clock != "leaping")
 
 
 def test_two_clocks_that_come_together_again_are_believed_again():
@@ -391,6 +391,6 @@ HELD_UP += [m for t in range(2000, 3000, 10) for m in ((0, float(t)), (1, t - 10
 @pytest.mark.parametrize("later", [*JUMPS, HELD_UP])
 def test_of_two_units_one_that_jumps_or_was_held_up_costs_the_other_nothing(later):
     aligner, samples = run(at(*rounds(100), *later))
-    assert not are_parted(aligner.rows[0])
+    assert not aligner.are_parted
     assert received(samples)[:, 0].all()
     assert later is HELD_UP or not received(samples)[110:, 1].any()

@@ -12,10 +12,10 @@ from monitor.streams import START, config, parallel, run, stream
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
-from fdi_ros.sources import ChannelsSource, ImuSource
 
 STEP = 10_000_000
 
@@ -148,7 +148,7 @@ def test_live_stamps_ahead_of_the_clock_are_refused_and_said():
         ear.take(unit, data, START + STEP * (k // 2) - (2_000_000_000 if unit else 0))
     assert ear.receiver.counts(1)["ahead"] == 100
     assert ear.receiver.counts(0)["ahead"] == 0
-    assert not ear.receiver.is_live(1)
+    assert not ear.receiver.alignment.is_live(1)
     # A recording has no clock.
     ear.take(1, ImuTemplate("imu").fill(START + 100 * STEP, (0.0,) * 3, (0.0,) * 9))
-    assert ear.receiver.is_live(1)
+    assert ear.receiver.alignment.is_live(1)

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
+from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.sources import ChannelsSource, ImuSource
 
 RATE = 250.0
 SIGMA = 0.0025

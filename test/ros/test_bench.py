@@ -24,10 +24,10 @@ from std_srvs.srv import Trigger
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.core.sources import ImuSource
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.sources import ImuSource
 
 STATUS = "injector_node: injector"
 FILE = ROOT / "config" / "two_imus.yaml"

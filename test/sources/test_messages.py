@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError
-from fdi_ros.sources import ChannelsSource, ImuSource
+from fdi_ros.core.sources import ChannelsSource, ImuSource
 
 finite = st.floats(allow_nan=False)
 vectors = st.tuples(finite, finite, finite)

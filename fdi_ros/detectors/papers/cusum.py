@@ -281,9 +281,7 @@ class Cusum(Detector):
     ) -> None:
         if not 0.05 <= shift <= 3.0:
             raise ConfigError(f"shift is {shift:g} standard deviations, expected 0.05 to 3")
-        self.run_length = FalseAlarmRate(
-            per_hour=false_alarms_per_hour, run_length=run_length, sample_rate=sample_rate
-        ).mean_run_length()
+        self.run_length = FalseAlarmRate(run_length, None, false_alarms_per_hour, sample_rate).mean_run_length()
         super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
         params, n = self.constants[0], geometry.n
         prepare_hypotheses(params["resting"], geometry, self.noise, confidence, fixed=True)

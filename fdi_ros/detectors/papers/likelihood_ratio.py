@@ -417,9 +417,9 @@ class LikelihoodRatio(Detector):
         sample_rate: float | None = None,
         confidence: float = 0.999,
     ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        super().__init__(geometry, noise, {**rate.as_options(), "confidence": confidence})
+        rate = FalseAlarmRate(None, false_alarm_probability, false_alarms_per_hour, sample_rate)
         self.probability = rate.per_sample()
+        super().__init__(geometry, noise, {"false_alarm_probability": self.probability, "confidence": confidence})
         params = self.constants[0]
         prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
         self.threshold = max_normal_threshold(whitened_directions(geometry, self.noise), self.probability)

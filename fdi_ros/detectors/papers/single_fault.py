@@ -130,7 +130,7 @@ class SingleFaultDetector(Detector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        rate = FalseAlarmRate(None, false_alarm_probability, false_alarms_per_hour, sample_rate)
         super().__init__(geometry, noise, {**options, **rate.as_options()})
         self.probability = rate.per_sample()
         n = geometry.n
