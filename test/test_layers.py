@@ -106,19 +106,22 @@ def test_no_import_goes_in_a_circle():
     graphlib.TopologicalSorter(graph).prepare()
 
 
-def names_after(code, timeout):
-    """What a fresh interpreter prints last, so that nothing loaded before hides a missing library."""
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=timeout)
-    return set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
+def python(code, *words):
+    """What a fresh interpreter says, in which nothing loaded before hides a missing library."""
+    command = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True, timeout=400, check=False)
+
+
+def names_after(code):
+    """What it prints last."""
+    return set(ast.literal_eval(python(code).stdout.strip().splitlines()[-1]))
 
 
 def test_the_core_imports_without_ros_and_bag_libraries():
     """And only what is used."""
     loaded = names_after(
         "import sys, fdi_ros; dir(fdi_ros); assert 'numpy' not in sys.modules;"
-        "fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))",
-        60,
+        "fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))"
     )
     assert "numpy" in loaded
     # Numba looks which SciPy there is; of SciPy itself nothing is used here, which the imports above show.
@@ -145,7 +148,7 @@ def make():
 assert process.run("fdi_node", [], make) == 0
 print([name for name in set(sys.modules) - before if sys.modules[name] is not None])
 """
-    loaded = names_after(code, 400)
+    loaded = names_after(code)
     parts = {name.split(".")[1] for name in loaded if name.startswith("fdi_ros.")}
     assert "monitor" in parts
     assert parts.isdisjoint(OFFLINE)

@@ -4,24 +4,17 @@
 """What an installation needs: a live node what a distribution has, everything else asked for by one line."""
 
 import re
-import subprocess
-import sys
 from xml.etree import ElementTree
 
 import numba
 import pytest
 import yaml
-from test_layers import PACKAGE
+from test_layers import PACKAGE, python
 
 from fdi_ros import system
 
 WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(system.BAGS)!r}))\n"
 """As if some libraries were not installed; where they are not, this changes nothing."""
-
-
-def python(code, *words):
-    command = [sys.executable, "-c", code, *map(str, words)]
-    return subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_a_build_farm_has_all_that_the_manifest_names(root):

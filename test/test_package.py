@@ -75,7 +75,7 @@ def install(workspace):
     return workspace / "install" / "fdi_ros"
 
 
-def test_every_executable_has_something_to_run(install):
+def test_every_executable_has_something_to_run_and_all_settings_are_installed(root, install):
     names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
     assert {"fdi", "fdi_node"} <= names
     (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
@@ -85,9 +85,6 @@ def test_every_executable_has_something_to_run(install):
         source = next(install.glob("lib/python*/site-packages")) / f"{module.replace('.', '/')}.py"
         assert source.is_file()
         assert callable(getattr(importlib.import_module(module), function))
-
-
-def test_the_index_the_manifest_and_all_settings_are_installed(root, install):
     share = install / "share"
     assert (share / "ament_index/resource_index/packages/fdi_ros").exists()
     assert (share / "fdi_ros/package.xml").exists()

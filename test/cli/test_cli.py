@@ -61,12 +61,6 @@ def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sampl
     assert sorted(os.listdir(tmp_path)) == ["s.csv", "s.json"]
 
 
-def test_scenario_and_fault_add_up(root, replay):
-    words = ("--scenario", root / "config" / "scenarios" / "two_at_once.yaml", "--json", "-", "--quiet")
-    found = json.loads(replay(*words, "--fault", "channel=g1 kind=noise size=0.2 start=50 seed=4").out)
-    assert [fault["kind"] for fault in found["faults"]] == ["noise", "bias", "drift"]
-
-
 def test_a_check_that_is_not_met_is_exit_code_1_with_the_reasons(tmp_path, replay):
     sound = tmp_path / "s.json"
     words = ("--end", 24, "--fault", FAULT, "--json", sound)
@@ -102,6 +96,11 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
         assert (done.code, done.err) == (code, "")
         return json.loads(done.out, parse_constant=pytest.fail)
 
+    # Faults of a scenario and of the command line add up.
+    scenario = root / "config" / "scenarios" / "two_at_once.yaml"
+    both = ("--scenario", scenario, "--fault", "channel=g1 kind=noise size=0.2 start=50 seed=4")
+    found = figures("replay", flight, "--config", config, *both)
+    assert [fault["kind"] for fault in found["faults"]] == ["noise", "bias", "drift"]
     # In 5 s the biases are still being learned: what the gyros are cannot be told.
     figures("replay", flight, "--config", config, "--end", 5, code=UNTOLD)
     found = figures("inspect", flight)

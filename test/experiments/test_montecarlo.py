@@ -23,11 +23,10 @@ from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
 from fdi_ros.experiments.contenders import cusum_run_length, moustakides_delay
 from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.outcomes import quantiles, share
 from fdi_ros.system import jobs
-from fdi_ros.system.files import MADE_BY, plain
+from fdi_ros.system.files import plain
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -346,21 +345,15 @@ def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not
     assert cells["bias"]["rms_after"] < 2 * cells["none"]["rms_after"]
 
 
-def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):
-    page, results = tmp_path / "page.html", []
-    monkeypatch.setattr(
-        "fdi_ros.experiments.montecarlo.run_study",
-        lambda *arguments: results.append(run_study(*arguments)) or results[0],
-    )
+def test_a_report_has_the_tables_and_shows_bands(tmp_path, expected, fdi):
+    page = tmp_path / "page.html"
     said = fdi("montecarlo", study_file(tmp_path, SMALL), "--workers", 1, "--report", page, "--json", "-")
-    assert said.code == 0
+    assert (said.code, json.loads(said.out)) == (0, json.loads(expected))
     assert "best possible" in said.err
-    assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
-    text, titles = page.read_text(), {one.title for one in tables(results[0])}
-    kinds = ("One fault", "Largest residual is the right one", "Delay")
-    assert {f"{kind}, two_triad_cone" for kind in kinds} < titles
-    assert all(title in text and title in said.err for title in titles)
-    assert '"type":"band"' in text
+    for kind in ("One fault", "Largest residual is the right one", "Delay"):
+        for text in (page.read_text(), said.err):
+            assert f"{kind}, two_triad_cone" in text
+    assert '"type":"band"' in page.read_text()
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)

@@ -5,7 +5,6 @@
 
 import json
 import re
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,19 +27,13 @@ ROOT = Path(__file__).parents[2]
 CONE = ROOT / "bags" / "cone_flight"
 
 
-@cache
-def three():
-    """Three triads, turned by hand."""
-    return vehicle(11, "rest and turns")
-
-
 def ready(block):
     """A recording made ready, gyros of a range of 35 rad/s."""
     return prepare(block, np.full(block.z.shape[1], 35.0))
 
 
 def test_mounts_are_found_and_taken_for_square_where_they_are():
-    unit = three()
+    unit = vehicle(11, "rest and turns")
     mounts = find_mounts(ready(unit.block))
     left, _, right = np.linalg.svd(unit.axes[:3].T)
     first = (left @ right).T
@@ -64,7 +57,7 @@ def test_mounts_are_found_and_taken_for_square_where_they_are():
 
 
 def test_a_mount_that_is_not_shown_is_not_known():
-    unit = three()
+    unit = vehicle(11, "rest and turns")
     seconds = (unit.block.stamp - unit.block.stamp[0]) * 1e-9
     noise = np.random.default_rng(3).normal(0, 0.003, unit.block.z.shape)
     about_one = noise.copy()
