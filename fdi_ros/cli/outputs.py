@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import platform
 import re
 import sys
@@ -23,7 +24,7 @@ from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files, is_made_by_fdi
 from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.report.layout import Severity, with_first_line_coloured
+from fdi_ros.report.layout import Severity
 from fdi_ros.system.files import STANDARD_OUTPUT, is_open_already, is_stream, open_regular, real_path, whole, write_json
 from fdi_ros.system.text import LINE, shown, visible
 
@@ -138,12 +139,16 @@ class Outputs:
     def say(self, text: str, severity: Severity | None = None) -> None:
         """Print for people, unless they asked for quiet: to standard output, unless data goes there.
 
-        ``severity``: of the first line, where that is a verdict.
+        ``severity``: of the first line, where that is a verdict; a terminal shows it by its colour.
         """
         if not self._arguments.quiet:
             stream = sys.stderr if any(map(is_open_already, self.targets.values())) else sys.stdout
             text = visible(text)
-            stream.write(text if severity is None else with_first_line_coloured(text, severity, stream))
+            if severity is not None and stream.isatty() and not os.environ.get("NO_COLOR"):
+                colour = {Severity.GOOD: 32, Severity.UNKNOWN: 33, Severity.BAD: 31}[severity]
+                first, end, rest = text.partition("\n")
+                text = f"\x1b[1;{colour}m{first}\x1b[0m{end}{rest}"
+            stream.write(text)
 
     def finish(
         self,

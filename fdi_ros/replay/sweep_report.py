@@ -17,16 +17,7 @@ import numpy as np
 from fdi_ros.replay.episodes import episode_words
 from fdi_ros.replay.outcomes import Estimate, OutcomeKind, share
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, Swept
-from fdi_ros.report.layout import (
-    PALETTE,
-    Columns,
-    Figure,
-    Section,
-    head_and_rows,
-    number,
-    page,
-    section_text,
-)
+from fdi_ros.report.layout import PALETTE, Columns, Figure, Section, head_and_rows, number, page, section_text
 
 WANTED = 0.95  # share of the faults of a size that is to be found for the size to count as found
 NOT_ORDERED = ("saturation",)  # kinds of which a larger size is no larger fault
@@ -371,8 +362,7 @@ def _figure(monitors: Mapping[str, Sequence[Line]], curves: Sequence[Curve], yax
         for words, dash, value in curves
     ]
     xaxis = {"type": "log", "title": {"text": f"size, {unit}" if unit else "size"}}
-    legend = {"orientation": "h", "y": 1.12}
-    return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "legend": legend, "height": 360}}
+    return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "height": 360}}
 
 
 def _map(one: Subject, plan: Plan) -> Section:
@@ -380,9 +370,6 @@ def _map(one: Subject, plan: Plan) -> Section:
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
     names, words = [one.channels[channel] for channel in one.used], [line.swept.words for line in rows[0]]
-    heat = {"type": "heatmap", "z": found, "x": words, "y": names, "zmin": 0, "zmax": 1, "colorscale": "Cividis"}
-    shown = {"text": found, "texttemplate": "%{text}", "xgap": 1, "ygap": 1}
-    axes = {"xaxis": {"tickangle": -60, "automargin": True}, "yaxis": {"autorange": "reversed", "automargin": True}}
-    figure = {"data": [{**heat, **shown}], "layout": {**axes, "height": 200 + 28 * len(rows)}}
+    heat = {"type": "heatmap", "z": found, "x": words, "y": names}
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(f"{one.name}, every channel", hint, "", [figure])
+    return Section(f"{one.name}, every channel", hint, "", [{"data": [heat], "layout": {}}])

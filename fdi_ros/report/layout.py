@@ -6,16 +6,14 @@
 The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
 the form of plotly's figures, of which the scripts draw:
 
-- traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
-  ``heatmap``, ``scatter3d`` (lines);
-- axes with title, type ``log`` or, of x, ``date`` (ms since 1970), range, rangemode ``tozero``; shapes ``rect`` over
-  all y, ``line`` over all x; height;
+- traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``heatmap``,
+  ``scatter3d`` (lines);
+- axes with title, type ``log``, range; shapes ``rect`` over all y; height;
 
 and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
 (``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),
 ``scale`` (plots of one name share the scale of values), ``robust`` (what shows only for a short time does not set the
-scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text, ``label``), ``rows`` of spans,
-``names`` of what is counted from 1 on x.
+scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text, ``label``), ``rows`` of spans.
 """
 
 from __future__ import annotations
@@ -24,14 +22,13 @@ import base64
 import html
 import json
 import math
-import os
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import resources
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,15 +55,6 @@ class Verdict(NamedTuple):
 
     severity: Severity
     words: str  # begins with the word of the verdict in capitals: ``HEALTHY: ...``
-
-
-def with_first_line_coloured(text: str, severity: Severity, stream: TextIO) -> str:
-    """Return a text whose first line has the colour of its severity, where the stream is a terminal that wants it."""
-    if not stream.isatty() or os.environ.get("NO_COLOR"):
-        return text
-    colour = {Severity.GOOD: 32, Severity.UNKNOWN: 33, Severity.BAD: 31}[severity]
-    first, end, rest = text.partition("\n")
-    return f"\x1b[1;{colour}m{first}\x1b[0m{end}{rest}"
 
 
 class Unit(NamedTuple):

@@ -1,25 +1,25 @@
 // Copyright 2026 fdi_ros maintainers
 // SPDX-License-Identifier: Apache-2.0
 
-// One plot with two axes: curves, bands, bars, spans in rows; marks, a cursor, a zoom.
+// One plot with two axes: curves, bands, spans in rows; marks, a cursor, a zoom.
 
-const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500"];
 const DASHES = { dash: "7 4", dot: "2 3", dashdot: "8 3 2 3" };
 const GLYPHS = { detected: "M-5,-9h10l-5,8z", isolated: "M0,2l5,5l-5,5l-5,-5z", declared: "M-4,-9l8,8M4,-9l-8,8", autopilot: "M-3,-7h6v6h-6z" };
 const LETTER = 6.6; // px, about, of the small print
 
 const esc = (text) => String(text).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 const px = (value) => value.toFixed(1);
-const ink = (trace, i = 0) => trace.line?.color ?? trace.marker?.color ?? PALETTE[i % PALETTE.length];
-const utc = (seconds, length) => (page.origin ? iso(page.origin + 1000 * seconds).slice(0, length).replace("T", " ") : "");
+const utc = (seconds, length) => {
+  if (!page.origin) return "";
+  return new Date(page.origin + 1000 * seconds).toISOString().slice(0, length).replace("T", " ");
+};
 const keyOf = (trace) => trace.legendgroup ?? trace.name ?? "";
 
 class Chart {
   constructor(figure, element, section, link) {
     Object.assign(this, { layout: figure.layout ?? {}, element, section, link });
-    this.traces = figure.data.map((trace, i) => ({ ...trace, curve: curveOf(trace), colour: ink(trace, i), key: keyOf(trace) }));
+    this.traces = figure.data.map((trace) => ({ ...trace, curve: curveOf(trace), colour: trace.line.color, key: keyOf(trace) }));
     this.rows = this.layout.rows;
-    this.categories = this.traces.find((t) => t.type === "bar")?.curve.x;
     this.stage = element.querySelector(".stage");
     this.readout = document.createElement("div");
     this.readout.className = "readout";
@@ -27,7 +27,7 @@ class Chart {
     this.stage.after(this.readout);
     this.stage.setAttribute("role", "group");
     this.stage.setAttribute("aria-label", this.words());
-    if (!this.categories) this.listen();
+    this.listen();
     link.charts.push(this);
   }
 
@@ -40,18 +40,16 @@ class Chart {
       const [[low, high] = []] = columns([t.curve], [-Infinity, Infinity].map((v) => (v < 0 ? t.curve.x[0] : t.curve.x[t.curve.x.length - 1])), 1);
       return low === undefined ? null : `${t.name} ${short(low)} to ${short(high)}`;
     };
-    const said = this.categories || this.rows ? this.traces.map((t) => t.name)
+    const said = this.rows ? this.traces.map((t) => t.name)
       : this.traces.filter((t) => t.type === "scatter" && t.name).slice(0, 14).map(named).filter(Boolean);
-    const keys = this.categories ? "" : " Arrow keys move the cursor, plus and minus zoom, 0 shows everything.";
     const marks = (this.layout.marks ?? []).slice(0, 12).map((m) => m.text);
-    return `${this.title}: ${[...said, ...marks].join("; ")}.${keys}`;
+    return `${this.title}: ${[...said, ...marks].join("; ")}. Arrow keys move the cursor, plus and minus zoom, 0 shows everything.`;
   }
 
   get title() { return [this.layout.title, this.layout.yaxis?.title?.text].filter(Boolean).join(", "); }
 
   whole() { // range of x of all that there is
     if (this.layout.xaxis?.range) return this.layout.xaxis.range;
-    if (this.categories) return [0, this.categories.length];
     let low = Infinity, high = -Infinity;
     for (const { curve } of this.traces) {
       for (const value of [curve.x[0], curve.x[curve.x.length - 1], ...(curve.x.length < 500 ? curve.x : [])]) {
@@ -70,32 +68,17 @@ class Chart {
       const positive = (values) => Array.from(values, (v) => (v > 0 ? v : NaN));
       curves = curves.map((c) => ({ x: c.x, low: positive(c.low), high: positive(c.high) }));
     }
-    if (this.categories) {
-      const all = this.shown.filter((t) => t.type === "bar").flatMap((t) => t.curve.low.filter(Number.isFinite));
-      const lines = (this.layout.shapes ?? []).filter((s) => s.type === "line").map((s) => s.y0);
-      const seen = [...all, ...lines].filter((v) => v > 0);
-      // Bars of a logarithmic scale stand on its lower end, which shows the smallest as one, too.
-      const range = [this.layout.yaxis?.type === "log" ? Math.min(...seen) / 2 : 0, Math.max(...seen)];
-      return { all: range, usual: range, floor: 0 };
-    }
     return valueRange(curves, this.link.range, this.layout.needed ?? []);
   }
 
   draw(width = this.stage.clientWidth) {
     if (!width) return;
     const { layout } = this, kind = layout.yaxis?.type ?? "linear";
-    const named = Math.max(0, ...(this.categories ?? []).map((name) => name.length)) * LETTER;
-    this.upright = this.categories && named > (width - 66) / this.categories.length - 4;
-    const height = layout.height ?? 240, under = this.upright ? named : 12;
-    const bottom = layout.xaxis?.hidden ? 6 : under + (layout.xaxis?.title ? 24 : 12);
-    this.under = under;
+    const height = layout.height ?? 240, bottom = layout.xaxis?.hidden ? 6 : layout.xaxis?.title ? 36 : 24;
     const longest = this.rows ? Math.max(...this.rows.map((row) => row.length)) * LETTER + 8 : 54;
     const left = Math.min(Math.max(54, longest), 0.4 * width), right = width - 12, top = 22;
     Object.assign(this, { width, height });
     this.x = scaleOf(layout.xaxis?.type ?? "linear", this.link.range, [left, right], Math.max(2, (right - left) / 80));
-    if (layout.xaxis?.names) this.x.ticks = nameTicks(...this.link.range, layout.xaxis.names, right - left);
-    if (layout.xaxis?.type === "date") this.x.ticks = dateTicks(...this.link.range, (right - left) / 100);
-    if (this.categories) this.x.ticks = this.categories.map((name, k) => [k + 0.5, name]);
     const base = height - bottom;
     if (this.rows) {
       this.y = scaleOf("linear", [0, this.rows.length], [top, base], 1);
@@ -123,7 +106,6 @@ class Chart {
     const asked = group ? together(this.link.charts.filter((c) => c.layout.scale === group).map((c) => c.values())) : this.values();
     this.cut = null;
     if (!asked) return padded([1, 0], kind);
-    if (this.layout.yaxis?.rangemode === "tozero") return padded([Math.min(0, asked.all[0]), asked.all[1]], kind);
     // Chance dips towards zero are no part of a logarithmic picture.
     if (kind === "log" && asked.floor > 0 && this.layout.link) return padded([asked.floor, asked.all[1]], kind);
     const span = ([low, high]) => high - low;
@@ -141,33 +123,26 @@ class Chart {
       if (!this.rows) parts.push(`<line class="grid" x1="${left}" x2="${right}" y1="${at}" y2="${at}"/>`);
       parts.push(`<text class="tick" x="${left - 6}" y="${at}" dy="4" text-anchor="end">${esc(label)}</text>`);
     }
-    const room = this.categories ? Infinity : right - 14;
     for (const [value, label] of this.x.ticks) {
       const at = px(this.x.to(value));
-      if (!this.categories) parts.push(`<line class="grid" x1="${at}" x2="${at}" y1="${top}" y2="${base}"/>`);
-      if (this.upright) parts.push(`<text class="tick" transform="translate(${px(+at + 4)},${base + 6}) rotate(-90)" text-anchor="end">${esc(label)}</text>`);
-      else if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > room ? "end" : "middle"}">${esc(label)}</text>`);
+      parts.push(`<line class="grid" x1="${at}" x2="${at}" y1="${top}" y2="${base}"/>`);
+      if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > right - 14 ? "end" : "middle"}">${esc(label)}</text>`);
     }
     const since = this.layout.link === "time" && utc(0, 19), named = this.layout.xaxis?.title?.text;
     const title = since && (named.length + since.length + 12) * LETTER < right - left ? `${named}; 0 is ${since} UTC` : named;
-    if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${px(base + this.under + 19)}" text-anchor="middle">${esc(title)}</text>`);
+    if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${px(base + 31)}" text-anchor="middle">${esc(title)}</text>`);
     parts.push(`<rect class="frame" x="${left}" y="${top}" width="${px(right - left)}" height="${px(base - top)}"/>`);
     return parts.join("");
   }
 
   shapes(top, base) {
     return (this.layout.shapes ?? []).map((shape) => {
-      if (shape.type === "line") {
-        const at = px(this.y.to(shape.y0)), [from, to] = this.x.pixels;
-        return `<line class="guide" x1="${from}" x2="${to}" y1="${at}" y2="${at}" stroke-dasharray="${DASHES[shape.line?.dash] ?? ""}"/>`;
-      }
       const from = this.x.to(shape.x0), to = this.x.to(shape.x1 ?? this.x.range[1]);
-      return `<rect class="${shape.kind ?? "fault"}" x="${px(from)}" y="${top}" width="${px(Math.max(to - from, 0.5))}" height="${px(base - top)}"/>`;
+      return `<rect class="${shape.kind}" x="${px(from)}" y="${top}" width="${px(Math.max(to - from, 0.5))}" height="${px(base - top)}"/>`;
     }).join("");
   }
 
   trace(trace) {
-    if (trace.type === "bar") return this.bars(trace);
     if (trace.type === "spans") return this.spans(trace);
     const most = Math.max(200, (this.x.pixels[1] - this.x.pixels[0]) / 1.5);
     const path = (list) => {
@@ -192,16 +167,6 @@ class Chart {
     if (!mode.includes("markers")) return line;
     const dots = list.filter(([, b]) => Number.isFinite(b) && (this.y.kind !== "log" || b > 0));
     return line + dots.map(([a, b]) => `<circle r="3" fill="${trace.colour}" cx="${px(this.x.to(a))}" cy="${px(this.y.to(b))}"/>`).join("");
-  }
-
-  bars(trace) {
-    const series = this.shown.filter((t) => t.type === "bar"), k = series.indexOf(trace), wide = 0.8 / series.length;
-    const base = this.y.kind === "log" ? Math.max(...this.y.pixels) : this.y.to(0);
-    return trace.curve.low.map((value, i) => {
-      if (!Number.isFinite(value) || (this.y.kind === "log" && value <= 0)) return "";
-      const from = this.x.to(i + 0.1 + k * wide), to = this.x.to(i + 0.1 + (k + 1) * wide), top = this.y.to(value);
-      return `<rect fill="${trace.colour}" x="${px(from)}" y="${px(top)}" width="${px(Math.max(1, to - from - 1))}" height="${px(Math.max(0, base - top))}"><title>${esc(`${trace.name}, ${trace.curve.x[i]}: ${short(value)}`)}</title></rect>`;
-    }).join("");
   }
 
   spans(trace) {
@@ -249,7 +214,7 @@ class Chart {
 
   point(value) { // the cursor of this plot and of those linked to it
     if (!this.line) return;
-    const none = value === null || value === undefined || this.categories || value < this.x.range[0] || value > this.x.range[1];
+    const none = value === null || value === undefined || value < this.x.range[0] || value > this.x.range[1];
     this.line.toggleAttribute("hidden", none);
     this.readout.hidden = none;
     if (none) return;
@@ -287,9 +252,6 @@ class Chart {
   }
 
   place(value) {
-    const names = this.layout.xaxis?.names, number = Math.round(value);
-    if (names) return `${number}: ${esc(names[number - 1] ?? "")}`;
-    if (this.layout.xaxis?.type === "date") return iso(value).slice(0, 16).replace("T", " ");
     if (this.layout.link !== "time") return short(value);
     return `${value.toFixed(3)} s${page.origin ? `, ${utc(value, 23).slice(11)} UTC` : ""}`;
   }

@@ -32,7 +32,7 @@ const number = (value) => (value === null || value === undefined ? NaN : +value)
 // x of a trace, and for each x the smallest and the largest value: one array where they are the same.
 const curveOf = (trace) => {
   if (!trace.packed) {
-    const x = Array.from(trace.x ?? [], (v) => (typeof v === "string" ? v : number(v)));
+    const x = Array.from(trace.x ?? [], number);
     if (trace.type === "band") return { x, low: trace.low.map(number), high: trace.high.map(number) };
     const y = Array.from(trace.y ?? [], number);
     return { x, low: y, high: y };

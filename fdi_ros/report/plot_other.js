@@ -20,7 +20,7 @@ class Heat {
 
   draw(width = this.stage.clientWidth) {
     if (!width) return;
-    const { z, x, y, zmin = 0, zmax = 1 } = this.trace;
+    const { z, x, y } = this.trace;
     const left = Math.max(...y.map((name) => name.length)) * LETTER + 10;
     const side = Math.min((width - left - 4) / x.length, 52), upright = Math.max(...x.map((name) => name.length)) * LETTER > side;
     const top = upright ? Math.max(...x.map((name) => name.length)) * LETTER + 10 : 20, height = top + side * y.length + 6;
@@ -33,7 +33,7 @@ class Heat {
       const at = top + i * side;
       parts.push(`<text class="tick" x="${left - 6}" y="${px(at + side / 2 + 4)}" text-anchor="end">${esc(y[i])}</text>`);
       row.forEach((value, j) => {
-        const [r, g, b] = shade((value - zmin) / (zmax - zmin)), dark = 0.3 * r + 0.6 * g + 0.1 * b < 128;
+        const [r, g, b] = shade(value), dark = 0.3 * r + 0.6 * g + 0.1 * b < 128;
         parts.push(`<g><title>${esc(`${y[i]}, ${x[j]}: ${short(value)}`)}</title><rect x="${px(left + j * side)}" y="${px(at)}" width="${px(side - 1)}" height="${px(side - 1)}" fill="rgb(${r},${g},${b})"/>`);
         if (side > 30) parts.push(`<text x="${px(left + (j + 0.5) * side)}" y="${px(at + side / 2 + 4)}" text-anchor="middle" font-size="11" fill="${dark ? "#fff" : "#000"}">${value.toFixed(2)}</text>`);
         parts.push("</g>");
@@ -87,7 +87,7 @@ class Space { // arrows from the origin, turned by a drag or the arrow keys
     arrows.sort((a, b) => a.to[2] - b.to[2]);
     const taken = [], parts = [`<svg width="${width}" height="${side}" viewBox="0 0 ${width} ${side}" aria-hidden="true">`];
     for (const { t, from, to } of arrows) {
-      const colour = t.name ? ink(t) : "var(--dim)", dash = t.line?.dash ? ' stroke-dasharray="6 4"' : "";
+      const colour = t.name ? t.line.color : "var(--dim)", dash = t.line?.dash ? ' stroke-dasharray="6 4"' : "";
       parts.push(`<line x1="${px(from[0])}" y1="${px(from[1])}" x2="${px(to[0])}" y2="${px(to[1])}" stroke="${colour}" stroke-width="${t.name ? 3.5 : 1.5}" stroke-linecap="round"${dash}/>`);
       if (t.name) parts.push(`<circle cx="${px(to[0])}" cy="${px(to[1])}" r="4.5" fill="${colour}"/>`);
     }

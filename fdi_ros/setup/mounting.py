@@ -290,7 +290,7 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     covariance = g.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
     rho = np.abs(g.rho)
-    heat = {"type": "heatmap", "z": np.round(rho, 4).tolist(), "x": list(names), "y": list(names), "zmin": 0, "zmax": 1}
+    heat = {"type": "heatmap", "z": np.round(rho, 4).tolist(), "x": list(names), "y": list(names)}
     drawn_rho = {"data": [heat], "layout": {"title": RHO_TITLE}}
     losses = told(_losses(result, result.single, unit), unit)
     return [
