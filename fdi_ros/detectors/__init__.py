@@ -63,11 +63,7 @@ def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options:
     ConfigError
         If an option is out of its range.
     """
-    from fdi_ros.detectors.base import accepted_options
+    from fdi_ros.detectors.base import built
 
-    method = detector_class(name)
-    for option in options:
-        if option not in accepted_options(method):
-            known = ", ".join(accepted_options(method)) or "none"
-            raise DetectorError(f"detector {name} has no option {option!r}, expected one of: {known}")
-    return method(geometry, noise, **options)
+    detector: Detector = built(detector_class(name), geometry, noise, options)
+    return detector

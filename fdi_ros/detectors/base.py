@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -281,3 +282,12 @@ def accepted_options(method: type[Detector]) -> tuple[str, ...]:
         if all(one.kind != one.VAR_KEYWORD for one in parameters):
             break
     return tuple(names)
+
+
+def built(method: Any, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Any:
+    """Build a method; `DetectorError` if it does not take an option, or cannot run on this geometry."""
+    for option in options:
+        if option not in accepted_options(method):
+            known = ", ".join(accepted_options(method)) or "none"
+            raise DetectorError(f"detector {method.name} has no option {option!r}, expected one of: {known}")
+    return method(geometry, noise, **options)

@@ -14,18 +14,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors import DETECTORS, create_detector, detector_class
-from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.detectors.base import Detector, Verdict, accepted_options, built
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.montecarlo import (
-    Counts,
-    Field,
-    Preparation,
-    Refusals,
-    Schema,
-    TrialProtocol,
-    geometry_of,
-)
+from fdi_ros.experiments.montecarlo import Counts, Field, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, solve_log
 from fdi_ros.model.samples import Array, Mask
@@ -127,15 +119,6 @@ class Contenders(NamedTuple):
     refused: dict[str, str]
 
 
-def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
-    """Options of a method with a threshold of a given false-alarm probability per sample, or a loose one."""
-    accepted = accepted_options(METHODS[name])
-    stated = FalseAlarmRate(false_alarm_probability=alarm_probability).as_options(accepted)
-    if stated:
-        return dict(stated)
-    return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
-
-
 def _largest(size: Array) -> NDArray[np.intp]:
     """Column of the largest of each row (N,); parallel channels are equal but for rounding, which must not decide."""
     size = np.nan_to_num(size, nan=-1.0)
@@ -227,16 +210,16 @@ class CommonRate(TrialProtocol[Cell]):
         geometry, (noise, probability) = self.geometries[g], self.loose()
         running, refused, streaming = {}, {}, {}
         for name in names:
-            options = loose_options(name, geometry.n, probability) | dict(own.get(name, {}))
+            accepted = accepted_options(METHODS[name])
+            options = dict(FalseAlarmRate(false_alarm_probability=probability).as_options(accepted))
+            if not options and "max_faults" in accepted:
+                options = {"threshold": LOOSE_BOUNDS, "max_faults": min(2, geometry.n - 4)}
+            options |= own.get(name, {})
             try:
-                if name == ChiSquare.name:
-                    method: Method = ChiSquare(geometry, noise, **options)
-                else:
-                    method = create_detector(name, geometry, noise, **options)
+                contender = Contender(built(METHODS[name], geometry, noise, options))
             except FdiError as error:
                 refused[name] = str(error)
                 continue
-            contender = Contender(method)
             if contender.has_memory and not self.streams:
                 streaming[name] = "judges a stream, not one sample"
             else:

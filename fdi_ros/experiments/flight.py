@@ -39,7 +39,7 @@ from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.outcomes import OutcomeKind, quantiles, score, share, standing
+from fdi_ros.replay.outcomes import OutcomeKind, quantiles, rms, score, share, standing
 
 STEEPEST = 1.5  # largest slope of the smooth step 3 u^2 - 2 u^3, at its middle
 
@@ -213,10 +213,6 @@ class Flight(TrialProtocol[str]):
         """List the kinds of faults."""
         return list(self.settings["kinds"])
 
-    def trials(self, cell: str) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set."""
-        return self.settings["trials"], self.settings["block"]
-
     def run(self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Simulate flights and run the monitor with every method on them."""
         flights = [self._flight(cell, rng) for _ in range(count)]
@@ -306,7 +302,7 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
         "without_rate": without_rate,
         "delays": dict(delays),
         **{
-            part: {"total": math.fsum(float(e.sum()) for e in found), "samples": sum(map(len, found))}
+            part: {"squares": math.fsum(float(e.sum()) for e in found), "count": sum(map(len, found))}
             for part, found in errors.items()
         },
     }
@@ -318,12 +314,7 @@ def _figures(counts: Counts, sample_rate: float) -> Figures:
     return {
         **{name: share(counts[name], counts["trials"]) for name in ("right", "wrong", "ambiguous", "silent")},
         "delay_s": {level: None if d is None else d / sample_rate for level, d in delays.items()},
-        "rms_before": _rms(**counts["before"]),
-        "rms_after": _rms(**counts["after"]),
+        "rms_before": rms(**counts["before"]),
+        "rms_after": rms(**counts["after"]),
         "samples_without_rate": counts["without_rate"],
     }
-
-
-def _rms(total: float, samples: int) -> float | None:
-    """Root mean square error, rad/s; None: no samples."""
-    return math.sqrt(total / samples) if samples else None

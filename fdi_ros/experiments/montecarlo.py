@@ -66,9 +66,9 @@ class TrialProtocol(ABC, Generic[Cell]):
     def trial_cells(self) -> list[Cell]:
         """Cells of the second stage."""
 
-    @abstractmethod
     def trials(self, cell: Cell) -> tuple[int, int]:
-        """Trials of a cell, and of one block of it: the block size never depends on the workers."""
+        """Trials of a cell, and of one block of it, as set: the block size never depends on the workers."""
+        return self.settings["trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Run one block of the first stage, where there is one."""

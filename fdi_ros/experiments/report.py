@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from fdi_ros.experiments.montecarlo import Figures, StudyResult
 from fdi_ros.replay.outcomes import Estimate
-from fdi_ros.report.layout import PALETTE, Section, number, page, table
+from fdi_ros.report.layout import PALETTE, Section, number, page, section_lines
 
 LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
@@ -60,8 +60,7 @@ def headline(result: StudyResult) -> str:
     """Tables as text."""
     lines = [f"{result.title or result.study}, seed {result.seed}"]
     for one in tables(result):
-        assert isinstance(one.content, tuple)
-        lines += ["", one.title, one.hint, *table(*one.content)]
+        lines += ["", *section_lines(one)]
     return "\n".join(lines)
 
 
@@ -103,10 +102,6 @@ def _of(name: str) -> Say:
         return f"{percent:.1f}" if figure.value >= 0.01 or not percent else f"{percent:.2g}"
 
     return say
-
-
-def _both(at: Figures) -> str:
-    return f"{_of('right')(at)} ({_of('declared')(at)})"
 
 
 def _at(cell: Figures, k: int = 0) -> dict[str, Figures]:
@@ -158,7 +153,8 @@ def _snapshot(group: Group) -> list[Section]:
         ]
     healthy, *faults = group.cells
     columns: list[ByDetector] = [("healthy", _at(healthy), _of("declared"))]
-    columns += [(f"{cell['size']:g}", _at(cell), _both) for cell in faults]
+    right, declared = _of("right"), _of("declared")
+    columns += [(f"{cell['size']:g}", _at(cell), lambda at: f"{right(at)} ({declared(at)})") for cell in faults]
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
     found = [_table(f"One fault, {group.mounting}", hint, columns)]
     columns = []

@@ -13,15 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.contenders import (
-    BOUND,
-    Cell,
-    CommonRate,
-    Contender,
-    Evaluation,
-    factors_of,
-    moustakides_delay,
-)
+from fdi_ros.experiments.contenders import BOUND, Cell, CommonRate, Contender, Evaluation, factors_of, moustakides_delay
 from fdi_ros.experiments.montecarlo import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask

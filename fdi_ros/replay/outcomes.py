@@ -345,7 +345,7 @@ class Evaluation:
     @property
     def residual_rms(self) -> list[float | None]:
         """Of each channel while OK, rad/s; None: it never was."""
-        return [_rms(*one) for one in self._residuals.T.tolist()]
+        return [rms(*one) for one in self._residuals.T.tolist()]
 
     def scores(self) -> Scores:
         """Return the figures."""
@@ -356,7 +356,7 @@ class Evaluation:
             duration_s=round((self.last - first) * 1e-9, 9),
             faults=tuple(one.result() for one in self.faults),
             declared=tuple(self._unexplained),
-            fault_effect_rad_s=FaultEffect(*(_rms(*one) for one in self._effects.T.tolist())),
+            fault_effect_rad_s=FaultEffect(*(rms(*one) for one in self._effects.T.tolist())),
             start_s=0.0 if self._first is None else round(self.time(first), 9),
             samples_judged=judged,
             samples_with_rate=with_rate,
@@ -365,7 +365,7 @@ class Evaluation:
         )
 
 
-def _rms(squares: float, count: float) -> float | None:
+def rms(squares: float, count: float) -> float | None:
     """Root mean square of a sum of squares; None of nothing."""
     return math.sqrt(squares / count) if count else None
 

@@ -253,6 +253,12 @@ def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path)
                 assert figures[key]["value"] == pytest.approx(truth, abs=error)
 
 
+def test_an_option_that_chi_square_does_not_take_is_told(tmp_path):
+    what = {"geometries": ["cone_5"], "detectors": ["chi_square"], "options": {"chi_square": {"shift": 1.0}}}
+    section = run(tmp_path, "snapshot", **what, trials=10, sound_trials=1000)
+    assert "chi_square has no option 'shift'" in section["not_run"]["cone_5"]["chi_square"]
+
+
 def best_possible(geometry, size, alarm, draws=60_000):
     """Share of faults declared with the right name by Bayes' decision, which knows the size; of one simulation."""
     rng, directions = np.random.default_rng(4), geometry.parity.T
