@@ -31,6 +31,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import lz4.frame
+import numpy as np
 import zstandard
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
@@ -39,15 +40,7 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.core.sources import source_of_type
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import (
-    CHANNELS,
-    CHUNK_BYTES,
-    NAME,
-    PORTION_BYTES,
-    ROS1_INDEX_BYTES,
-    STEPS,
-    STEPS_PER_BYTE,
-)
+from fdi_ros.system.files import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, ROS1_INDEX_BYTES, STEPS, STEPS_PER_BYTE
 
 _TOGETHER = 4096  # messages handed on at once, at most
 _TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
@@ -78,8 +71,16 @@ class LibraryBag(BagFile):
         while messages := list(_together(found)):
             read += len(messages)
             numbers, times, data = zip(*messages, strict=True)
-            progress = min(1.0, read / max(1, whole))
-            yield Batch.of_messages([chosen[number] for number in numbers], times, data, progress)
+            length = np.array([len(one) for one in data])
+            yield Batch(
+                buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
+                topic=np.array([chosen[number] for number in numbers]),
+                log_time=np.array(times, dtype=np.int64),
+                offset=np.cumsum(length) - length,
+                length=length,
+                horizon=times[-1],
+                progress=min(1.0, read / max(1, whole)),
+            )
 
 
 def _together(messages: Iterator[Message]) -> Iterator[Message]:

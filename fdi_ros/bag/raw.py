@@ -69,20 +69,6 @@ class Batch:
         columns["offset"] += np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
         return replace(parts[-1], **columns)
 
-    @classmethod
-    def of_messages(cls, topics: Sequence[int], times: Sequence[int], data: Sequence[bytes], progress: float) -> Batch:
-        """Return k messages in the order of their times of recording, ns."""
-        length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
-        return cls(
-            buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-            topic=np.array(topics, dtype=np.int64),
-            log_time=np.array(times, dtype=np.int64),
-            offset=np.cumsum(length) - length,
-            length=length,
-            horizon=times[-1] if times else 0,
-            progress=progress,
-        )
-
     def message(self, k: int) -> bytes:
         """Return the bytes of message k."""
         start = int(self.offset[k])

@@ -41,16 +41,8 @@ FORMATS: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile, ".ba
 class Recording:
     """An open recording; close it, or use it in a with statement.
 
-    Parameters
-    ----------
-    path
-        A rosbag2 folder, or one file: .mcap, .db3, .bag (ROS 1), .csv, .bin (ArduPilot), .ulg (PX4) or .tlog (ground
-        stations).
-
-    Raises
-    ------
-    BagError
-        If there is no such recording or nothing in it can be read.
+    ``path``: a rosbag2 folder, or one file: .mcap, .db3, .bag (ROS 1), .csv, .bin (ArduPilot), .ulg (PX4) or .tlog
+    (ground stations). `BagError` if there is no such recording or nothing in it can be read.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -103,13 +95,7 @@ class Recording:
         return tuple(sorted(text for file in self._files for text in file.texts))
 
     def require(self, names: Sequence[str], type_name: str) -> None:
-        """Check that topics are there, of the type, serialised as CDR and not empty.
-
-        Raises
-        ------
-        BagError
-            If one is not; a missing topic lists those that are there.
-        """
+        """Check that topics are there, of the type and serialised as CDR; else `BagError`, with those there are."""
         there = {topic.name: topic for topic in self.topics}
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
@@ -175,23 +161,8 @@ class Recording:
 def convert(recording: Recording, path: Path, progress: Callable[[float], None]) -> dict[str, int]:
     """Write the messages of a recording that may be of gyros, byte for byte, with their times of recording.
 
-    Parameters
-    ----------
-    recording
-        Open recording.
-    path
-        Folder to be made; it must not exist.
-    progress
-        Is told the share done, 0 to 1.
-
-    Returns
-    -------
-    Messages written of each topic.
-
-    Raises
-    ------
-    BagError
-        If the recording has no such topic.
+    ``path``: folder to be made, which must not exist; ``progress`` is told the share done, 0 to 1. Returns the number
+    of messages of each topic; `BagError` if the recording has none.
     """
     # Imported lazily: readers do not need it.
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer

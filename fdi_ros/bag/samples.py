@@ -43,32 +43,15 @@ class Newest(NamedTuple):
 class Samples:
     """The samples of a recording, block after block.
 
-    Parameters
-    ----------
-    recording
-        Open recording.
-    config
-        Says the input topics.
-    channels
-        Number of channels.
-    start, end
-        Part to be read, s from the first message.
-    tap
-        Is shown every batch of raw messages with those that are used.
-    period
-        Cut the blocks at multiples of this time of recording, ns; 0: where it is fastest.
-
-    Raises
-    ------
-    BagError
-        If a topic is missing or of another type.
+    ``start``, ``end``: part to be read, s from the first message. ``tap`` is shown every batch of raw messages with
+    those that are used. ``period``: blocks are cut at multiples of this time of recording, ns; 0: where it is fastest.
+    `BagError` if a topic of the config is missing or of another type.
     """
 
     def __init__(
         self,
         recording: Recording,
         config: Config,
-        channels: int,
         start: float = 0.0,
         end: float = math.inf,
         tap: Tap | None = None,
@@ -76,11 +59,10 @@ class Samples:
     ) -> None:
         self.recording = recording
         self.topics = config.topics
-        self.channels = channels
         self.source = source_of(config)
         recording.require(self.topics, self.source.type)
         self.alignment = Alignment(*self.source.alignment)
-        first = self.source.channels_of(0, channels)
+        first = self.source.channels_of(0, build_geometry(config).n)
         self._width = first.stop - first.start  # values in a message
         columns = [("topic", "i8"), ("log_time", "i8"), ("stamp", "i8"), ("values", "f8", (self._width,))]
         self._row = np.dtype(columns)
@@ -102,13 +84,7 @@ class Samples:
         """Last message of each topic in the blocks so far; kept only where blocks are cut by period."""
 
     def blocks(self) -> Iterator[Block]:
-        """Read the recording.
-
-        Raises
-        ------
-        BagError
-            If it holds not a single message that can be used, or samples of another rate than configured.
-        """
+        """Read the recording; `BagError` if no message can be used, or the rate is another than configured."""
         for messages in self._portions():
             self.messages += len(messages)
             if self.period:
@@ -234,7 +210,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
 def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:
     """Read all samples of a part of a recording, aligned as in a replay; `BagError` as of `Recording` and `Samples`."""
     with Recording(bag) as recording:
-        return joined(list(Samples(recording, config, build_geometry(config).n, start, end).blocks()))
+        return joined(list(Samples(recording, config, start, end).blocks()))
 
 
 def joined(blocks: Sequence[Block]) -> Block:

@@ -139,16 +139,10 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
 
 
 class Injector:
-    """Injects faults into a stream of blocks, in the order of the list.
+    """Injects faults into a stream of blocks, in the order of the list, several on one channel one after the other.
 
-    Parameters
-    ----------
-    faults
-        What to inject; several on one channel act one after the other. `FaultError` if there is no such channel.
-    channel_names
-        Names of the n channels of the stream.
-    start_stamp
-        Stamp that the times of the faults count from, ns; None: that of the first sample.
+    ``channel_names``: of the n channels of the stream; `FaultError` if a fault is on another. ``start_stamp``: what the
+    times of the faults count from, ns; None: that of the first sample.
     """
 
     def __init__(self, faults: Sequence[Fault], channel_names: Sequence[str], start_stamp: int | None = None) -> None:

@@ -280,7 +280,7 @@ def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: flo
         settings = Config.of(config)
     # Refused now, not with the first block.
     recording = Recording(bag)
-    samples = Samples(recording, settings, build_geometry(settings).n, start, end)
+    samples = Samples(recording, settings, start, end)
 
     def blocks() -> Iterator[Block]:
         with recording:
@@ -332,7 +332,7 @@ def replay(
             sink.tap(batch, rows)
 
     with Recording(bag) as recording:
-        samples = Samples(recording, settings, len(injector.channel_names), start, end, tap, period)
+        samples = Samples(recording, settings, start, end, tap, period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:

@@ -43,7 +43,7 @@ STAMP = START + STEP * np.arange(SAMPLES)
 def read(path, config=CONFIG, **span):
     """All samples of a recording, and the reader of them."""
     with Recording(path) as recording:
-        samples = Samples(recording, config, 6, **span)
+        samples = Samples(recording, config, **span)
         block = joined(list(samples.blocks()))
     return block.stamp, block.z, samples
 

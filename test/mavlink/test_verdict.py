@@ -52,7 +52,7 @@ def judge(path: Path, config: Config, strikes: float) -> Verdict:
     pipeline = Pipeline.from_config(config)
     events = []
     with Recording(path) as recording:
-        for block in Samples(recording, config, 9).blocks():
+        for block in Samples(recording, config).blocks():
             events += pipeline.process(block).events
     declared = [event for event in events if event.declares]
     after = [event.stamp / NS - strikes for event in declared if event.stamp / NS >= strikes]
