@@ -3,6 +3,7 @@
 
 """The package as a user of Python or of a notebook meets it."""
 
+import inspect
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -61,6 +62,7 @@ def test_a_replay_says_what_the_verb_says(flight, config, root):
     assert same.isolated == 1
     # A module of it has been imported, and it is a function all the same.
     assert "fdi_ros.replay.run" in sys.modules
+    assert [*inspect.signature(fdi_ros.replay).parameters][:3] == ["path", "config", "faults"]
     for settings, one in ((root / "config" / "two_imus.yaml", fault), (config, FAULT)):
         assert fdi_ros.replay(flight, settings, [one], end=31.0).scores == same
     assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config

@@ -27,7 +27,7 @@ from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.episodes import Episode
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary
@@ -190,14 +190,15 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
         except FdiError as error:
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
-    seen = _Seen(config.sample_rate)
+    seen = _Seen(config)
     summary = replay(path, config, sinks=[seen])
-    if seen.first is None:
+    origin = summary.stream.origin_ns
+    if not summary.scores.samples or origin is None:
         raise BagError("its topics have no time in common: there is no sample of all channels")
     looks |= {f"{second} gives the values of {first}: one sensor" for first, second in seen.copies}
     noise = tuple(seen.segments.noise().quiet.tolist())
-    row = _row(replace(flight, date=_date(seen.first), noise=noise, why=tuple(sorted(looks))), summary)
-    origin = seen.first - round(summary.scores.start_s * 1e9)
+    date = _date(origin + round(summary.scores.start_s * 1e9))
+    row = _row(replace(flight, date=date, noise=noise, why=tuple(sorted(looks))), summary)
     return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
 
@@ -211,19 +212,14 @@ def _calibrated(path: Path, parameters: str) -> str:
 
 
 class _Seen(Sink):
-    """What a summary does not have: stamp of the first sample, and the noise of the channels."""
+    """What a summary does not have: the noise of the channels, and units that are copies."""
 
-    def __init__(self, rate: float) -> None:
-        self.first: int | None = None  # ns
-        self._rate, self.segments = rate, NoiseSegments(0)
+    def __init__(self, config: Config) -> None:
+        self._rate, self.segments = config.sample_rate, NoiseSegments(build_geometry(config).n)
         self.copies: set[tuple[str, str]] = set()
         """Units, with their topics, of which the second gives the values of the first."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        if not len(block):
-            return
-        if self.first is None:
-            self.first, self.segments = int(block.stamp[0]), NoiseSegments(block.z.shape[1])
         whole = np.isfinite(block.z).all(axis=1)
         self.segments.add(block.z[whole], block.stamp[whole], self._rate)
         self.copies |= {*pipeline.status().copies}

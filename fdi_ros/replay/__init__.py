@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from types import ModuleType
 from typing import Any
@@ -18,6 +19,12 @@ class _Callable(ModuleType):
         from fdi_ros.replay.run import replay
 
         return replay(*arguments, **named)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        from fdi_ros.replay.run import replay
+
+        return inspect.signature(replay)
 
 
 sys.modules[__name__].__class__ = _Callable

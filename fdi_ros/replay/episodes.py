@@ -21,7 +21,7 @@ from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""
-HOLE = 1.0  # a fault is not injected where samples are missing for longer than this while it is watched, s
+HOLE = 1.0  # no fault is injected into a longer time without a sample, and no curve is drawn over it, s
 
 
 def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:

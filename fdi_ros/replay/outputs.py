@@ -8,8 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from rosbags.interfaces import Connection
@@ -90,18 +89,13 @@ class OutputBag(Sink):
 
     def __enter__(self) -> OutputBag:
         self._writer.open()
-        names = [name if name.startswith("/") else f"/{name}" for name in self._source.topics]
-        self._inputs = [self._topic(name, self._source.type) for name in names]
-        self._outputs = {
-            topic: self._topic(_full_name(topic.name), topic.type)
-            for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
-        }
+        self._inputs = [self._topic(name, self._source.type) for name in self._source.topics]
+        topics = (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
+        self._outputs = {topic: self._topic(topic.name, topic.type) for topic in topics}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._writer.__exit__(*error)
 
     def tap(self, batch: Batch, rows: Int) -> None:
         """Copy the messages that are used."""
@@ -158,13 +152,10 @@ class OutputBag(Sink):
         return min(max(stamp + self._later, 0), LATEST)
 
     def _topic(self, name: str, kind: str) -> Connection:
+        """Add a topic, called as by the node where nothing is remapped."""
+        name = name.replace("~", NODE, 1) if name.startswith("~") else f"/{name.lstrip('/')}"
         return self._writer.add_connection(name, kind, typestore=_STORE)
 
     def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
         lines = describe(pipeline.status(), inputs=inputs)
         self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now))
-
-
-def _full_name(name: str) -> str:
-    """Return the name under which the node publishes a topic where nothing is remapped."""
-    return name.replace("~", NODE, 1) if name.startswith("~") else f"/{name.lstrip('/')}"

@@ -16,7 +16,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.episodes import Episode, Story, detail_words, episode_words, stretch_words
+from fdi_ros.replay.episodes import HOLE, Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.outcomes import Outcome, StateChange
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import AutopilotText, Summary
@@ -41,7 +41,6 @@ from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system import there
 from fdi_ros.system.text import date_of
 
-HOLE = 1.0  # no curve is drawn over a longer time without a sample, s
 SEES_AXIS = 0.3  # share of a body axis in a channel's own axis from which on the channel's reading of it is shown
 LOG_FROM = 10.0  # a statistic that exceeds its threshold by more is shown on a logarithmic scale
 _AXES = "xyz"

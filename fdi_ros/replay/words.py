@@ -21,14 +21,7 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.replay.episodes import (
-    MOST_TOLD,
-    Episode,
-    Story,
-    detail_words,
-    episode_words,
-    stretch_words,
-)
+from fdi_ros.replay.episodes import MOST_TOLD, Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.outcomes import UNCHECKED_STATES, Outcome, Scores
 from fdi_ros.replay.summary import ChannelResult, Judgement, SampleRate, Summary
 from fdi_ros.report.layout import (

@@ -28,15 +28,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.estimator.blocks import QUIET, REST_STD, UNLEARNED, rests
-from fdi_ros.estimator.error_states import (
-    ERROR_KINDS,
-    ONE,
-    SIGNALS,
-    Layout,
-    fill_signals,
-    places_of,
-    prepare_layout,
-)
+from fdi_ros.estimator.error_states import ERROR_KINDS, ONE, SIGNALS, Layout, fill_signals, places_of, prepare_layout
 from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask

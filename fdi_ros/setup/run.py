@@ -26,21 +26,14 @@ from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiErr
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.outcomes import OutcomeKind
-from fdi_ros.replay.sweep import Baseline, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
+from fdi_ros.replay.sweep import Baseline, Plan, Subject, parse_swept, sweep
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, Calibration, calibrate, reference_channels
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.setup.starting_config import (
-    candidates,
-    clocks_apart,
-    copy_words,
-    needs,
-    refuse_degrees,
-    starting_config,
-)
+from fdi_ros.setup.starting_config import candidates, clocks_apart, copy_words, needs, refuse_degrees, starting_config
 from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
@@ -105,12 +98,12 @@ class Proof:
 def _tried(block: Block, config: Config) -> Tried:
     """Replay a recording as it is, and with biases of all sizes."""
     plan = Plan(tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")), TIMES, WITHIN)
+    one = Subject("settings", config, block)
     try:
-        (one,) = sweep([Subject("settings", config, block)], plan)
+        sweep([one], plan)
     except FdiError as error:
-        pipeline = monitor_of(config)
-        pipeline.restart()
-        baseline = watch_baseline(pipeline, block)
+        if (baseline := one.baseline) is None:
+            raise FdiError(one.refused) from error
         return Tried(baseline if baseline.judged else None, baseline.note or str(error), {})
     # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
     missed, isolated = len(one.skipped) * len(one.used), {}

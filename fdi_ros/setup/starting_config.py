@@ -330,7 +330,7 @@ def _turned_units(path: Path, config: Config) -> str:
     with Recording(path) as recording:
         means = [
             block.z[: len(block) // size * size].reshape(-1, size, 3 * len(names)).mean(axis=1)
-            for block in Samples(recording, config, 3 * len(names)).blocks()
+            for block in Samples(recording, config).blocks()
         ]
     slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
     slow = slow[np.isfinite(slow).all(axis=1)]
