@@ -11,9 +11,7 @@ Rates are in IMU (what the autopilot uses: filtered, all units at one time, at t
 (what its estimator is given: angles, and the time they were taken in) and, where raw logging is on, in GYR (all samples
 of each sensor with their own times); all are in the body frame. Before version 4.1 the instances were messages of their
 own: IMU, IMU2, IMU3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a sensor twice, before and
-after the filters: at the same SampleUS, as instance I and as I plus the number of gyros. Which are logged, and how
-fast: LOG_BITMASK and INS_RAW_LOG_OPT in the "Complete Parameter List". Batches (INS_LOG_BAT_MASK) are bursts for
-spectra, and are not read.
+after the filters: at the same SampleUS, as instance I and as I plus the number of gyros.
 
 Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
 TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.

@@ -6,13 +6,8 @@
 ULog (.ulg, .ulog). Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time
 they were taken in) and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the
 uORB messages of these names say. By default they are logged at 1 to 2 Hz, and so is vehicle_imu_status (body frame,
-calibrated: the mean of the last 0.1 s): of such a log the means are read, for a coarse check. No bit of SDLOG_PROFILE
-changes that for all IMUs: "Sensor comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fifo. A
-list of topics on the SD card does ("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the
-default one. sensor_combined has the one IMU that PX4 has selected: nothing to compare.
-
-Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates. How long the
-logger dropped out is told; what was lost then is a gap in the samples.
+calibrated: the mean of the last 0.1 s): of such a log the means are read, for a coarse check. Times count from the
+start of the autopilot; in a simulation with the clock of the computer they are dates.
 
 pyulog keeps each message that is no sample as an object, makes one for each field that a format announces, tries again
 byte by byte where a file is damaged, and prints. So it is given a file that ends early if it has more of that than

@@ -43,7 +43,7 @@ class Newest(NamedTuple):
 class Samples:
     """The samples of a recording, block after block.
 
-    ``start``, ``end``: part to be read, s from the first message. ``tap`` is shown every batch of raw messages with
+    ``start``, ``end``: part to be read, s from the first message. ``taps`` are shown every batch of raw messages with
     those that are used. ``period``: blocks are cut at multiples of this time of recording, ns; 0: where it is fastest.
     `BagError` if a topic of the config is missing or of another type.
     """
@@ -54,7 +54,7 @@ class Samples:
         config: Config,
         start: float = 0.0,
         end: float = math.inf,
-        tap: Tap | None = None,
+        taps: Sequence[Tap] = (),
         period: int = 0,
     ) -> None:
         self.recording = recording
@@ -69,7 +69,7 @@ class Samples:
         """Of a decoded message: index of the input topic, times, ns (the time of recording where it carries no stamp),
         rates, rad/s."""
         self._span = (start, end)
-        self._tap = tap
+        self._taps = taps
         self.period = period
         self._configured = config.sample_rate
         self._first: list[Int] | None = []  # stamps of the first samples, ns; None: their rate was checked.
@@ -181,8 +181,8 @@ class Samples:
         if self._span != (0.0, math.inf):
             seconds = (stamp - (self.origin or 0)) * 1e-9
             keep = keep & (seconds >= self._span[0]) & (seconds < self._span[1])
-        if self._tap is not None:
-            self._tap(batch, np.flatnonzero(keep))
+        for tap in self._taps:
+            tap(batch, np.flatnonzero(keep))
         messages = np.empty(len(batch), self._row)
         messages["topic"], messages["log_time"] = batch.topic, batch.log_time
         messages["stamp"], messages["values"] = stamp, decoded.values

@@ -162,12 +162,7 @@ VERBS = {
     "inspect": Verb(
         "say what is in a recording and print a starting config for it",
         ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
-        {
-            "bag": {},
-            "--output --write": takes_path("write the config to a file, too"),
-            **RESULTS,
-            "--degrees": {},
-        },
+        {"bag": {}, "--output --write": takes_path("write the config to a file, too"), **RESULTS, "--degrees": {}},
         "recording:run_inspect",
         (*BAGS, *PROGRESS),
     ),

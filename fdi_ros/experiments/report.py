@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from fdi_ros.experiments.montecarlo import Figures, StudyResult
 from fdi_ros.replay.outcomes import Estimate
-from fdi_ros.report.layout import PALETTE, Section, number, page, section_lines
+from fdi_ros.report.layout import PALETTE, Section, number, page, text_of
 
 LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
@@ -58,10 +58,7 @@ def tables(result: StudyResult) -> list[Section]:
 
 def headline(result: StudyResult) -> str:
     """Tables as text."""
-    lines = [f"{result.title or result.study}, seed {result.seed}"]
-    for one in tables(result):
-        lines += ["", *section_lines(one)]
-    return "\n".join(lines)
+    return text_of([f"{result.title or result.study}, seed {result.seed}"], tables(result))
 
 
 def report(result: StudyResult) -> str:
@@ -135,9 +132,6 @@ def _plot(
     return Section(title, "", "", [{"data": data, "layout": layout}])
 
 
-# One sample
-
-
 def _snapshot(group: Group) -> list[Section]:
     if group.settings["faults"] == 2:
         return [_double(group, cell) for cell in group.faults]
@@ -201,9 +195,6 @@ def _snapshot_curves(group: Group) -> list[Section]:
     return found
 
 
-# Streams
-
-
 def _delay(group: Group) -> list[Section]:
     def mean(at: Figures) -> str:
         figure = at["mean_delay"]
@@ -228,9 +219,6 @@ def _delay_curves(group: Group) -> list[Section]:
     return [_plot(f"Delay, {group.mounting}", curves, SIZE, "mean delay, samples", "yaxis", limit)]
 
 
-# Flights
-
-
 def _flight(group: Group) -> list[Section]:
     def delays(at: Figures) -> str:
         median, late = at["delay_s"]["p50"], at["delay_s"]["p90"]
@@ -251,9 +239,6 @@ def _flight(group: Group) -> list[Section]:
     ]
 
 
-# The protocol of 2019
-
-
 def _search(group: Group) -> list[Section]:
     """Shares of each selection: of the searches with the paper's tolerance, then of all methods at each rate."""
     found, settings = [], group.settings
@@ -271,10 +256,5 @@ def _search(group: Group) -> list[Section]:
     return found
 
 
-_TABLES: Mapping[str, Shows] = {
-    "snapshot": _snapshot,
-    "delay": _delay,
-    "flight": _flight,
-    "residual_search": _search,
-}
+_TABLES: Mapping[str, Shows] = {"snapshot": _snapshot, "delay": _delay, "flight": _flight, "residual_search": _search}
 _CURVES: Mapping[str, Shows] = {"snapshot": _snapshot_curves, "delay": _delay_curves}

@@ -61,9 +61,6 @@ def _text(value: float) -> str:
     return "" if value != value else repr(value)
 
 
-# The bag --------------------------------------------------------------------------------------------------------------
-
-
 NODE = "/fdi_node"  # what ``~`` stands for: the node as it is called by default, in no namespace
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 

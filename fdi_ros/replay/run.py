@@ -326,13 +326,8 @@ def replay(
     begun, period = clock(), max((sink.period for sink in sinks), default=0)
     injector = Injector(tuple(map(_fault, faults)), build_geometry(settings).channel_names)
     judge = Judge(Pipeline.from_config(settings), injector, sinks)
-
-    def tap(batch: Batch, rows: Int) -> None:
-        for sink in sinks:
-            sink.tap(batch, rows)
-
     with Recording(bag) as recording:
-        samples = Samples(recording, settings, start, end, tap, period)
+        samples = Samples(recording, settings, start, end, [sink.tap for sink in sinks], period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:

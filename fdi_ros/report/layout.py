@@ -185,6 +185,11 @@ def section_lines(section: Section) -> list[str]:
     return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content or ["none"])]
 
 
+def text_of(lines: Sequence[str], sections: Iterable[Section]) -> str:
+    """Lay out lines, and sections below them, for a terminal."""
+    return "\n".join([*lines, *(line for section in sections for line in ("", *section_lines(section)))])
+
+
 def section_text(section: Section) -> str:
     """Lay out a section for a terminal as a text of its own: what is below the title is set in."""
     title, *lines = section_lines(section)

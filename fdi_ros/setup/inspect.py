@@ -122,7 +122,6 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     kind, messages = report.kind, (batch.buffer, batch.offset[rows], batch.length[rows])
     if kind is None or report.topic.encoding != "cdr":
         return
-    # What could be angular rates.
     if not report.channels:
         report.announced = kind.announced(*messages)
         if report.announced not in kind.value_counts:

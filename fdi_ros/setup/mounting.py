@@ -32,7 +32,7 @@ from fdi_ros.report.layout import (
     figures_of,
     number,
     page,
-    section_lines,
+    text_of,
     told,
 )
 
@@ -308,10 +308,7 @@ def _matrix(names: Sequence[str], values: Array, form: str) -> Rows:
 
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    lines = [*summary_lines(result, unit)]
-    for section in mounting_sections(result, unit):
-        lines += ["", *section_lines(section)]
-    return "\n".join(lines) + "\n"
+    return text_of(summary_lines(result, unit), mounting_sections(result, unit)) + "\n"
 
 
 def mounting_page(result: Mounting, title: str, unit: Unit = RADIANS) -> str:

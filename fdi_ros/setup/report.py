@@ -26,7 +26,7 @@ from fdi_ros.report.layout import (
     figures_of,
     first_of,
     page,
-    section_lines,
+    text_of,
     time_layout,
     told,
 )
@@ -384,10 +384,7 @@ def _sections(
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
     (first, *lines), sections = _sections(found, list(setup_findings(found, unit)), bag, config, unit)
-    text = [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)]
-    for section in sections:
-        text += ["", *section_lines(section)]
-    return "\n".join([*text, "", ""])
+    return text_of([first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)], sections) + "\n\n"
 
 
 def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
