@@ -77,17 +77,21 @@ def flight(samples=600, seed=0, rate=100.0):
     return imu_messages(START + step * np.arange(samples), z, apart=1000), z
 
 
+def send(messages, types, connect, write):
+    """Write messages, each on the connection that the first of its topic makes."""
+    connections = {}
+    for topic, log_time, data in messages:
+        if topic not in connections:
+            connections[topic] = connect(topic, (types or {}).get(topic, IMU))
+        write(connections[topic], log_time, data)
+
+
 def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None):
     """A rosbag2 folder written by rosbags."""
     writer = Writer(path, version=9, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        connections = {}
-        for topic, log_time, data in messages:
-            if topic not in connections:
-                kind = (types or {}).get(topic, IMU)
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], log_time, data)
+        send(messages, types, partial(writer.add_connection, typestore=STORE), writer.write)
     return path
 
 
@@ -96,14 +100,13 @@ def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **o
     path, options = path.with_suffix(".mcap"), {"chunk_size": 16_384, **options}
     with path.open("wb") as file:
         writer = McapWriter(file, compression=compression, **options)
+
+        def connect(topic, kind):
+            definition = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+            return writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", definition))
+
         writer.start("ros2", "test")
-        channels = {}
-        for sequence, (topic, log_time, data) in enumerate(messages):
-            if topic not in channels:
-                kind = (types or {}).get(topic, IMU)
-                schema = writer.register_schema(kind, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], log_time, data, log_time, sequence)
+        send(messages, types, connect, lambda channel, at, data: writer.add_message(channel, at, data, at))
         writer.finish()
     return path
 
@@ -125,15 +128,14 @@ def write_ros1(path, messages, compression=None, types=None):
     writer = Ros1Writer(path)
     if compression is not None:
         writer.set_compression(compression)
+
+    def write(connection, log_time, data):
+        with contextlib.suppress(SerdeError, struct.error, IndexError, ValueError):
+            data = bytes(STORE.cdr_to_ros1(data, connection.msgtype))
+        writer.write(connection, log_time, data)
+
     with writer:
-        connections = {}
-        for topic, log_time, data in messages:
-            kind = (types or {}).get(topic, IMU)
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
-            with contextlib.suppress(SerdeError, struct.error, IndexError, ValueError):
-                data = bytes(STORE.cdr_to_ros1(data, kind))
-            writer.write(connections[topic], log_time, data)
+        send(messages, types, partial(writer.add_connection, typestore=ROS1), write)
     return path
 
 

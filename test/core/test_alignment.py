@@ -87,11 +87,9 @@ def arrays(messages):
     return unit, stamps, np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 3)
 
 
-def blocks_of(messages, units, cuts=(), skew=SKEW, timeout=TIMEOUT):
-    aligner, edges = Alignment(units, skew, timeout), [0, *sorted(cuts), len(messages)]
-    return aligner, [
-        aligner.push_block(*(column[a:b] for column in arrays(messages))) for a, b in itertools.pairwise(edges)
-    ]
+def blocks_of(messages, units, cuts):
+    aligner, edges, columns = Alignment(units, SKEW, TIMEOUT), [0, *sorted(cuts), len(messages)], arrays(messages)
+    return aligner, [aligner.push_block(*(one[a:b] for one in columns)) for a, b in itertools.pairwise(edges)]
 
 
 def same(samples, blocks, units):

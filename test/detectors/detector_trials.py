@@ -3,8 +3,6 @@
 
 """Samples and figures that the tests of several detectors share."""
 
-import math
-
 import numpy as np
 
 from fdi_ros import Geometry
@@ -75,8 +73,3 @@ def alarms(detector, noise, rows, seed):
         z, acceleration = sound(rng, detector.geometry, noise, min(100_000, rows - start))
         total += int(detector.detect(z, None if noise.constant else acceleration).alarm.sum())
     return total
-
-
-def within_standard_errors(count, rows, probability, errors=3.0):
-    """Whether a number of alarms fits a probability."""
-    return abs(count - rows * probability) <= errors * math.sqrt(rows * probability * (1 - probability))

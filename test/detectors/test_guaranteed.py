@@ -74,6 +74,12 @@ def test_the_mildest_explanation_is_that_of_a_linear_programme():
             assert statistic < 1.001
 
 
+def minimum(cost, A, b):
+    """Of a linear programme A x <= b: inf if it cannot be, -inf if without bound."""
+    solved = linprog(cost, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
+    return {0: solved.fun, 2: np.inf, 3: -np.inf}[solved.status]
+
+
 def by_programmes(H, bound, z, faults):
     """Extremes (2, n) of every channel's error over all sets left out, and which sets are feasible."""
     n, feasible = len(H), []
@@ -81,12 +87,11 @@ def by_programmes(H, bound, z, faults):
     for struck in combinations(range(n), faults):
         kept = [i for i in range(n) if i not in struck]
         A, b = np.vstack([H[kept], -H[kept]]), np.concatenate([z[kept] + bound[kept], bound[kept] - z[kept]])
-        feasible.append(linprog(np.zeros(3), A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 0)
+        feasible.append(minimum(np.zeros(3), A, b) == 0)
         if feasible[-1]:
             for i in range(n):
-                top, low = (linprog(-s * H[i], A_ub=A, b_ub=b, bounds=(None, None), method="highs") for s in (1, -1))
-                hull[0, i] = min(hull[0, i], z[i] + top.fun if top.status == 0 else -np.inf)
-                hull[1, i] = max(hull[1, i], z[i] - low.fun if low.status == 0 else np.inf)
+                hull[0, i] = min(hull[0, i], z[i] + minimum(-H[i], A, b))
+                hull[1, i] = max(hull[1, i], z[i] - minimum(H[i], A, b))
     return (hull if any(feasible) else np.full((2, n), np.nan)), feasible
 
 
@@ -94,10 +99,8 @@ def least_largest(H, bound, z, struck):
     """Least t for which the errors of the channels struck stay within t bounds and all others within one."""
     grows = np.isin(np.arange(len(H)), struck) * bound
     fixed = bound - grows
-    A = np.vstack([np.column_stack([H, -grows]), np.column_stack([-H, -grows])])
-    b = np.concatenate([z + fixed, fixed - z])
-    solved = linprog([0, 0, 0, 1], A_ub=A, b_ub=b, bounds=[(None, None)] * 3 + [(0, None)], method="highs")
-    return float(solved.fun) if solved.status == 0 else np.inf
+    A = np.vstack([np.column_stack([H, -grows]), np.column_stack([-H, -grows]), [0, 0, 0, -1]])
+    return minimum([0, 0, 0, 1], A, np.concatenate([z + fixed, fixed - z, [0]]))
 
 
 @settings(max_examples=150)

@@ -34,9 +34,9 @@ def white(seed, rows, n=6):
     return np.random.default_rng(seed).standard_normal((rows, n))
 
 
-def fault(channel, size, geometry=CONE):
+def fault(channel, size):
     """Error of one channel (n,) that moves its normalised residual by so many standard deviations."""
-    return size / geometry.sensitivity[channel] * np.eye(geometry.n)[channel]
+    return size / CONE.sensitivity[channel] * np.eye(6)[channel]
 
 
 @cache
