@@ -37,15 +37,12 @@ from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.files import read_trusted, replacing
 
-YOUNG = NS
-"""A declaration is acted on up to this age, ns: with what is older the vehicle has flown, and the pilot decides."""
+YOUNG = NS  # a declaration is acted on up to this age, ns: with what is older the vehicle has flown, the pilot decides
 HEALED = 2 * NS  # so long an IMU that is out must have been well before it changes places with a faulty one, ns
-GROUNDED = 2 * NS
-"""A vehicle is disarmed when its heartbeats have all said so for so long, ns: a single forged one is not enough."""
+GROUNDED = 2 * NS  # disarmed is what all heartbeats have said for so long, ns: a single forged one is not enough
 RETRY, TRIES = 100 * MS, 10  # between two attempts to set a parameter, ns, and their number
 AGAIN = 10 * NS  # an IMU that could not be put back is tried again after so long, ns
-SETTLED = 2 * NS
-"""What was sent so long ago has arrived, or never will, ns: what is heard later is the truth, or somebody else's."""
+SETTLED = 2 * NS  # what was sent so long ago has arrived, or never will, ns: what is heard later is the truth
 
 
 class FailoverUnit(NamedTuple):
@@ -55,8 +52,7 @@ class FailoverUnit(NamedTuple):
     heard: int = 0  # when the autopilot said so last
     declared: int | None = None  # when the newest of its channels that are FAULTY by name was declared; None: none is.
     ok: bool = False  # whether all its channels are OK: healthy and checked
-    well: int | None = None
-    """Since when none of its channels is FAULTY, without data or taken out by an operator; None: one is."""
+    well: int | None = None  # since when none of its channels is FAULTY, without data or excluded; None: one is.
     delivers: bool = False  # whether its samples come
 
 
@@ -92,17 +88,13 @@ class FailoverState:
 
     orders: dict[int, Order] = field(default_factory=dict)  # of those that are, or may be, out of use by our hand
     seen: dict[int, bool] = field(default_factory=dict)  # what each parameter said last
-    left_alone: set[int] = field(default_factory=set)
-    """Those that somebody else has taken out or put back: left alone until the vehicle is disarmed."""
+    left_alone: set[int] = field(default_factory=set)  # set by somebody else: left alone until it is disarmed
     answered: dict[int, int] = field(default_factory=dict)
     """Declarations that were acted on, or of which it was said why not: when they were made, ns."""
 
     @classmethod
     def resumed(cls, ours: Iterable[int]) -> FailoverState:
-        """State after a start, of IMUs that were out of use by our hand before, and may be still.
-
-        What somebody else has set meanwhile is not known: they are put back, and not taken out again in this flight.
-        """
+        """State after a start, of IMUs that were out by our hand: they are put back, and left alone in this flight."""
         orders = {unit: Order(False, TRIES + 1) for unit in ours}
         return cls(orders, left_alone=set(orders))
 
@@ -250,8 +242,7 @@ OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
 _STEP = 20 * MS  # the policy is asked so often while a declaration is young, ns
 _BEFORE = NS + HEALED  # time of the policy at the start of a recording, ns
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS  # parameters are read in turn so often; what is older counts as not known
-SILENT, ABSENT = NS // 2, 5 * NS
-"""A monitor without a sample, or without a report, for so long is silent, ns; and an IMU without a sample."""
+SILENT, ABSENT = NS // 2, 5 * NS  # an IMU or a monitor without a sample, a monitor without a report, for so long, ns
 TEXTS = {
     "out": (CRITICAL, "out of use"),
     "back": (INFO, "in use again"),
@@ -306,16 +297,13 @@ class Failover:
     def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
         self._vehicle, self._channels, self._limit, self._path = vehicle, channels, limit, path
         count = len(channels) // 3
-        self.errors: dict[str, float] = {}
-        """Estimated error of each channel, as the monitor last reported it, rad/s; NaN: it reported none."""
-        self.reported = 0
-        """When the monitor last reported as a whole, of these IMUs, ns; 0: it has not, or of others since."""
+        self.errors: dict[str, float] = {}  # estimated error of each channel, as last reported, rad/s; NaN: none
+        self.reported = 0  # when the monitor last reported as a whole, of these IMUs, ns; 0: not, or of others since
         self.is_alone = False  # whether nobody but the monitor publishes what is taken for its declarations
         self.declarations = Declarations(count)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count  # what each parameter said last, and when
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
-        self._system, self._saved = self._restore()
-        """Of which system IMUs are out of use by our hand, and which, as the file says."""
+        self._system, self._saved = self._restore()  # which IMUs of which system are out of use by our hand, as saved
         self._state = FailoverState.resumed(self._saved)
         self._save()
 
@@ -353,11 +341,11 @@ class Failover:
             else:
                 self._announce(action.kind, action.unit, action.why)
         if self._state.orders.keys() != self._saved and now >= self._save_at:
-            self._system, self._save_at = self._vehicle.system or 0, now + NS
+            self._system, self._save_at = self._vehicle.system or 0, now
             try:
                 self._save()
-                self._save_at = now
             except ConfigError as error:
+                self._save_at = now + NS
                 self._vehicle.events.append(str(error))
 
     def restore(self, now: int) -> tuple[bool, str]:
@@ -425,15 +413,15 @@ class Failover:
             raise ConfigError(f"failover_file {self._path} cannot be written: {error.strerror}") from error
         self._saved = frozenset(self._state.orders)
 
-    def status(self, name: str, now: int) -> tuple[Level, str, str]:
-        """Return level, name and words for the diagnostics: what is out, or what would speak against taking one out."""
+    def status(self, now: int) -> tuple[Level, str]:
+        """Return level and words for the diagnostics: what is out, or what would speak against taking one out."""
         if out := [format_imu(k, self._channels) for k, order in self._state.orders.items() if order.is_out]:
             unsaved = "" if self._state.orders.keys() == self._saved else "; failover_file is not written"
-            return Level.WARN, name, f"out of use: {', '.join(out)} of system {self._system}{unsaved}"
+            return Level.WARN, f"out of use: {', '.join(out)} of system {self._system}{unsaved}"
         known = self._known(now)
         known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
         against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]
-        return (Level.OK, name, "ready") if "" in against else (Level.WARN, name, f"no failover: {against[0]}")
+        return (Level.OK, "ready") if "" in against else (Level.WARN, f"no failover: {against[0]}")
 
 
 def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[str]) -> str:
@@ -459,10 +447,9 @@ def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[
             states[channels.index(channel)] = float(ChannelState[name])
         declarations.hear(states, now)
         stale = [ChannelState.STALE in states[3 * k : 3 * k + 3] for k in range(count)]
-        units = [
-            unit._replace(use=use[k], heard=now, delivers=not stale[k]) for k, unit in enumerate(declarations.units)
-        ]
-        state, actions = decide(state, Known(tuple(units), linked=True, armed=True, monitored=True), now)
+        said = zip(declarations.units, use, stale, strict=True)
+        units = tuple(unit._replace(use=used, heard=now, delivers=not lost) for unit, used, lost in said)
+        state, actions = decide(state, Known(units, linked=True, armed=True, monitored=True), now)
         for action in actions:
             if action.kind == "set":
                 use[action.unit] = action.use

@@ -39,10 +39,7 @@ _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD
 
 
 class Link:
-    """A way to an autopilot, opened by a function; messages that are sent wait, whole, until there is room.
-
-    ``gone``: what it means, in words, that there is nothing to read where there should be.
-    """
+    """A way to an autopilot, opened by a function; messages that are sent wait, whole, until there is room."""
 
     def __init__(self, url: str, make: Callable[[], Any], gone: str = _CLOSED) -> None:
         self.url = url
@@ -73,10 +70,7 @@ class Link:
         return None, data
 
     def receive(self, now: int) -> list[tuple[Any, bytes]]:
-        """Return what has arrived and from whom, opening the link first if it is not open; and send what waits.
-
-        The time now is in ns; where there is only one address it is None.
-        """
+        """Open the link if need be, return what has arrived, from whom (None: there is only one); send what waits."""
         found: list[tuple[Any, bytes]] = []
         size = 0
         try:
@@ -184,10 +178,7 @@ def _raise(code: int) -> None:
 
 
 def open_link(url: str) -> Link:
-    """Return the link of a URL; it opens itself when it is first read.
-
-    `FdiError` if the URL is none, the host has no address, or a library is missing.
-    """
+    """Return the link of a URL, which opens itself when it is first read; `FdiError` if it cannot be one."""
     kind, _, rest = url.partition(":")
     place, _, last = rest.rpartition(":")
     number = int(last) if last.isdecimal() and len(last) < 9 else -1
@@ -252,8 +243,7 @@ class Verifier:
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._latest: dict[tuple[int, int, int], int] = {}  # time of the last message, by link id, system and component
-        self.behind = 0.0
-        """s by which the message of the last check was too old, though signed with the key; 0: it was not."""
+        self.behind = 0.0  # s by which the last message was too old, though signed with the key; 0: it was not
 
     def accepts(self, message: bytes, system: int, component: int, now: int) -> bool:
         """Whether a whole message is signed with the key and new; now is the time of a signature made here now."""

@@ -117,8 +117,7 @@ SET_MESSAGE_INTERVAL = 511
 DEFAULT_INTERVAL = 0
 PATIENCE = NS  # so long an acknowledgement is waited for, ns
 TRIES = 3
-AGAIN, AGAIN_REFUSED = 10 * NS, 60 * NS
-"""What comes too slowly is asked for again after so long, and what was refused, ns."""
+AGAIN, AGAIN_REFUSED = 10 * NS, 60 * NS  # what comes too slowly, and what was refused, is asked for again after, ns
 ENOUGH = 0.8  # of the rate asked for
 RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in progress", "cancelled")  # MAV_RESULT
 _HOPEFUL = ("not asked yet", RESULTS[5])
@@ -231,8 +230,7 @@ class TimeSync:
         self._requests = self._next = 0
         self._used: float | None = None
         self._used_at = 0
-        self._arrival: float | None = None
-        """Highest difference of a stamp from the time of its arrival, ns: its offset less the link's latency."""
+        self._arrival: float | None = None  # highest difference of a stamp from its arrival, ns: offset less latency
         self._arrival_at = 0
 
     def request(self, now: int) -> int | None:
@@ -300,10 +298,7 @@ def system_ahead(monotonic: Callable[[], int] = time.monotonic_ns, system: Calla
 
 
 class BootClock:
-    """Times of an autopilot as they come: made whole where they run over, and looked at for steps.
-
-    Milliseconds in 32 bits run over after 49.7 days.
-    """
+    """Times of an autopilot, made whole where 32 bits of milliseconds run over (49.7 days), and looked at for steps."""
 
     BACK, AHEAD = NS, 2 * NS
     """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or
@@ -317,15 +312,11 @@ class BootClock:
     def reset(self) -> None:
         """Begin anew with the next time."""
         self._latest: int | None = None
-        self._lead = 0
-        """By how much the times were ahead of those here at most, ns: those of messages with the least delay."""
+        self._lead = 0  # by how much the times were ahead of those here at most, ns: with the least delay
         self._odd = 0
 
     def unwrap(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
-        """Return a time that a message says, made whole, ns; None: it is not to be used.
-
-        It is looked at at the time now here, runs over if it comes in milliseconds, and should be about so much there.
-        """
+        """Return a time that came at the time now here, about so much there, made whole, ns; None: not to be used."""
         if not 0 <= time < 1 << 61:
             return None
         reference = self._latest if about is None else about

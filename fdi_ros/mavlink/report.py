@@ -32,12 +32,10 @@ class Reporter:
         """Return the statuses at the monotonic time now, ns; names begin with prefix."""
         recent = {name: count - self._before.get(name, 0) for name, count in self._vehicle.counts.items()}
         self._before = dict(self._vehicle.counts)
-        level, message = self._format_link(recent, now)
-        lines = [StatusLine(level, f"{prefix}link", message, hardware, self._link_values(now))]
+        rows = [("link", *self._format_link(recent, now), self._link_values(now))]
         for k, name in enumerate(self._names):
-            level, message = self._format_unit(k, now)
-            lines.append(StatusLine(level, f"{prefix}unit {name}", message, hardware, self._unit_values(k, now)))
-        return lines
+            rows.append((f"unit {name}", *self._format_unit(k, now), self._unit_values(k, now)))
+        return [StatusLine(level, prefix + name, words, hardware, values) for name, level, words, values in rows]
 
     def _format_link(self, recent: dict[str, int], now: int) -> tuple[Level, str]:
         vehicle, link = self._vehicle, self._link

@@ -44,8 +44,7 @@ from fdi_ros.system import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 AUTOPILOT_COMPONENT = 1
-GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128
-"""MAV_TYPE, MAV_STATE and a bit of MAV_MODE_FLAG of a HEARTBEAT."""
+GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128  # MAV_TYPE, MAV_STATE, a MAV_MODE_FLAG
 REAL32 = 9  # MAV_PARAM_TYPE; ArduPilot takes any, and knows its own.
 LOST = 3 * NS  # an autopilot that says nothing for so long is lost, ns
 UNSYNCHRONISED = 2 * NS  # so long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns
@@ -79,8 +78,7 @@ class UnitTrack:
     impossible: int = 0  # samples at times that cannot be
     last: int = 0  # when the last sample came, ns
     time: int = -1  # time of the last sample on the autopilot's clock, ns
-    stamp: int = -1
-    """Of the last sample that was given out, ns: later ones have later stamps, also where a better offset is found."""
+    stamp: int = -1  # of the last sample given out, ns: later ones have later stamps, also with a better offset
     arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))  # when samples came, ns
 
     def rate(self, now: int) -> float:
@@ -132,7 +130,7 @@ class Vehicle:
         if settings.key:
             self._out.signing.secret_key, self._out.signing.sign_outgoing = settings.key, True
             self._out.signing.timestamp = now_in_steps(seconds())
-        self._beat = self._checked = 0
+        self._beat = 0  # when the last heartbeat was sent, ns
         self._scaled_at = 0  # when SCALED_IMU of IMU 1 came last, or was asked for, ns
         self._sequence: int | None = None
         self._late = 0  # late messages in a row
@@ -152,8 +150,7 @@ class Vehicle:
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
         """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
         self._found = self._first_imu = 0
-        self._seen: set[tuple[str, int]] = set()
-        """Kinds of messages and units of which samples came, until a kind is chosen."""
+        self._seen: set[tuple[str, int]] = set()  # kinds and units of which samples came, until a kind is chosen
 
     # What comes in ------------------------------------------------------------------------------------------------
 
@@ -255,10 +252,7 @@ class Vehicle:
         return True
 
     def _may_change_to(self, system: int, beats: bool, number: int, now: int) -> bool:
-        """Whether another system may be the autopilot from now on: none is given, and the one in use gives no gyros.
-
-        The one in use is lost, or has not given any yet; then one that does goes before one that says it is there.
-        """
+        """Whether another one may be the autopilot now: none is given, and that in use is lost or gives no gyros."""
         is_gone = self.system is None or self._lost
         if self.settings.system or not system or not (is_gone or not self.gives_gyros):
             return False
@@ -364,7 +358,7 @@ class Vehicle:
 
     def tick(self, now: int) -> None:
         """Send what is due; called often."""
-        if now - self._beat >= NS:
+        if is_second := now - self._beat >= NS:
             self._beat = now
             self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
         if self._found and not self._lost and now - self.heard > LOST:
@@ -377,8 +371,7 @@ class Vehicle:
         if (request := self.streams.due(now)) is not None:
             fields = (SET_MESSAGE_INTERVAL, 0, *request, 0, 0, 0, 0, 0)
             self._say("command_long", self.system, AUTOPILOT_COMPONENT, *fields)
-        if now - self._checked >= NS:
-            self._checked = now
+        if is_second:
             self._check_rates(now)
             if self.streams.refused(SCALED) and understood("RAW_IMU", self.autopilot):
                 self.streams.want((RAW,), self._interval)

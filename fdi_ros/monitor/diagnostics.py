@@ -24,16 +24,14 @@ if TYPE_CHECKING:
 
 Values = tuple[tuple[str, str], ...]
 
-PREFIX = "fdi_node: "
-"""What names begin with where no node gives its own: its full name without the first slash, and a colon."""
+PREFIX = "fdi_node: "  # what names begin with where no node gives its full name, without the first slash, and a colon
 WHOLE = "monitor"  # name of the line about all, after the prefix
 INPUT = "input "  # what the name of the line about an input topic begins with, after the prefix
 FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
 OLD = 86400.0  # stamps that far behind the clock are of a recording, most likely, s
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
 CERTAIN = 4.0  # a delay between units is reported from so many of its standard deviations on
-LEAST_DELAY = 0.001
-"""And from so much on, s: less is usual between drivers, and in turns of 10 rad/s^2 no more than 0.01 rad/s."""
+LEAST_DELAY = 0.001  # and from so much on, s: less is usual between drivers, and 0.01 rad/s in turns of 10 rad/s^2
 NEARLY = 0.8  # a bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault
 
 

@@ -31,10 +31,8 @@ from fdi_ros.model.samples import Array, Mask
 Axes = tuple[float, float, float]
 NO_LEVEL: Axes = (math.inf,) * 3
 
-MIN_LEFT = 1e-3
-"""Smallest singular value of S_LL: below it the channels L reach no residual, or cannot be told from each other."""
-MIN_SPREAD = 1e-9
-"""Residuals whose standard deviation is less than this share of the channel's are rounding, not evidence."""
+MIN_LEFT = 1e-3  # smallest singular value of S_LL: below it L reaches no residual, or cannot be told apart
+MIN_SPREAD = 1e-9  # residuals with less than this share of the channel's standard deviation are rounding
 _HALVINGS = 48
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
@@ -162,10 +160,7 @@ def _modes(
 
 
 def _share(level: Array, share: Array, modes: _Modes) -> Array:
-    """Largest share (k, 3) of each variance in the square of the level (3,), over all modes that it holds back.
-
-    The share given (3, k) is that in the square of the standard deviation of the fused rate.
-    """
+    """Largest share (k, 3) of each variance in the square of the level (3,); given that of the rate alone, (k, 3)."""
     for at, limit_share, sigma_share in zip(modes.limit, modes.limit_share, modes.sigma_share, strict=True):
         held = (at <= level)[:, None]
         total = (limit_share + (level - np.where(held[:, 0], at, 0.0))[:, None] * sigma_share) / level[:, None]

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ChannelState", "Event", "Output", "Reason"]
 
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
-"""Where the nine entries of a symmetric (3, 3) matrix stand in its upper triangle."""
+_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the nine entries of a (3, 3) matrix are in its upper triangle
 _FLAG = np.dtype(np.bool_)
 
 
@@ -215,8 +214,7 @@ class SampleOutput:
     """What is said of each sample on a topic of its own."""
 
     topic: Topic
-    make: Callable[[str, int], Template]
-    """Makes a message to be filled, from the frame_id of the rate and the number of channels n."""
+    make: Callable[[str, int], Template]  # a message to be filled, from the frame_id of the rate and n channels
     fill: Callable[[Template, Any, int, int], None]
     """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
     needs_rate: bool = False  # whether it is of samples with a fused rate alone

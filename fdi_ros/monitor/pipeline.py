@@ -46,15 +46,11 @@ UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 and where all channels arrive in one message, s."""
 BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples
 REST_NOISE = 4.0  # at rest the standard deviation of a channel is at most this many noise_std
-RETURN_PROBABILITY = 1e-6
-"""Probability with which a healthy channel disagrees by chance in one sample, where it is to return."""
+RETURN_PROBABILITY = 1e-6  # with which a healthy channel disagrees by chance in one sample, where it is to return
 
 
 def build_geometry(config: Config) -> Geometry:
-    """Sensitivity axes of a configuration.
-
-    `ConfigError` if the number of axes, names and topics do not fit each other, `GeometryError` if the axes are unfit.
-    """
+    """Sensitivity axes of a configuration; `FdiError` if axes, names and topics do not fit each other."""
     geometry = _axes(config)
     source_of(config).check_channels(geometry.n)
     units = config.channels.units
@@ -69,10 +65,7 @@ def build_geometry(config: Config) -> Geometry:
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration, one value per channel.
-
-    A bias averaged at start-up is known no better than white noise lets the average be.
-    """
+    """Error model of a configuration; a bias averaged at start-up is as well known as white noise lets it be."""
     noise = config.noise
     std = np.array(noise.noise_std)
     bound = np.array(noise.bound) if noise.bound else BOUND_IN_NOISE * std
@@ -117,10 +110,7 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
 
 
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
-    """Record of a monitor before its first sample, (1,) `fdi_ros.core.records.Core`.
-
-    `ConfigError` if a setting is given per channel for another number of channels.
-    """
+    """Record of a monitor before its first sample, (1,) `Core`; `ConfigError` if a setting has another length."""
     n = geometry.n
     check_lengths(config, "channel", n)
     cores = allocate(Core)
@@ -136,10 +126,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
 
 
 def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> None:
-    """Set what goes with a detector, its rule of decision, and whether biases are followed; and whether to withhold.
-
-    All that may change at run time; core (1,).
-    """
+    """Set in core (1,) all that may change at run time: the rule of decision, what is followed, what is withheld."""
     settings, rule = core["settings"], config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
     settings["estimates"] = detector.takes_any

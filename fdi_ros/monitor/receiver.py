@@ -8,13 +8,10 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections import deque
-from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Callback, allocate
 from fdi_ros.config.config import Config
@@ -95,11 +92,7 @@ _NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
 
 
 class Receiver:
-    """Takes messages as a pipeline's settings say, aligns those of several units, and has it work the samples.
-
-    `receive` and `go_on` work one sample at most; what they return says whether its messages are to
-    be published, and whether to go on (`fdi_ros.core.path`).
-    """
+    """Takes messages one at a time, aligns those of several units, and has the pipeline work one sample a call."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         config, n = pipeline.config, pipeline.geometry.n
@@ -110,34 +103,24 @@ class Receiver:
         self.errors = [""] * len(self.source.topics)  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
-        self._fused, self._integrity = (self.encoder.templates[output] for output in (FUSED, INTEGRITY))
-        self.live["fused_at"], self.live["integrity_at"] = self._fused.at, self._integrity.at
+        fused, integrity = (self.encoder.templates[output] for output in (FUSED, INTEGRITY))
+        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
         self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
+        self._records = (self.alignment.rows, self.live, self._events, fused.bytes, integrity.bytes)
         pipeline.prepare()
-        self._update_detector()
         self.warm(self.source)
-
-    def _update_detector(self) -> None:
-        """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
-        self._detector = self.pipeline.detector
-        self._records = (self.alignment.rows, self.live, self._events, self._fused.bytes, self._integrity.bytes)
-        self._process: Callable[[], int] = partial(process, self.pipeline.path, *self._records)
 
     def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take in a message of an input topic; stamp: when it arrived, ns; 0: not known."""
-        if self.pipeline.detector is not self._detector:
-            self._update_detector()
         # Bytes: arrays of what can be written would be compiled once more.
         message = np.frombuffer(bytes(data), dtype=np.uint8)
         flags = self.source.receive(self.alignment.rows, self.live, inlet, message, stamp)
-        return self._process() if flags & MORE else flags
+        return self.go_on() if flags & MORE else flags
 
     def go_on(self) -> int:
         """Work the next sample."""
-        if self.pipeline.detector is not self._detector:
-            self._update_detector()
-        return self._process()
+        return int(process(self.pipeline.path, *self._records))
 
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
@@ -170,12 +153,6 @@ class Receiver:
     def restarts(self) -> int:
         """How often the time of all inputs began anew."""
         return int(self.alignment.rows["restarts"][0] + self.live["restarts"][0])
-
-    @property
-    def rate(self) -> NDArray[np.float64]:
-        """Last fused rate (3,), rad/s; NaN where there was none."""
-        rate: NDArray[np.float64] = self.pipeline.core["last"]["rate"][0]
-        return rate if self.pipeline.core["samples"][0] else np.full(3, np.nan)
 
     def counts(self, unit: int) -> dict[str, int]:
         """All that was not taken as it came, by kind."""

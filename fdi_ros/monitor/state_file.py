@@ -33,8 +33,7 @@ from fdi_ros.system.files import DistrustError, open_regular, read_trusted, repl
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
 MAX_BYTES = 1 << 20  # bytes of a state file at most; what is longer is damaged
-PLAUSIBLE = 5.0
-"""An error is believed up to so many of the standard deviations that it had beforehand, beside its walk since."""
+PLAUSIBLE = 5.0  # an error is believed up to so many of its standard deviations beforehand, beside its walk since
 MOVED = 2.0
 """Errors are saved again when one is off the saved one by so many of its standard deviations, or known so many times
 better. In between, the random walk that the age stands for on restoring covers it."""
@@ -222,10 +221,7 @@ class StateFile:
         self._not_before = 0.0
 
     def restore(self, pipeline: Pipeline) -> bool:
-        """Take over the state in the file, if it fits; return whether it did; `words` has the details.
-
-        `ConfigError` if the file holds something else than a state: the next save must not replace it.
-        """
+        """Take over the state in the file, if it fits; return whether it did. `ConfigError`: the file is no state."""
         self._check_ours(self.path)
         self._check_ours(self._old)
         self.is_rejected = True
@@ -268,10 +264,7 @@ class StateFile:
                 )
 
     def save(self, pipeline: Pipeline) -> bool:
-        """Write the state if it has changed since it was last written; return whether that was tried.
-
-        The file is replaced as a whole or not at all; what goes wrong is in `words`.
-        """
+        """Write the state, whole or not at all, if it has changed; return whether that was tried."""
         state = _content(pipeline)
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False

@@ -31,8 +31,7 @@ CERTAIN = 4.0  # two channels of a larger set surely differ from so many standar
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 UNUSUAL = 3.0  # an error beyond so many standard deviations expected of it is not what was expected
 
-MAX_START_BIAS = 4.0
-"""A bias learned at the start that is off by more ``bias.turn_on_std`` is reported: one healthy start in 16 000."""
+MAX_START_BIAS = 4.0  # a start bias of more bias.turn_on_std is reported: one healthy start in 16 000
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,9 @@ class ChannelStatus:
     delivers: float = 1.0  #: Share of the samples that it has lately given a finite number for.
     drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
     start_bias: float = 0.0  #: What was learned of its bias at the start, beyond ``bias.fixed``, rad/s.
-    bias_std: float = math.nan
-    """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
+    bias_std: float = (
+        math.nan
+    )  #: Of what is unknown of its bias, but for what passes for rate, rad/s; NaN: not followed.
     noise: float = 0.0  #: Lately, in noise_std; 0: not measured.
     noisy: bool = False  #: Whether that is much, and more than the others show.
 
@@ -99,8 +99,7 @@ class ErrorStatus:
     unit: str
     value: float
     std: float
-    prior: float
-    """Standard deviation by now if nothing had been measured: at the start, and what it may have wandered since."""
+    prior: float  # standard deviation by now if nothing had been measured: at the start, and its walk since
 
     @property
     def is_unusual(self) -> bool:
@@ -126,13 +125,11 @@ class Status:
     statistic: float
     threshold: float
     has_rate: bool  #: Whether the last sample gave a fused rate.
-    withheld: bool
-    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false), or of old values."""
+    withheld: bool  #: Whether it would have, but of old values, or of doubted channels (``publish_under_doubt``).
     all_repeat: bool  #: Whether all channels repeat their values.
     can_detect: tuple[str, ...]  #: Channels whose fault would be seen.
     can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
-    bias: tuple[float, ...]
-    """Subtracted from each channel, rad/s: as given or learned at the start, and what was followed in flight."""
+    bias: tuple[float, ...]  #: Subtracted from each channel, rad/s: from the start, and what was followed in flight.
     bias_state: str  #: Words: fixed, learned, learning, refused and why, followed from a start in motion.
     note: str  #: Why checking is limited, in words; empty if it is not.
     protection_level: tuple[float, float, float] = (math.inf,) * 3
@@ -140,13 +137,10 @@ class Status:
     protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
     """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
     units: tuple[UnitStatus, ...] = ()  #: Units of several channels, in their order.
-    delays: tuple[float, ...] = ()
-    """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
+    delays: tuple[float, ...] = ()  #: By how much each unit is late against the first, s; empty: not measured.
     delay_std: tuple[float, ...] = ()  #: Standard deviation of each, s.
-    errors: tuple[ErrorStatus, ...] = ()
-    """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`."""
-    names_rest_on: str = ""
-    """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
+    errors: tuple[ErrorStatus, ...] = ()  #: Of the sensors, in the order of ``ERROR_KINDS``.
+    names_rest_on: str = ""  #: What no data can tell, and every name rests on; empty: one fault at a time.
     copies: tuple[tuple[str, str], ...] = ()
     """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
     apart: ApartStatus | None = None  #: Where a set is declared: the pair in it that surely differs.
@@ -265,10 +259,7 @@ def _unit_names(geometry: Geometry) -> list[str]:
 
 
 def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
-    """By how much each unit is late against each other one, and the standard deviation, (units, units) s.
-
-    Both (0, 1) where that is not measured.
-    """
+    """How late each unit is against each other one, and its standard deviation, (units, units) s; (0, 1): not known."""
     units = len(detector.geometry.units)
     if units < 2 or not detector.takes_any or not begun:
         return np.zeros((0, 1)), np.zeros((0, 1))

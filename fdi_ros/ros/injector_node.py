@@ -49,8 +49,7 @@ class InjectorNode(CheckedNode):
         self._source = source_of(self.config)
         # The first message must not wait for a compiler.
         warm_codec(self._source)
-        self._unheard: dict[str, tuple[int, Any]] = {}
-        """Topics whose output has no subscriber yet, each with its number and its output."""
+        self._unheard: dict[str, tuple[int, Any]] = {}  # topics whose output has no subscriber yet: number, output
         for k, topic in enumerate(self._source.topics):
             self.resolved(topic + suffix)
             self._unheard[topic] = k, self.create_output(self._source.type, topic + suffix)

@@ -34,10 +34,7 @@ def arguments(config: str) -> list[Action]:
 
 
 def checked(context: LaunchContext) -> tuple[str, Config]:
-    """Return the parameter file and its settings; what is wrong ends the launch before anything starts.
-
-    launch_ros itself would leave out a wrong file with a warning.
-    """
+    """Return the parameter file and its settings; launch_ros itself would leave out a wrong file with a warning."""
     file = str(resolve(LaunchConfiguration("config").perform(context)))
     try:
         return file, Config.from_file(file)

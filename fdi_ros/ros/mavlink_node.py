@@ -18,6 +18,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -41,8 +42,7 @@ from fdi_ros.ros.process import Stop, guarded, make_executor
 IMU = "sensor_msgs/msg/Imu"
 NAMES = ("imu_1", "imu_2", "imu_3")  # of units where the settings name none, each on the topic ``NAME/data_raw``
 WAIT = 0.02  # the link is waited for at most so long, and the executor gets its turn as often, s
-INJECTED = "_faulty"
-"""What the injector adds to the name of a topic: on the bench the monitor has its inputs from there."""
+INJECTED = "_faulty"  # what the injector adds to the name of a topic: on the bench the monitor's inputs
 PARTING = 4.0  # so long the end waits on the ground for IMUs to be put back, s
 MOST_CALLS = 32  # callbacks of a turn of the executor
 _SEND_EVERY = 10_000_000  # what is to be sent is looked for so often, ns
@@ -51,10 +51,7 @@ _VALUE_EVERY = 450_000_000  # between two NAMED_VALUE_FLOAT of a name, ns
 
 
 class AutopilotNode(CheckedNode):
-    """Publishes the IMUs of an autopilot, one topic a unit.
-
-    `FdiError` if a parameter is wrong, or what a link needs is not installed.
-    """
+    """Publishes the IMUs of an autopilot, one topic a unit; `FdiError` if a parameter is wrong."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", MAVLINK, subscribes=False, **options)
@@ -77,9 +74,7 @@ class AutopilotNode(CheckedNode):
         self._announcer = Announcer(channels) if params["statustext"] else None
         self._sends_values: bool = params["named_values"]
         # In full, as it stands in diagnostics: without the first slash.
-        monitor = params["monitor"]
-        namespace = "" if monitor.startswith("/") else self.get_namespace().rstrip("/")
-        self._monitor = f"{namespace}/{monitor}".lstrip("/")
+        self._monitor = expand_topic_name(params["monitor"], self.get_name(), self.get_namespace()).lstrip("/")
         self._failover = None if params["failover"] == "off" else self._make_failover(params)
         if self._announcer is not None or self._sends_values or self._failover is not None:
             few = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -123,10 +118,7 @@ class AutopilotNode(CheckedNode):
         return Failover(self._vehicle, self.config.channel_names, params["failover_limit"], path)
 
     def live(self, stop: Stop) -> None:
-        """Wait for the link, pass on what came, and give the executor its turn, until stopped.
-
-        One thread: what comes over the link is bounded per turn, so the executor never waits for long.
-        """
+        """Wait for the link, pass on what came, and give the executor its turn, until stopped: all in one thread."""
         # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
         executor = make_executor(self, "single")
         due = time.monotonic()
@@ -248,7 +240,8 @@ class AutopilotNode(CheckedNode):
         self._ahead = system_ahead()
         lines = self._reporter.lines(self.prefix, hardware, now)
         if self._failover is not None:
-            lines.append(StatusLine(*self._failover.status(f"{self.prefix}failover", now), hardware, ()))
+            level, words = self._failover.status(now)
+            lines.append(StatusLine(level, f"{self.prefix}failover", words, hardware))
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()))
 
     def destroy_node(self) -> None:

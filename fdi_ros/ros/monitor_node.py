@@ -34,8 +34,7 @@ from fdi_ros.ros.running import Running
 from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05  # how often silence is checked for, and the state saved if it has changed, s
-LATE = 2
-"""Periods after which the timer is not waited for any longer: other events are before it in the executor's queue."""
+LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RCLError = rclpy_implementation.RCLError
 

@@ -36,8 +36,7 @@ from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine
 from fdi_ros.ros.process import Stop, spin
 from fdi_ros.system.text import LINE, shown
 
-DEPTH = 256
-"""Messages that a topic keeps, in and out, for a node that is busy for a moment: a quarter of a second at 1 kHz."""
+DEPTH = 256  # messages that a topic keeps, in and out, for a busy node: a quarter of a second at 1 kHz
 REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 MOST_LINES = 20  # of one severity in one such period: what anybody may cause with requests hides no declaration
 LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
@@ -66,10 +65,7 @@ def message_class(name: str) -> Any:
 
 
 def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
-    """Return what a node, by its full name, says in a message of /diagnostics, where all speak.
-
-    The names are without that of the node. `ValueError` if a level is none.
-    """
+    """Return what a node says in a message of /diagnostics, names without its own; `ValueError`: no such level."""
     prefix = f"{node.strip('/')}: "
     found = []
     for status in message.status:
@@ -271,10 +267,7 @@ class CheckedNode(Node):
         return f"{self.get_fully_qualified_name().lstrip('/')}: "
 
     def create_output(self, kind: str, topic: str, **options: Any) -> Any:
-        """Publish messages of a type as REP-2003 wants sensor data published: reliable, for subscribers of either kind.
-
-        They are handed over as bytes.
-        """
+        """Publish messages, given as bytes, as REP-2003 wants sensor data: reliable, for subscribers of either kind."""
         # A new QoS each time, as overrides are written into it.
         return self.create_publisher(message_class(kind), topic, QoSProfile(depth=DEPTH), **options)
 

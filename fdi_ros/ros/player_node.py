@@ -31,10 +31,8 @@ from fdi_ros.ros.process import Stop, guarded
 
 PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
 SETTLING = 0.3  # time for the subscribers that were found to have found the player, s
-LONGEST_STEP, DISORDER = 60.0, 1.0
-"""s without a message, more of which is not waited for; s by which messages may stand out of order."""
-MOST_BEHIND = 0.01
-"""A message is late by at most so much, s: what is due meanwhile fits into a queue of 256 also at 10 kHz."""
+LONGEST_STEP, DISORDER = 60.0, 1.0  # a longer pause is not waited for, s; messages may stand so far out of order, s
+MOST_BEHIND = 0.01  # a message is late by so much at most, s: what is due meanwhile fits into a queue at 10 kHz
 CLOCK_STEP = 1_000_000  # /clock is published at most this often, ns of recorded time
 
 
@@ -123,10 +121,7 @@ class PlayerNode(CheckedNode):
         return ", ".join(output.topic_name for output in self.outputs if not output.get_subscription_count())
 
     def messages(self) -> Iterator[float]:
-        """Publish the messages one by one; before each, yield when it is due, s from the first.
-
-        Hours without a message, and times that are damaged, are not waited for.
-        """
+        """Publish the messages one by one; before each, yield when it is due, s from the first."""
         last = clock = None
         due = 0.0
         for batch in self.recording.batches(self.config.topics):

@@ -23,8 +23,7 @@ from typing import Any
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.system import BAGS, require
 
-TIMEOUT = 0.1
-"""Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
+TIMEOUT = 0.1  # of one turn of the executor, s, which a signal waits for; the EventsExecutor needs one to work
 ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-config-file", "--enclave")
 NODES = {
     "fdi_node": "monitor_node.MonitorNode",
@@ -49,11 +48,7 @@ class Stop:
 
 
 def spin(node: Any, stop: Stop) -> None:
-    """Turn the executor until stopped; the node's ``inputs`` are drained after every turn.
-
-    What a callback raises ends no node: rclpy itself raises for some requests and times that come from outside. In a
-    flood of messages a SingleThreadedExecutor, which has no queue, takes over from the EventsExecutor.
-    """
+    """Turn the executor until stopped, and drain the node's ``inputs`` after every turn."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

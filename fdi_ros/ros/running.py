@@ -31,10 +31,8 @@ REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
 ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
 NAMED = 4  # publishers of one topic that are named at most
-END_OF_TIME = 2**62
-"""The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
-QUIET = 5.0
-"""After a line about a channel the next one comes not before so long, s, unless the channel's state becomes worse."""
+END_OF_TIME = 2**62  # stamps beyond all clocks, ns: a clock was set back by decades again and again
+QUIET = 5.0  # after a line about a channel the next one waits so long, s, unless its state becomes worse
 BY_SEVERITY = ("OK", "EXCLUDED", "UNCHECKED", "SUSPECT", "STALE", "AMBIGUOUS", "FAULTY")  # states, the worst last
 
 
@@ -56,11 +54,7 @@ class ChangeLog:
         self._last = [_Line() for _ in names]
 
     def add(self, events: Sequence[Event], shift: int, pair: ApartStatus | None) -> None:
-        """Log the changes that one sample has brought.
-
-        The shift, ns, subtracted from their stamps gives those of the messages; where a set is declared, the pair in it
-        differs for certain.
-        """
+        """Log what a sample has changed; shift, ns, is taken off its stamp; pair: what surely differs in a set."""
         now = self._clock()
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
@@ -195,8 +189,7 @@ class Running:
         self._changes = ChangeLog(self._node.log, receiver.pipeline.channel_names)
         self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
-        self._due = 0.0
-        """Steady time of the next regular report, s: the first at once, however soon there is another monitor."""
+        self._due = 0.0  # steady time of the next regular report, s: the first at once
         self._at_once = MAX_AT_ONCE  # changes that may still be reported at once before it
         self._restarts = receiver.restarts
         self._bias_outcome = -1
@@ -278,7 +271,7 @@ class Running:
         """Say why the bias cannot be learned now; empty if it can."""
         if not self._node.inputs.subscriptions or self._has_no_samples:
             return "no samples"
-        rate = float(np.linalg.norm(self.receiver.rate))
+        rate = float(np.linalg.norm(self.receiver.pipeline.core["last"]["rate"][0]))
         if not np.isfinite(rate):
             return "no fused rate, so nothing says that the vehicle is at rest"
         limit = self.receiver.pipeline.config.bias.max_rest_rate

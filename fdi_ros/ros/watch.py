@@ -48,12 +48,10 @@ except ImportError:
 PERIOD = 0.1  # how often the view is drawn, s
 REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
 SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there before the node is configured
-SETTLE = 1.0
-"""Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
+SETTLE = 1.0  # monitors appear one by one: wait for so long before one is taken for the only one, s
 STATES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-SILENT = {"fused": 1.0, "diagnostics": 3.0}
-"""After so long without a message the last one is no longer shown as the present state, s."""
+SILENT = {"fused": 1.0, "diagnostics": 3.0}  # after so long without a message the last one is no longer shown, s
 REMEMBERED = 50  # changes of state that were not reported yet, or may be drawn
 COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
 GREY = "bright_black"
@@ -202,10 +200,7 @@ class Watcher(Node):
 
 
 def watch(node: str = "", plain: bool = False) -> int:
-    """Show a monitor until interrupted, and return the exit code; `FdiError` if there is not one monitor.
-
-    Without the full name of a node it is the only monitor that is running. Plain is line by line also on a terminal.
-    """
+    """Show a monitor, by its full name or the only one, until interrupted; `FdiError` if there is not one monitor."""
     name = f"/{node.removeprefix('/')}" if node else ""
     if name and not is_plain_name(name):
         raise FdiError(f"--node is {node!r}, expected the full name of a node such as /drone/fdi_node")

@@ -246,7 +246,7 @@ def test_a_file_that_cannot_be_written_in_flight_is_told_and_written_later(flyin
         file.unlink()
     tmp_path.rmdir()
     flying.declare("imu_1.y", 1.0)
-    assert flying.failover.status("failover", flying.now)[2].endswith("of system 1; failover_file is not written")
+    assert flying.failover.status(flying.now)[1].endswith("of system 1; failover_file is not written")
     tmp_path.mkdir()
     flying.run(2.0)
     assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
@@ -262,7 +262,7 @@ def test_a_companion_that_dies_tells_and_puts_back_at_its_next_start(flying: Mon
     again = Monitored(tmp_path, autopilot).run(12.0)
     assert autopilot.texts == [(2, "FDI: IMU 1 (imu_1) out of use"), (6, "FDI: IMU 1 (imu_1) in use again")]
     assert autopilot.flies_with == 0
-    assert again.failover.status("failover", again.now)[2] == "ready"
+    assert again.failover.status(again.now)[1] == "ready"
 
 
 def test_what_failover_would_have_done_in_a_recording() -> None:
