@@ -89,8 +89,7 @@ class FailoverState:
     orders: dict[int, Order] = field(default_factory=dict)  # of those that are, or may be, out of use by our hand
     seen: dict[int, bool] = field(default_factory=dict)  # what each parameter said last
     left_alone: set[int] = field(default_factory=set)  # set by somebody else: left alone until it is disarmed
-    answered: dict[int, int] = field(default_factory=dict)
-    """Declarations that were acted on, or of which it was said why not: when they were made, ns."""
+    answered: dict[int, int] = field(default_factory=dict)  # declarations acted on, or refused: when made, ns
 
     @classmethod
     def resumed(cls, ours: Iterable[int]) -> FailoverState:
@@ -237,8 +236,7 @@ def _sent(state: FailoverState, known: Known, k: int, now: int, limit: int, acti
 
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
-OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
-"""States of a channel that is not used at all; under doubt for a moment are also healthy ones."""
+OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}  # not used at all; suspects may be healthy
 _STEP = 20 * MS  # the policy is asked so often while a declaration is young, ns
 _BEFORE = NS + HEALED  # time of the policy at the start of a recording, ns
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS  # parameters are read in turn so often; what is older counts as not known
@@ -250,8 +248,7 @@ TEXTS = {
     "not back": (CRITICAL, "back in use: not accepted"),
     "changed": (WARNING, "set by others, left alone"),
     "stays": (CRITICAL, "stays: "),
-}
-"""Severity and words, by the kind of action."""
+}  # severity and words, by the kind of action
 LARGEST = 4096  # bytes of the file, at most
 
 
@@ -287,11 +284,9 @@ class Declarations:
 
 
 class Failover:
-    """Takes faulty IMUs of one ArduPilot out of use, and puts them back; ``vehicle``: the conversation with it.
+    """Takes faulty IMUs of one ArduPilot out of use, at most ``limit`` at a time, and puts them back.
 
-    ``channels``: names of the monitor's channels, three for each IMU. ``limit``: at most so many IMUs are out of use by
-    our hand at a time. ``path``: file in which they stand; `ConfigError` if it cannot be read and written, or is not
-    ours.
+    ``channels``: three for each IMU. ``path``: file in which those out stand; `ConfigError` if it is not ours.
     """
 
     def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
@@ -425,11 +420,7 @@ class Failover:
 
 
 def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[str]) -> str:
-    """Say in a line what failover would have done in a recorded flight: armed, all in use, parameters set at once.
-
-    ``changes`` of state of a recording, in order: when, s since its start, name of the channel, new state.
-    ``channels``: their names, three for each IMU; where failover would not run, nothing is said.
-    """
+    """Say what failover would have done in a flight, by its changes: s since the start, channel, new state."""
     count = len(channels) // 3
     if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:
         return ""

@@ -66,8 +66,7 @@ MESSAGES: dict[int, ImuMessage] = {
             "HIGHRES_IMU", 105, "HIGHRES_IMU", 63, struct.Struct("<Q6f"), 1, 1.0, 1.0, unit_at=62, updated_at=60
         ),
     )
-}
-"""By message id."""
+}  # by message id
 RESOLUTION = {"HIGHRES_IMU": "single precision, 1 us", "RAW_IMU": "1 mrad/s, 1 us", "SCALED_IMU": "1 mrad/s, 1 ms"}
 """Kinds of messages, the finest first, with the resolution of rate and time."""
 SCALED, RAW = 26, 27  # messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it
@@ -113,7 +112,6 @@ def understood(kind: str, autopilot: int) -> bool:
 # How they are asked for ----------------------------------------------------------------------------------------------
 
 
-SET_MESSAGE_INTERVAL = 511
 DEFAULT_INTERVAL = 0
 PATIENCE = NS  # so long an acknowledgement is waited for, ns
 TRIES = 3

@@ -125,8 +125,7 @@ _STATES = {
     "AMBIGUOUS": (CRITICAL, "one of them faulty"),
     "STALE": (WARNING, "no data"),
     FROZEN: (WARNING, "frozen"),
-}
-"""By the state of a channel that is announced."""
+}  # by the state of a channel that is announced
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
 NOTHING_SEEN = "no further fault would be seen"
 

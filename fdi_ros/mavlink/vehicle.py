@@ -31,7 +31,6 @@ from fdi_ros.mavlink.protocol import (
     RAW,
     RESOLUTION,
     SCALED,
-    SET_MESSAGE_INTERVAL,
     BootClock,
     ImuSample,
     Streams,
@@ -43,6 +42,7 @@ from fdi_ros.mavlink.protocol import (
 from fdi_ros.system import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
+SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 AUTOPILOT_COMPONENT = 1
 GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128  # MAV_TYPE, MAV_STATE, a MAV_MODE_FLAG
 REAL32 = 9  # MAV_PARAM_TYPE; ArduPilot takes any, and knows its own.
@@ -100,10 +100,9 @@ def dialect() -> Any:
 
 
 class Vehicle:
-    """One autopilot as it is heard.
+    """One autopilot as it is heard; `FdiError` if pymavlink is not installed.
 
-    ``send`` takes the bytes of one message, and the address they go to. ``seconds``: Unix time now, s, for the times of
-    signatures. `FdiError` if pymavlink is not installed.
+    ``send`` takes the bytes of a message and where they go to. ``seconds``: Unix time, s, for signatures.
     """
 
     def __init__(
@@ -147,8 +146,7 @@ class Vehicle:
         self.magnetometers: set[int] = set()  # units of which only a magnetometer came
         self.heard = 0  # when it was last heard, ns; 0: never
         self.gives_gyros = False  # whether it has sent any
-        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
-        """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
+        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)  # what it has said of them, to be taken out
         self._found = self._first_imu = 0
         self._seen: set[tuple[str, int]] = set()  # kinds and units of which samples came, until a kind is chosen
 
@@ -313,7 +311,11 @@ class Vehicle:
         restarts, offset = self.clock.restarts, self.sync.offset(now)
         time = self.clock.unwrap(sample.stamp, now, milliseconds, None if offset is None else now + offset)
         if self.clock.restarts != restarts:
-            self._restarted(now)
+            self.sync, self._found, self.begun = TimeSync(), now, self.begun + 1
+            for other in self.units.values():
+                other.time = -1
+            self.streams.ask_again()
+            self.events.append("the time of the autopilot has stepped: it has started anew, or its clock was set")
         if time is None:
             track.impossible += 1
             return None
@@ -345,14 +347,6 @@ class Vehicle:
                 self.streams.want(numbers(other), DEFAULT_INTERVAL)
         self.events.append(f"{self.kind} is in use")
         return True
-
-    def _restarted(self, now: int) -> None:
-        self.sync = TimeSync()
-        self._found, self.begun = now, self.begun + 1
-        for track in self.units.values():
-            track.time = -1
-        self.streams.ask_again()
-        self.events.append("the time of the autopilot has stepped: it has started anew, or its clock was set")
 
     # What goes out ------------------------------------------------------------------------------------------------
 

@@ -97,8 +97,7 @@ _LEVELS = {
     ChannelState.AMBIGUOUS: Level.ERROR,
     ChannelState.FAULTY: Level.ERROR,
     ChannelState.STALE: Level.STALE,
-}
-"""Of a state; of all others a warning."""
+}  # of all other states a warning
 _TIMES = (
     ("ms", 1e-3, 0.1, 1),
     ("s", 1, 600, 1),
@@ -106,8 +105,7 @@ _TIMES = (
     ("h", 3600, 172_800, 0),
     ("days", 86_400, 63_072_000, 0),
     ("years", 31_557_600, math.inf, 0),
-)
-"""Units of time: name, length, below what it is used, s, and decimals."""
+)  # name, length, below what it is used, s, and decimals
 ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
@@ -115,8 +113,7 @@ ODD = {
     "ahead": "stamps ahead of the clock, refused",
     "jumped": "stamps far ahead of all others, refused",
     "late": "messages too late for their sample",
-}
-"""What was not taken as it came, in words, by the names of the counters."""
+}  # what was not taken as it came, in words, by the names of the counters
 
 
 def describe(
@@ -272,10 +269,7 @@ def _whole_values(status: Status) -> Values:
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),
         ("names rest on", status.names_rest_on or "one fault at a time"),
         ("protection level (rad/s)", " ".join(map(_figure, status.protection_level))),
-        (
-            "protection level after one more loss (rad/s)",
-            " ".join(map(_figure, status.protection_level_after_loss)),
-        ),
+        ("protection level after one more loss (rad/s)", " ".join(map(_figure, status.protection_level_after_loss))),
         ("bias", status.bias_state),
         *((f"{unit.name}: stamps late (ms)", _late(unit)) for unit in status.units),
         ("note", status.note),

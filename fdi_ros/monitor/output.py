@@ -227,14 +227,12 @@ FUSED = SampleOutput(
     lambda out, row, n, shift: fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]),
     needs_rate=True,
 )
-"""Fused rate and its covariance."""
 INTEGRITY = SampleOutput(
     Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
     lambda frame_id, n: ChannelsTemplate(n + 5),
     lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n),
     on_demand=True,
-)
-"""Statistic, threshold, states of the channels, protection level."""
+)  # statistic, threshold, states of the channels, protection level
 OUTPUTS = (FUSED, INTEGRITY)  # all that is said of samples, live and in an output bag
 
 

@@ -22,14 +22,7 @@ from fdi_ros.core.fusion import update_level
 from fdi_ros.core.path import Path, begin_bias, run
 from fdi_ros.core.records import Core, EventRow, OutputRow, Sample
 from fdi_ros.core.sources import source_of
-from fdi_ros.core.subsets import (
-    describe_sensors,
-    mask_of,
-    prepare_capability,
-    prepare_subsets,
-    single_losses,
-    whole_set,
-)
+from fdi_ros.core.subsets import describe_sensors, mask_of, prepare_capability, prepare_subsets, single_losses
 from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
@@ -165,7 +158,7 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     n, fixed, learning = len(noise.noise_std), config.bias.fixed, config.bias.startup_bias_duration > 0
     bias["given"] = bool(fixed)
     bias["value"][:n] = bias["centre"][:n] = fixed or 0.0
-    bias["known"] = whole_set(n)
+    bias["known"] = mask_of(range(n))
     bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
     bias["max_rate"] = config.bias.max_rest_rate
     prepare_limits(bias)
@@ -304,10 +297,7 @@ class Pipeline:
         return status_of(self.core[0], self.subsets, self.detector, self.integrity, self.config)
 
     def prepare(self) -> None:
-        """Prepare every loss of one channel and of one whole unit, now and after each change of the detector.
-
-        In flight no fault may wait for it; offline it is enough to prepare what comes.
-        """
+        """Prepare every loss of one channel or unit, now and after each change of detector: in flight none may wait."""
         self._in_flight = True
         whole = len(self.subsets) - 1
         without_unit = [whole & ~mask_of(unit) for unit in self.geometry.units]
@@ -317,10 +307,7 @@ class Pipeline:
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:
-        """Prepare what the sample path has requested: the detector for a set of channels, or its protection level.
-
-        Where it has found a copy of a unit, what was learned and declared by its word is void.
-        """
+        """Prepare what the sample path has asked for; what was learned by the word of a copy of a unit is void."""
         core = self.core[0]
         if core["copies"]["found"]:
             core["copies"]["found"] = False

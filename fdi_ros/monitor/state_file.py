@@ -55,18 +55,13 @@ DAMAGED = (ValueError, KeyError, TypeError, AttributeError, RecursionError, Over
 
 
 def _content(pipeline: Pipeline) -> dict[str, Any]:
-    """Return what outlives a monitor, in the fields of the file, with channels by name.
-
-    ``bias``: rad/s; None: being learned. ``errors``: see `_errors`. ``in_motion``: whether the biases are as given,
-    after a start in motion. ``known``: channels whose bias is known. ``declared``: channels that are ``faulty``, and
-    why, one of `WHY`; the ``ambiguous`` of which one is faulty.
-    """
+    """Return what outlives a monitor, in the fields of the file, with channels by name; biases in rad/s."""
     core, names = pipeline.core[0], pipeline.channel_names
     bias, decision, learned = core["bias"], core["decision"], not core["bias"]["learning"]
     return {
         "bias": dict(zip(names, bias["value"][: len(names)].tolist(), strict=True)) if learned else None,
         "errors": _errors(pipeline.detector) if learned else None,
-        "in_motion": bool(bias["outcome"] == IN_MOTION),
+        "in_motion": bool(bias["outcome"] == IN_MOTION),  # biases as given
         "known": [names[i] for i in members(int(bias["known"]))],
         "declared": {
             "faulty": {names[i]: WHY[decision["why"][i]] for i in members(int(decision["faulty"]))},
@@ -76,11 +71,7 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _errors(detector: Detector) -> dict[str, Array] | None:
-    """Return what a detector has estimated of the errors of the sensors; None: nothing yet, or it does not.
-
-    ``value`` (N,) in the order of `fdi_ros.estimator.error_states.ERROR_KINDS`, ``covariance`` (N, N), and ``late``,
-    the delays taken off the stamps of the units, s.
-    """
+    """Return what a detector has estimated of ``ERROR_KINDS``, (N,), (N, N), and delays taken off, s; None: nothing."""
     if not detector.takes_any or not detector.states[0]["begun"]:
         return None
     estimator, count = detector.states[0]["estimator"], int(detector.constants[0]["layout"]["count"])

@@ -223,11 +223,7 @@ def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
 
 
 def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
-    """Return what the channels marked in mask (n,) can do with a detector.
-
-    Channels whose fault would be seen, and those whose fault would be isolated, (n,); why others would not, in words;
-    what no data can tell, and every isolation rests on.
-    """
+    """Channels whose fault would be seen, and isolated, (n,); why others' would not; what every isolation rests on."""
     detectable, isolable = np.zeros((2, len(mask)), dtype=bool)
     try:
         reduced = detector.geometry.subset(mask)

@@ -32,11 +32,10 @@ LOOK_PERIOD = 0.05  # how often it is looked whether an output has found its fir
 
 
 class InjectorNode(CheckedNode):
-    """Republishes the input topics of a monitor with faults in them.
+    """Republishes the input topics of a monitor with faults in them; `FdiError` if a parameter or a fault is wrong.
 
     A topic is subscribed to when its output has found its first subscriber: who waits for this node waits for the
-    monitor behind it, and nothing is lost in between. `FdiError` if a parameter is wrong, or a fault strikes a channel
-    that is not there.
+    monitor behind it, and nothing is lost in between.
     """
 
     def __init__(self, **options: Any) -> None:

@@ -66,8 +66,8 @@ class AutopilotNode(CheckedNode):
         self._units = list(zip(outputs, map(ImuTemplate, names), strict=True))
         self._reporter = Reporter(self._link, self._vehicle, names, self._topics)
         self._diagnostics = self.create_diagnostics()
-        self._opened = self._valued = self._due = 0
-        self._trouble = self._link.trouble
+        self._valued = self._due = 0
+        self._link_state = (0, self._link.trouble)  # how often it was opened, and why it is not open
         self._ahead = system_ahead()
         self._called = False  # whether the executor has found something to do
         channels = config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
@@ -110,8 +110,7 @@ class AutopilotNode(CheckedNode):
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
         kind = message_class(INTEGRITY.topic.type)
         heard = self.create_subscription(kind, declarations, self._on_integrity, 10, raw=True)
-        self._sole = [heard.topic_name, *self._topics]
-        """Topics that must have one publisher: names as they are after remapping."""
+        self._sole = [heard.topic_name, *self._topics]  # topics, remapped, that must have one publisher
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not params["signing_key"]:
             self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
@@ -171,13 +170,11 @@ class AutopilotNode(CheckedNode):
     def _receive(self) -> None:
         link = self._link
         received = link.receive(time.monotonic_ns())
-        if link.opened != self._opened:
-            self._opened = link.opened
-            self._vehicle.reopened()
-            self.log.info(f"{link.url} is open")
-        if link.trouble not in ("", self._trouble):
-            self.log.info(f"{link.url} is not open: {link.trouble}")
-        self._trouble = link.trouble
+        if (state := (link.opened, link.trouble)) != self._link_state:
+            self._link_state = state
+            self.log.info(f"{link.url} is {f'not open: {link.trouble}' if link.trouble else 'open'}")
+            if not link.trouble:
+                self._vehicle.reopened()
         for peer, data in received:
             now = time.monotonic_ns()
             for sample in self._vehicle.feed(peer, data, now):

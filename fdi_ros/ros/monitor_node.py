@@ -35,6 +35,7 @@ from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05  # how often silence is checked for, and the state saved if it has changed, s
 LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
+END_OF_TIME = 2**62  # stamps beyond all clocks, ns: a clock was set back by decades again and again
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RCLError = rclpy_implementation.RCLError
 
@@ -53,8 +54,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self._running: Running | None = None
         self._checked_at = time.monotonic()  # steady time of the last check, s
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
-        self._receiver: Receiver | None = self._build()
-        """The monitor: there from the start, and again from configure to cleanup."""
+        self._receiver: Receiver | None = self._build()  # again from configure to cleanup
         self._service_change_state.callback = partial(self._on_change_state, self._service_change_state.callback)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/relearn_bias", self._on_relearn_bias)
@@ -64,10 +64,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
             receiver = Receiver(Pipeline.from_config(self.config))
         if self._state_file is not None:
             self._state_file.restore(receiver.pipeline)
-            if self._state_file.is_rejected:
-                self.log.warning(self._state_file.words)
-            else:
-                self.log.info(self._state_file.words)
+            say = self.log.warning if self._state_file.is_rejected else self.log.info
+            say(self._state_file.words)
         return receiver
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, *arguments: Any, **options: Any) -> Any:
@@ -168,7 +166,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self._checked_at = time.monotonic()
         self.save_state()
         running.check()
-        if running.is_out_of_time:
+        if not 0 <= running.receiver.live["last_stamp"][0] < END_OF_TIME:
             self.log.error("the clock went back by decades too often: the monitor begins anew")
             self._receiver = self._build()
             running.start(self._receiver)

@@ -1,10 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all nodes have: parameters from the table that every command shares, requests that are answered, a bounded log.
-
-And topics: messages come in and go out as bytes. They may come from anywhere, and never stop a node.
-"""
+"""What all nodes have: parameters, requests that are answered, a bounded log, topics of bytes that never stop them."""
 
 from __future__ import annotations
 
@@ -50,8 +47,7 @@ _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
     "depth": (),
     "reliability": ("reliable", "best_effort", "system_default"),
-}
-"""What QoS may be overridden, and the values it may have."""
+}  # what QoS may be overridden, and the values it may have
 _MAX_DEPTH = 100_000
 
 
@@ -205,11 +201,10 @@ def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:
 
 
 class CheckedNode(Node):
-    """A node that refuses what it cannot use, at the start and later, and answers every request.
+    """A node that refuses what it cannot use (`ConfigError`), answers every request, and bounds what many bring about.
 
-    Nothing that many requests or messages bring about is without bound. ``fields`` are its parameters that are none of
-    the settings. QoS may be overridden of the input topics, if it subscribes to them, and of topics that it
-    ``publishes``. `ConfigError` if a parameter is unknown, of the wrong type or out of its range.
+    ``fields`` are its parameters that are none of the settings. QoS may be overridden of the input topics, if it
+    subscribes to them, and of topics that it ``publishes``.
     """
 
     def __init__(

@@ -30,8 +30,7 @@ NODES = {
     "injector_node": "injector_node.InjectorNode",
     "mavlink_node": "mavlink_node.AutopilotNode",
     "player_node": "player_node.PlayerNode",
-}
-"""Where the class of each node is."""
+}  # where the class of each node is
 NO_ROS = "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or in a clone pip install '.[ros]'"
 
 
@@ -125,14 +124,11 @@ def _make(name: str) -> Any:
 
 
 def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None) -> int:
-    """Make one of `NODES`, let it live until it is done, a signal or a shutdown, and take it down.
+    """Make one of `NODES`, let it live until it is done, a signal or a shutdown; return the exit code, 0 or 2.
 
-    Arguments are those of ROS, by default those of the process. Something else may make the node. Returned is the exit
-    code: 0, or 2 if the node cannot start.
-
-    Until the node is up, a signal has its default effect and ends the process: while something is compiled, a handler
-    in Python would run only now and then.
+    Arguments are those of ROS, by default those of the process. Something else may make the node.
     """
+    # A signal ends the process until the node is up: while something is compiled, no handler in Python runs.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
     try:

@@ -1,10 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What exists only while the node is configured: the path of a message, and the supervision of the monitor.
-
-What changes is logged and reported at once, both up to 20 times per second; all of it is reported at 1 Hz.
-"""
+"""What exists only while the node is configured: the path of a message, and the supervision of the monitor."""
 
 from __future__ import annotations
 
@@ -31,7 +28,6 @@ REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
 ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
 NAMED = 4  # publishers of one topic that are named at most
-END_OF_TIME = 2**62  # stamps beyond all clocks, ns: a clock was set back by decades again and again
 QUIET = 5.0  # after a line about a channel the next one waits so long, s, unless its state becomes worse
 BY_SEVERITY = ("OK", "EXCLUDED", "UNCHECKED", "SUSPECT", "STALE", "AMBIGUOUS", "FAULTY")  # states, the worst last
 
@@ -262,11 +258,6 @@ class Running:
             self._report()
             self._count_anew(now)
 
-    @property
-    def is_out_of_time(self) -> bool:
-        """Whether the stamps of the samples are beyond what can be worked: the monitor must begin anew."""
-        return not 0 <= self.receiver.live["last_stamp"][0] < END_OF_TIME
-
     def why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
         if not self._node.inputs.subscriptions or self._has_no_samples:
@@ -286,13 +277,12 @@ class Running:
         return self._watchdog.silent or not self._samples
 
     def _count_subscribers(self) -> None:
-        """Check which outputs are wanted: with a subscriber, or published whether there is one or not."""
+        """Check which outputs are wanted, and of what samples: with a subscriber, or whether there is one or not."""
         self._wanted = [
             (HAS_RATE if output.needs_rate else WORKED, output, publisher)
             for output, publisher in self._outputs.items()
             if not output.on_demand or publisher.get_subscription_count() > 0
         ]
-        """Each with the flag of the samples that it is published of."""
 
     def _check_bias(self) -> None:
         """Log where the biases come from, and why not from a time at rest, whenever that changes."""

@@ -1,10 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Watch a running monitor, fdi watch: a picture of it, made of what it publishes, drawn in place or told line by line.
-
-It may run anywhere, and its topics may be mapped to anything.
-"""
+"""Watch a running monitor, fdi watch: a picture of what it publishes, drawn in place or told line by line."""
 
 from __future__ import annotations
 
@@ -366,9 +363,8 @@ def _channel_table(picture: Picture, is_wide: bool) -> Table:
 
 def _format_bias(line: StatusLine) -> str:
     bias, std = line.number("bias (rad/s)"), line.number("bias known to (rad/s)")
-    if not math.isfinite(bias):
-        return "none"
-    return f"{bias:+.4f}" + (f" +- {std:.4f}" if math.isfinite(std) else "")
+    known = f" +- {std:.4f}" if math.isfinite(std) else ""
+    return f"{bias:+.4f}{known}" if math.isfinite(bias) else "none"
 
 
 def _input_lines(picture: Picture) -> list[Text]:
