@@ -26,7 +26,7 @@ from fdi_ros.core.health import (
     intermittent_channels,
     update_stuck,
 )
-from fdi_ros.core.records import Core, Current, Decision, Estimate, Evidence, PathSettings, Subset
+from fdi_ros.core.records import Core, Current, Decision, Evidence, PathSettings, SampleInput, Subset
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
@@ -38,10 +38,10 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
     settings, health, now, evidence = core.settings, core.health, core.now, core.now.evidence
     evidence.judged = not math.isnan(now.verdict.statistic)
-    evidence.checked = subsets[now.input_mask].detectable if evidence.judged else 0
+    evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
     if settings.estimates:
-        evidence.checked &= core.estimate.checked
-    evidence.held = core.known.held
+        evidence.checked &= core.sample.estimate.checked
+    evidence.held = core.sample.held
     evidence.broken = evidence.repeats = evidence.agrees = clear = 0
     may_return = not settings.latch and core.decision.faulty != 0
     for i in range(settings.n):
@@ -77,7 +77,7 @@ def fill_suspects(core: Core, stuck: int) -> None:
         # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
         if settings.members[u] & stuck & now.repeated:
             stuck |= settings.members[u]
-    update_drifted(settings, core.estimate, now)
+    update_drifted(settings, core.sample, now)
     evidence.certain |= evidence.drifted
     add_stuck(settings, now, stuck)
     for i in range(n):
@@ -89,13 +89,13 @@ def fill_suspects(core: Core, stuck: int) -> None:
 
 
 @compiled
-def update_drifted(settings: PathSettings, estimate: Estimate, now: Current) -> None:
+def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
     """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
-    now.evidence.drifted = 0
+    now.evidence.drifted, estimate = 0, sample.estimate
     if settings.estimates and settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
-            if now.input_mask >> i & 1 and bias > settings.max_drift:
+            if sample.mask >> i & 1 and bias > settings.max_drift:
                 now.evidence.drifted |= 1 << i
                 now.verdict.suspects[i], now.verdict.error[i] = True, estimate.bias[i]
 
@@ -422,7 +422,7 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
                 error = core.now.verdict.error[i]
                 if error == 0:
                     # Of a drift that was declared before a restart the bias is known, too.
-                    error = core.estimate.bias[i] if reason == _DRIFTED else last.residual[i]
+                    error = core.sample.estimate.bias[i] if reason == _DRIFTED else last.residual[i]
                 if not math.isfinite(error):
                     # It gives nothing in this very sample.
                     error = 0.0

@@ -26,13 +26,11 @@ from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.health import is_at_rest
 from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Parity, PathSettings, Subset
 from fdi_ros.core.subsets import (
-    UNKNOWN_RATE,
     apply_gain,
-    compute_weights,
     covariance_of,
-    eliminate_rate,
     fill_growth,
     fill_level,
+    fill_parity,
     fill_rate,
     passes_test,
     variance_of,
@@ -50,7 +48,7 @@ APART = 1e-3  # least share of a variance in its parity, and of A_ii A_jj in the
 def cover_rivals(core: Core) -> None:
     """Raise ``core.last.level`` to what holds if a name or the set is wrong; the covariance of the sample is known."""
     now, decision, n = core.now, core.decision, core.settings.n
-    update_parity(core, now.fused)
+    fill_parity(now.parity, core.settings.sensors, now.fused, now.uncertainty)
     chi = chi_of(now.parity, n, now.fused, now.corrected)
     for i in range(n):
         if decision.faulty >> i & 1 and now.plain >> i & 1:
@@ -58,13 +56,6 @@ def cover_rivals(core: Core) -> None:
     doubted = decision.ambiguous
     if doubted and not doubted & (now.fused | ~now.plain):
         cover(core, doubted, chi)
-
-
-@compiled
-def update_parity(core: Core, mask: int) -> None:
-    """Work out the parity of the channels in mask."""
-    compute_weights(core.now.parity, core.settings.n, mask, core.now.uncertainty)
-    eliminate_rate(core.now.parity, core.settings.n, core.settings.sensors.axes, UNKNOWN_RATE)
 
 
 @compiled
@@ -83,7 +74,7 @@ def cover(core: Core, out: int, chi: float) -> None:
     """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not."""
     n, now, parity, prior = core.settings.n, core.now, core.now.parity, core.settings.prior
     mask, count, free = now.fused | out, 0, -1.0
-    update_parity(core, mask)
+    fill_parity(parity, core.settings.sensors, mask, now.uncertainty)
     for i in range(n):
         count += now.fused >> i & 1
         free += out >> i & 1
@@ -133,7 +124,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     subset = subsets[now.fused]
     fill_rate(subset, n, now.fused, now.corrected, now.plain_rate)
     last.valid = not math.isnan(now.plain_rate[0])
-    update_gain(settings, core.estimate, core.acceleration, now, subset)
+    update_gain(settings, core.sample.estimate, core.acceleration, now, subset)
     for a in range(3):
         last.rate[a] = now.plain_rate[a]
     if last.valid and settings.estimates:
@@ -141,13 +132,13 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     update_residuals(settings, now, last)
     update_lag(core)
     if last.valid:
-        covariance_of(now.gain, n, now.variance, core.estimate.covariance, last.covariance)
+        covariance_of(now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance)
         if doubtful & now.usable:
             add_doubt(core, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
         # Whichever unit is in time, the others are early or late: the instant lies anywhere between.
         for a in range(3):
-            now.others_rate[a] = core.estimate.spread * core.acceleration.value[a]
+            now.others_rate[a] = core.sample.estimate.spread * core.acceleration.value[a]
         add_square(last.covariance, now.others_rate, 1.0 / 12.0)
         update_common_error(core)
     else:
@@ -158,7 +149,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 @compiled
 def update_lag(core: Core) -> None:
     """Find the instant that the rate is of, where units are late before the stamp; instants only ever go forwards."""
-    true = core.now.evidence.stamp - round(1e9 * core.estimate.behind)
+    true = core.now.evidence.stamp - round(1e9 * core.sample.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
         core.now.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]
@@ -217,8 +208,7 @@ def update_gain(
         for a in range(3):
             now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
     if settings.estimates and subset.spans:
-        compute_weights(now.parity, n, now.fused, now.uncertainty)
-        eliminate_rate(now.parity, n, sensors.axes, UNKNOWN_RATE)
+        fill_parity(now.parity, sensors, now.fused, now.uncertainty)
         for a in range(3):
             for i in range(n):
                 now.gain[a, i] = now.parity.gain[a, i]
@@ -248,23 +238,19 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 @compiled
 def add_units(settings: PathSettings, now: Current, last: OutputRow, subsets: NDArray[Any], doubtful: int) -> None:
     """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
-    whole = 0
+    doubted = whole = 0
     for u in range(settings.units):
-        whole += is_doubted(settings, now, subsets, doubtful, u)
-    for u in range(settings.units if whole else 0):
-        if is_doubted(settings, now, subsets, doubtful, u):
+        inside = now.usable & settings.members[u]
+        if inside and not inside & ~doubtful and subsets[now.usable & ~inside].spans:
+            doubted |= 1 << u
+            whole += 1
+    for u in range(settings.units):
+        if doubted >> u & 1:
             rest = now.usable & ~settings.members[u]
             fill_rate(subsets[rest], settings.n, rest, now.corrected, now.others_rate)
             for a in range(3):
                 now.others_rate[a] -= last.rate[a]
             add_square(last.covariance, now.others_rate, 1.0 / whole)
-
-
-@compiled
-def is_doubted(settings: PathSettings, now: Current, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
-    """Whether a unit is in doubt as a whole, and there is a rate without it."""
-    inside = now.usable & settings.members[unit]
-    return inside != 0 and not inside & ~doubtful and subsets[now.usable & ~inside].spans != 0
 
 
 @compiled
@@ -291,7 +277,7 @@ def update_common_error(core: Core) -> None:
         for a in range(3):
             total = 0.0
             for j in range(n):
-                total += core.now.gain[a, j] * core.estimate.covariance[i, j]
+                total += core.now.gain[a, j] * core.sample.estimate.covariance[i, j]
             taken[i, a] = total
     k = 0
     for a in range(3):
@@ -306,7 +292,7 @@ def update_common_error(core: Core) -> None:
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
         square = x * x * b[0] + y * y * b[3] + z * z * b[5] + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
         mixed = x * taken[i, 0] + y * taken[i, 1] + z * taken[i, 2]
-        core.remaining[i] = math.sqrt(max(core.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0))
+        core.remaining[i] = math.sqrt(max(core.sample.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0))
 
 
 @compiled

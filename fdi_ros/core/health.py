@@ -250,17 +250,8 @@ def update_repeated(core: Core) -> int:
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
     """Whether the rate of the channels in use is that of a vehicle at rest."""
     square = now.rate[0] * now.rate[0] + now.rate[1] * now.rate[1] + now.rate[2] * now.rate[2]
-    least = RESTS * largest_noise(settings) + AT_REST
+    least = RESTS * settings.largest_noise + AT_REST
     return square < least * least
-
-
-@compiled
-def largest_noise(settings: PathSettings) -> float:
-    """Largest noise_std of all channels, rad/s."""
-    noise = 0.0
-    for i in range(settings.n):
-        noise = max(noise, settings.sensors.noise_std[i])
-    return noise
 
 
 @compiled
@@ -269,7 +260,7 @@ def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int)
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
     """
-    step, noise = largest_step(settings, health, now), largest_noise(settings)
+    step, noise = largest_step(settings, health, now), settings.largest_noise
     # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
     if not now.usable or (coarse and is_at_rest(settings, now)):

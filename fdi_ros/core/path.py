@@ -40,7 +40,7 @@ from fdi_ros.core.decision import (
 from fdi_ros.core.fusion import fuse, update_level
 from fdi_ros.core.health import FINE, OUT_OF_RANGE, all_repeat, check, leave_flickering, update_copies, update_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
-from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, PathSettings, Sample
+from fdi_ros.core.records import Aligner, Core, Current, Live, PathSettings, Sample
 from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
 from fdi_ros.model.samples import Bytes
 
@@ -64,8 +64,9 @@ def run(
 
     Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first sample that
     brings one. Returned are the row at which it ended, N if all is done; the number of events; and whether something
-    must be prepared. If it is the detector, for ``now.input_mask``, the row was not worked, and ``now.waiting`` is set;
-    if the row before it lacks its level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
+    must be prepared. If it is the detector, for ``sample.mask`` of the core, the row was not worked, and
+    ``now.waiting`` is set; if the row before it lacks its level, the channels fused are in ``core.wanted``; or
+    ``core.copies.found`` is set.
     """
     core, count = path[0][0], 0
     for k in range(start, len(samples)):
@@ -89,7 +90,7 @@ def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int)
     now = core.now
     if not now.waiting:
         prepare_sample(path, sample)
-    now.waiting = not now.learned_from and not judge_sample(bank, now.input_mask, now.input, core.known, now.verdict)
+    now.waiting = not now.learned_from and not judge_sample(bank, core.sample, now.input, now.verdict)
     return WAITING if now.waiting else conclude_sample(path, row, events, count)
 
 
@@ -130,18 +131,19 @@ def prepare_sample(path: Path, sample: Sample) -> None:
         now.corrected[i] = now.aligned[i] - core.bias.value[i] - core.correction[i]
     fill_rate(subsets[now.in_use], settings.n, now.in_use, now.corrected, now.rate)
     fill_input(core, out)
-    core.known.stamp, core.known.out, core.known.interrupted = stamp, out, now.evidence.interrupted
-    core.known.beyond = now.input_mask & ~now.usable
-    core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
+    given = core.sample
+    given.stamp, given.out, given.interrupted = stamp, out, now.evidence.interrupted
+    given.beyond = given.mask & ~now.usable
+    given.held = core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
     now.repeated = update_repeated(core) if settings.estimates else 0
-    core.known.repeated = now.repeated != 0
+    given.repeated = now.repeated != 0
     now.all_repeat = settings.estimates and all_repeat(settings, core.health, now, stamp)
     if now.all_repeat:
-        now.input_mask = 0
+        given.mask = 0
     if settings.needs_acceleration:
         differentiate_rate(core.acceleration, stamp, now.rate)
         for a in range(3):
-            core.known.acceleration[a] = core.acceleration.value[a]
+            given.acceleration[a] = core.acceleration.value[a]
 
 
 @compiled
@@ -156,7 +158,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
                 inside |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
-    delivered = restamp(core.line, settings, core.estimate.late, sample, delivered, inside, aligned)
+    delivered = restamp(core.line, settings, core.sample.estimate.late, sample, delivered, inside, aligned)
     for i in range(settings.n):
         if delivered >> i & 1 and abs(aligned[i]) < settings.max_rate[i]:
             plain |= 1 << i
@@ -177,24 +179,14 @@ def learn_bias(path: Path, stamp: int, plain: int) -> None:
 
 
 @compiled
-def apply_estimate(core: Core, bank: Bank) -> None:
-    """Take over what the detector has found of the errors of the sensors, and correct ``now.corrected`` anew by it."""
-    n, estimate = core.settings.n, bank.sample.estimate
-    core.estimate.known, core.estimate.checked = estimate.known, estimate.checked
-    core.estimate.behind, core.estimate.spread = estimate.behind, estimate.spread
-    if not estimate.known:
-        return
-    for i in range(n):
-        core.estimate.variance[i] = estimate.variance[i]
-        core.estimate.bias[i], core.estimate.bias_std[i] = estimate.bias[i], estimate.bias_std[i]
-        for j in range(n):
-            core.estimate.covariance[i, j] = estimate.covariance[i, j]
-        if math.isfinite(core.now.input[i]):
-            core.now.corrected[i] = estimate.corrected[i]
-            if core.now.usable >> i & 1:
-                core.correction[i] = core.now.aligned[i] - core.bias.value[i] - core.now.corrected[i]
-    for u in range(core.settings.units):
-        core.estimate.late[u] = estimate.late[u]
+def apply_estimate(core: Core) -> None:
+    """Correct ``now.corrected`` anew by what the detector has found of the errors of the sensors."""
+    now, estimate = core.now, core.sample.estimate
+    for i in range(core.settings.n if estimate.known else 0):
+        if math.isfinite(now.input[i]):
+            now.corrected[i] = estimate.corrected[i]
+            if now.usable >> i & 1:
+                core.correction[i] = now.aligned[i] - core.bias.value[i] - now.corrected[i]
 
 
 @compiled
@@ -226,7 +218,7 @@ def begin_bias(core: Core) -> None:
         if not motion and step > settings.sensors.noise_std[i]:
             # Noise does not take a sensor over coarse steps: at rest it was off by up to half of one all the time.
             std = math.sqrt(std * std + step * step / 12.0)
-        core.remaining[i] = core.known.bias_std[i] = std
+        core.remaining[i] = core.sample.bias_std[i] = std
         core.correction[i] = 0.0
 
 
@@ -239,7 +231,7 @@ def fill_input(core: Core, out: int) -> None:
     the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
     """
     now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
-    now.input_mask = now.usable
+    core.sample.mask = now.usable
     for i in range(core.settings.n):
         now.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         now.input[i] = now.aligned[i] - core.bias.value[i]
@@ -247,7 +239,7 @@ def fill_input(core: Core, out: int) -> None:
             limit = core.settings.max_rate[i]
             if abs(now.along[i]) < RAIL_MARGIN * limit:
                 now.input[i] = min(max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
-                now.input_mask |= 1 << i
+                core.sample.mask |= 1 << i
             else:
                 core.saturated, core.saturated_stamp = True, now.evidence.stamp
 
@@ -255,14 +247,14 @@ def fill_input(core: Core, out: int) -> None:
 @compiled
 def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> int:
     """Decide, fuse and write events after the detector; the output is ``core.last``. Return the number of events."""
-    core, bank, subsets = path[0][0], path[1][0], path[3]
+    core, subsets = path[0][0], path[3]
     settings, now, last, verdict = core.settings, core.now, core.last, core.now.verdict
     last.stamp = now.evidence.stamp
     if now.learned_from:
         skip_sample(core)
         return write_events(core, subsets[alive(core)], row, True, events, count)
     if settings.estimates:
-        apply_estimate(core, bank)
+        apply_estimate(core)
         update_noisy(settings, now)
     fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous

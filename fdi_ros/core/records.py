@@ -154,20 +154,6 @@ class Sensors:
 
 
 @record
-class Circumstances:
-    """What is known of a sample beside its values; masks and `bias_std` are of all channels that there are."""
-
-    stamp: Whole  # ns
-    out: Mask  # channels taken out of use, which may be there all the same
-    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
-    acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
-    interrupted: Flag  # there is a hole in the stream before this sample
-    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
-    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
-
-
-@record
 class Estimate:
     """What a method that estimates the errors of the sensors knows of them in a sample."""
 
@@ -184,15 +170,24 @@ class Estimate:
 
 
 @record
-class SampleInput(Circumstances):
+class SampleInput:
     """A sample of one set of channels, and what is known of it: values in order, without gaps.
 
-    Of a method that takes any set of channels: of all channels, those in ``mask`` are there.
+    Of a method that takes any set of channels: of all channels, those in ``mask`` are there. Other masks and `bias_std`
+    are of all channels that there are.
     """
 
+    stamp: Whole  # ns
     z: Channels  # rad/s
     mask: Mask
-    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors
+    out: Mask  # channels taken out of use, which may be there all the same
+    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
+    acceleration: Vector  # body angular acceleration, rad/s^2
+    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
+    interrupted: Flag  # there is a hole in the stream before this sample
+    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
+    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
+    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors; until the next one it stands
 
 
 @record
@@ -225,7 +220,6 @@ class Bank:
     states_size: Whole  # bytes of a row
     rows: Whole  # rows in use
     row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]  # by the bits of the channels present
-    sample: SampleInput
     judged: SampleVerdict
 
 
@@ -489,6 +483,7 @@ class PathSettings:
 
     n: Whole  # channels
     sensors: Sensors
+    largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
     members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
     # Of the checks:
@@ -529,8 +524,7 @@ class Current:
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
     aligned: Channels  # values of the instant that it stands for, rad/s
     corrected: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
-    input: Channels  # what the detector sees, rad/s, of the channels in input_mask
-    input_mask: Mask
+    input: Channels  # values of all channels as the detector takes them, rad/s
     plain: Mask  # delivered and in range
     in_use: Mask  # of these, those in use
     usable: Mask  # of these, those that are well by themselves
@@ -564,9 +558,8 @@ class Core:
     bias: Bias
     line: DelayBuffer
     copies: Copies
-    known: Circumstances  # what is known beside the values, for the detector
+    sample: SampleInput  # of the channels that the detector sees, and what it estimates of them
     unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s
-    estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
     correction: Channels  # last estimated error of each channel, taken off its value, rad/s
     remaining: Channels  # what residuals show of the unknown errors of each channel, standard deviation, rad/s
     acceleration: Acceleration

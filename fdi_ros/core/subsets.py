@@ -21,8 +21,8 @@ from fdi_ros.core.records import (
     ACCELERATION_SAMPLES,
     Acceleration,
     Bank,
-    Circumstances,
     Parity,
+    SampleInput,
     SampleVerdict,
     Sensors,
     Subset,
@@ -242,31 +242,29 @@ def clear_verdict(verdict: SampleVerdict, n: int) -> None:
 
 
 @compiled
-def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumstances, verdict: SampleVerdict) -> bool:
-    """Judge a sample z (n,) by the channels in mask; False, and nothing is done, if their constants are unprepared."""
+def judge_sample(bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict) -> bool:
+    """Judge a sample by those of all values z (n,) that are in its mask; all else but its values is filled in already.
+
+    False, and nothing is done, if the constants for these channels are unprepared.
+    """
+    mask, judged = sample.mask, bank.judged
     row = 0 if bank.takes_any else bank.row[mask]
     if row == UNPREPARED:
         return False
     clear_verdict(verdict, bank.n)
     if row == REFUSED:
         return True
-    present, judged = bank.sample, bank.judged
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
+            sample.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
-        present.bias_std[i] = known.bias_std[i]
-    for a in range(3):
-        present.acceleration[a] = known.acceleration[a]
-    present.mask, present.out, present.beyond, present.stamp = mask, known.out, known.beyond, known.stamp
-    present.interrupted, present.held, present.repeated = known.interrupted, known.held, known.repeated
-    judged.alarm = judged.isolated = present.estimate.known = False
-    call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)
+    judged.alarm = judged.isolated = sample.estimate.known = False
+    call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, sample, judged)
     verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
     verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
     k = 0
@@ -355,38 +353,6 @@ def invert(a: Array, size: int, out: Array) -> float:
 
 
 @compiled
-def compute_weights(parity: Parity, n: int, mask: int, variance: Array) -> None:
-    """W of independent errors of the given variances (n,), (rad/s)^2."""
-    for i in range(n):
-        for j in range(n):
-            parity.weight[i, j] = 0.0
-        if mask >> i & 1:
-            parity.weight[i, i] = 1.0 / variance[i]
-
-
-@compiled
-def compute_joint_weights(parity: Parity, n: int, mask: int, covariance: Array) -> None:
-    """W of errors of the given covariance (n, n), (rad/s)^2."""
-    count = 0
-    for i in range(n):
-        if mask >> i & 1:
-            parity.place[count] = i
-            count += 1
-            for q in range(count):
-                parity.information[count - 1, q] = covariance[i, parity.place[q]]
-    invert(parity.information, count, parity.weight)
-    for p in range(count):
-        for q in range(count):
-            parity.information[p, q] = parity.weight[p, q]
-    for i in range(n):
-        for j in range(n):
-            parity.weight[i, j] = 0.0
-    for p in range(count):
-        for q in range(count):
-            parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
-
-
-@compiled
 def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out W H, and of ``H' W H + K`` the lower triangle."""
     for i in range(n):
@@ -420,6 +386,41 @@ def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
             for a in range(3):
                 total -= parity.weighted[i, a] * parity.gain[a, j]
             parity.information[i, j] = parity.information[j, i] = total
+
+
+@compiled
+def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) -> None:
+    """Work out A and G for independent errors of variances (n,), (rad/s)^2, while nothing is known of the rate."""
+    n = sensors.n
+    for i in range(n):
+        for j in range(n):
+            parity.weight[i, j] = 0.0
+        if mask >> i & 1:
+            parity.weight[i, i] = 1.0 / variance[i]
+    eliminate_rate(parity, n, sensors.axes, UNKNOWN_RATE)
+
+
+@compiled
+def fill_joint_parity(parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float) -> None:
+    """Work out A and G for errors of a covariance (n, n), (rad/s)^2; ``known`` of the rate: k in s^2/rad^2."""
+    n, count = sensors.n, 0
+    for i in range(n):
+        if mask >> i & 1:
+            parity.place[count] = i
+            count += 1
+            for q in range(count):
+                parity.information[count - 1, q] = covariance[i, parity.place[q]]
+    invert(parity.information, count, parity.weight)
+    for p in range(count):
+        for q in range(count):
+            parity.information[p, q] = parity.weight[p, q]
+    for i in range(n):
+        for j in range(n):
+            parity.weight[i, j] = 0.0
+    for p in range(count):
+        for q in range(count):
+            parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
+    eliminate_rate(parity, n, sensors.axes, known)
 
 
 @compiled

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Callback, Whole, address_of, allocate, as_input, compiled, record
-from fdi_ros.core.records import Bank, Circumstances, SampleVerdict
+from fdi_ros.core.records import Bank, SampleInput, SampleVerdict
 from fdi_ros.core.subsets import REFUSED, UNPREPARED, describe_sensors, flags_of, judge_sample, present_in, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
@@ -181,10 +181,10 @@ class Detector(ABC):
         if acceleration is not None and turning.shape != (rows, 3):
             raise DetectorError(f"acceleration has shape {turning.shape}, expected ({rows}, 3)")
         verdicts = allocate(SampleVerdict, rows)
-        known = allocate(Circumstances)
-        known["bias_std"][0, : self.geometry.n] = self.noise.bias_std
+        sample = allocate(SampleInput)
+        sample["bias_std"][0, : self.geometry.n] = self.noise.bias_std
         done = 0
-        while (done := judge_rows(self.bank, z, turning, known, verdicts, done)) < rows:
+        while (done := judge_rows(self.bank, z, turning, sample, verdicts, done)) < rows:
             self.prepare(present_in(z[done], self.geometry.n))
         return as_verdict(verdicts, self.geometry.n)
 
@@ -238,21 +238,18 @@ class _Rows:
 
 @compiled
 def judge_rows(
-    bank: NDArray[Any], z: Array, acceleration: Array, known: NDArray[Any], verdicts: NDArray[Any], start: int
+    bank: NDArray[Any], z: Array, acceleration: Array, sample: NDArray[Any], verdicts: NDArray[Any], start: int
 ) -> int:
     """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
 
-    Returns
-    -------
-    The first row whose channels present are unprepared; N if all are judged.
+    Returned is the first row whose channels present are unprepared; N if all are judged.
     """
     for k in range(start, len(z)):
-        mask = present_in(z[k], bank[0].n)
-        known[0].stamp = bank[0].clock
+        sample[0].mask, sample[0].stamp = present_in(z[k], bank[0].n), bank[0].clock
         bank[0].clock += bank[0].period
         for a in range(3):
-            known[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
-        if not judge_sample(bank[0], mask, z[k], known[0], verdicts[k]):
+            sample[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
+        if not judge_sample(bank[0], sample[0], z[k], verdicts[k]):
             bank[0].clock -= bank[0].period
             return k
     return len(z)

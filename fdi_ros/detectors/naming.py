@@ -30,7 +30,7 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import Matrix, Parity
-from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate, invert
+from fdi_ros.core.subsets import UNKNOWN_RATE, fill_joint_parity, invert
 from fdi_ros.estimator.error_states import fill_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
 from fdi_ros.estimator.noise import BLOCK, BURST, MOTION
@@ -362,8 +362,7 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
 def explain(params: Constants, inference: Inference) -> None:
     """Explain a mean: find the smallest set of hypotheses that holds the truth with the confidence."""
     n = params.sensors.n
-    compute_joint_weights(inference.parity, n, inference.mask, inference.covariance)
-    eliminate_rate(inference.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_joint_parity(inference.parity, params.sensors, inference.mask, inference.covariance, UNKNOWN_RATE)
     inference.total = 0.0
     for i in range(n):
         inference.u[i] = 0.0

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.subsets import UNKNOWN_RATE, compute_joint_weights, eliminate_rate
+from fdi_ros.core.subsets import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
@@ -251,8 +251,7 @@ def judge_block(params: Constants, kf: Estimator) -> float:
         for j in range(n):
             kf.matrix[i, j] = kf.block_at.covariance[i, j]
         kf.matrix[i, i] += noise.now.block[i] * noise.longest[i] / params.length + kf.extra[i]
-    compute_joint_weights(kf.block_parity, n, mask, kf.matrix)
-    eliminate_rate(kf.block_parity, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_joint_parity(kf.block_parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
     subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
     chi, free = 0.0, -3.0
     for i in range(n):
@@ -364,9 +363,8 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
                 kf.matrix[i, j] += kf.block_at.covariance[i, j]
         subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
     if kf.rest or kept != kf.masks[1]:
-        compute_joint_weights(kf.block_parity, n, kept, kf.matrix)
         known = 1.0 / (params.rest_std * params.rest_std) if kf.rest else UNKNOWN_RATE
-        eliminate_rate(kf.block_parity, n, params.sensors.axes, known)
+        fill_joint_parity(kf.block_parity, params.sensors, kept, kf.matrix, known)
     update_least_variances(params, kf)
     update(layout, kf.states, kf.block_at, kf.block_parity.information, kf.block_innovation, weight, kf.taught)
 

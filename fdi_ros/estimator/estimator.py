@@ -34,7 +34,7 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, compute_joint_weights, compute_weights, eliminate_rate
+from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, fill_joint_parity, fill_parity
 from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, fill_signals, subtract_errors
 from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array
@@ -208,16 +208,14 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     """
     n, noise = params.sensors.n, kf.noise
     lasting = 2.0 * params.length
-    compute_weights(kf.parity, n, kf.mask, noise.now.sample)
-    eliminate_rate(kf.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_parity(kf.parity, params.sensors, kf.mask, noise.now.sample)
     for i in range(n):
         kf.known[i] = kf.parity.information[i, i]
     for i in range(n):
         for j in range(n):
             kf.matrix[i, j] = lasting * kf.at.covariance[i, j]
         kf.matrix[i, i] += noise.now.sample[i]
-    compute_joint_weights(kf.parity, n, kf.mask, kf.matrix)
-    eliminate_rate(kf.parity, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_joint_parity(kf.parity, params.sensors, kf.mask, kf.matrix, UNKNOWN_RATE)
     kf.judged = kf.checked = 0
     for i in range(n):
         information, share = kf.parity.information[i, i], 0.0
@@ -234,8 +232,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
     if not params.spans[kept]:
         kept = kf.mask
-    compute_weights(kf.fused, n, kept, kf.growth)
-    eliminate_rate(kf.fused, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_parity(kf.fused, params.sensors, kept, kf.growth)
 
 
 @compiled

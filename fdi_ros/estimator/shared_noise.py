@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, compute_weights, eliminate_rate, invert
+from fdi_ros.core.subsets import apply_gain, fill_parity, invert
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
@@ -139,13 +139,11 @@ def update_shape(params: Constants, kf: Estimator) -> None:
         kept = kf.mask
     if kept == shared.kept and kf.filled > 0:
         return
-    compute_weights(shared.alone, n, kept, noise.now.sample)
-    eliminate_rate(shared.alone, n, params.sensors.axes, UNKNOWN_RATE)
+    fill_parity(shared.alone, params.sensors, kept, noise.now.sample)
     if kept != shared.kept:
         # Differences are of samples of the same channels.
         shared.kept, shared.fresh = kept, 0
-        compute_weights(shared.even, n, kept, shared.ones)
-        eliminate_rate(shared.even, n, params.sensors.axes, UNKNOWN_RATE)
+        fill_parity(shared.even, params.sensors, kept, shared.ones)
     if noise.regime != shared.regime:
         shared.regime, shared.count = noise.regime, 0.5 * params.length / params.adaptation_gain
         for i in range(n):

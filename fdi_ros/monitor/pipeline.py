@@ -111,7 +111,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
     _fill_settings(core["settings"], config, geometry, noise)
     _fill_bias(core["bias"], config, noise)
     core["remaining"][:n] = noise.bias_std
-    core["known"]["bias_std"][:n] = noise.bias_std if core["bias"]["learning"] else config.bias.turn_on_std
+    core["sample"]["bias_std"][:n] = noise.bias_std if core["bias"]["learning"] else config.bias.turn_on_std
     core["last_stamp"] = -MAX_STAMP
     core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
     core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
@@ -125,7 +125,7 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     settings["estimates"] = detector.takes_any
     if not detector.takes_any:
         # What another detector had found of the sensors is taken off no longer.
-        core["estimate"], core["correction"] = 0, 0.0
+        core["sample"]["estimate"], core["correction"] = 0, 0.0
     settings["by_evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
     settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
@@ -134,6 +134,7 @@ def _fill_settings(settings: Any, config: Config, geometry: Geometry, noise: Noi
     n, integrity = geometry.n, config.integrity
     settings["n"] = n
     describe_sensors(settings["sensors"], geometry, noise)
+    settings["largest_noise"] = noise.noise_std.max()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
     settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
     settings["max_drift"] = config.bias.max_drift
@@ -315,7 +316,7 @@ class Pipeline:
             self.detector.reset()
             begin_bias(core)
         if core["now"]["waiting"]:
-            self.detector.prepare(int(core["now"]["input_mask"]))
+            self.detector.prepare(int(core["sample"]["mask"]))
         if core["wanted"]:
             self.integrity.fill(self.subsets, int(core["wanted"]))
             update_level(core, self.subsets)

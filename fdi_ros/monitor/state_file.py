@@ -172,8 +172,8 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
         bias["known"], bias["learning"] = mask_of(map(names.index, state["known"])), False
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
         std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]
-        core["known"]["bias_std"][:n] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
-        core["remaining"][:n] = core["known"]["bias_std"][:n]
+        core["sample"]["bias_std"][:n] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
+        core["remaining"][:n] = core["sample"]["bias_std"][:n]
     if state["errors"] is not None:
         # Known as well as their walk since then leaves them.
         detector, (value, covariance, late) = pipeline.detector, state["errors"].values()
@@ -182,7 +182,7 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
         estimator["late"][: len(late)] = late
         estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count] = value, covariance
         predict(detector.constants[0]["layout"], detector.states["estimator"]["states"][0], age)
-        core["estimate"]["bias"][:n] = value[:n]
+        core["sample"]["estimate"]["bias"][:n] = value[:n]
     decision = core["decision"]
     decision["faulty"] = mask_of(map(names.index, faulty))
     decision["ambiguous"] = decision["voted"] = mask_of(map(names.index, ambiguous))

@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate
 from fdi_ros.core.alignment import restamp
-from fdi_ros.core.records import DelayBuffer, Parity, PathSettings, Sample
-from fdi_ros.core.subsets import compute_joint_weights, eliminate_rate
+from fdi_ros.core.records import DelayBuffer, Parity, PathSettings, Sample, Sensors
+from fdi_ros.core.subsets import fill_joint_parity
 from fdi_ros.estimator.error_states import (
     MAX_STATES,
     ErrorStates,
@@ -64,8 +64,9 @@ class Measured:
         project(self.layout, self.states, self.at)
         known = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
         known[:n, :n] = self.noise + self.at["covariance"][:n, :n]
-        compute_joint_weights(self.parity, n, (1 << n) - 1, known)
-        eliminate_rate(self.parity, n, self.axes, 1e-6)
+        sensors = allocate(Sensors)[0]
+        sensors["n"], sensors["axes"][:n] = n, self.axes
+        fill_joint_parity(self.parity, sensors, (1 << n) - 1, known, 1e-6)
         self.columns = self.at["columns"][:n, : self.count].copy()
         self.information = self.parity["information"][:n, :n].copy()
 
