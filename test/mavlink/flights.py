@@ -129,6 +129,7 @@ class Flight:
             assert units[k].declared is not None, "a healthy one"
             assert self.now - units[k].declared <= 3 * NS, "declared long ago"
             assert all(unit.use is not None for unit in units)
+            assert units[k].use, "out already"
             healthy = {j for j, unit in enumerate(units) if unit.use and unit.delivers and unit.ok}
             # What we have just set to be out may be out, though it was not heard yet.
             assert healthy - {j for j, at in enumerate(self.asked) if not self.wish[j] and self.now - at < 2 * NS} - {k}

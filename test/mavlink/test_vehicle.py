@@ -138,19 +138,6 @@ def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(latency: Cal
     assert talk.vehicle.clock.restarts == 0
 
 
-def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
-    one, other = Autopilot("px4", system=3), Autopilot("ardupilot", system=7, rates={26: 50, 116: 50, 129: 50}, seed=9)
-    talk = Conversation(one, other, system=3).run(6.0)
-    check_flight(talk)
-    assert [*talk.vehicle.others] == [7]
-    assert other.intervals == {26: 20000, 116: 20000, 129: 20000}
-    # The one in use is not changed for the other, even when it falls silent.
-    one.step = lambda now: []
-    samples = len(talk.run(10.0).samples)
-    assert len(talk.run(10.0).samples) == samples
-    assert talk.vehicle.system == 3
-
-
 def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> None:
     one, other = Autopilot("px4", system=3), Autopilot("px4", system=7, seed=9)
     talk = Conversation(one, other, kind="")

@@ -181,17 +181,6 @@ def test_a_sensor_saturates_in_a_hard_manoeuvre():
     assert sum(channel.counts["out of range"] for channel in pipeline.status().channels) == clipped.sum()
 
 
-def test_one_axis_saturates_in_a_manoeuvre_along_it_and_comes_back():
-    pipeline = Pipeline(config(health__max_rate=4.0))
-    t, axes = np.arange(1500) / RATE, pipeline.geometry.axes
-    rate = np.outer(4.8 * np.clip(np.sin(0.8 * t), 0, None), axes[0])
-    z = np.clip(rate @ axes.T + np.random.default_rng(1).normal(0, SIGMA, (1500, 6)), -4, 4)
-    output = pipeline.process(Block(stream(pipeline.geometry, 1500).stamp, z))
-    assert declarations(pipeline, output) == []
-    assert ChannelState.SUSPECT in states_of(pipeline, output, "g1")
-    assert output.state[-1, 0] == ChannelState.OK
-
-
 def test_a_unit_dead_at_start_up_does_not_keep_the_others_from_learning_their_bias():
     pipeline = Pipeline(parallel(3, bias__startup_bias_duration=2.0))
     _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=0 stop=5", size=0.0)
@@ -333,6 +322,7 @@ def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_i
     output = pipeline.process(Block(stream(pipeline.geometry, 4000).stamp, z))
     assert output.valid.all()
     assert Reason.ALL_REPEAT not in {event.reason for event in output.events}
+    assert "frozen" not in str(told(pipeline))
 
 
 @pytest.mark.parametrize("stuck", [False, True])

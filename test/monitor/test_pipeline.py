@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Properties of the whole pipeline: the same for every cut, never a NaN published, honest about what it cannot do."""
+"""Properties of the whole pipeline: the same for every cut, never a NaN published, honest about what it cannot do.
+
+And its decision over time, against a plain account of the same rules over whole windows.
+"""
 
 import itertools
 
@@ -11,7 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, run, seconds, stream
 
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config
+from fdi_ros.core.decision import decide
+from fdi_ros.core.records import Decision, Evidence, PathSettings
+from fdi_ros.core.subsets import is_in, mask_of
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Block
@@ -312,3 +319,83 @@ def test_no_level_vouches_for_a_channel_in_doubt(name, seed):
         assert not output.valid[0] or not fused & in_state[0]
         assert not (fused & in_state[1]) or not np.isfinite(output.level[0]).any()
         assert under_doubt or not output.valid[0] or not fused & in_state[1]
+
+
+N = 5
+SETS = [(), (0,), (1,), (0, 1), (2, 3), (0, 1, 2, 3, 4)]
+ALL = mask_of(range(N))
+
+
+class Decider:
+    """The decision, told of one sample after the other."""
+
+    def __init__(self, alarms, window):
+        self.limits, self.own, self.seen = allocate(PathSettings), allocate(Decision), allocate(Evidence)
+        for name, value in {"n": N, "alarms": alarms, "window": window, "latch": True}.items():
+            self.limits[name] = value
+        self.stamp = 0
+
+    def take(self, members, isolated=False, **more):
+        """Whether a sample whose alarm names these channels changes what is declared."""
+        self.stamp += 1
+        told = {"suspected": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
+        for name in self.seen.dtype.names:
+            self.seen[name] = {**told, "stamp": self.stamp, **more}.get(name, 0)
+        return decide(self.limits[0], self.own[0], self.seen[0])
+
+    def channels(self, name):
+        return {i for i in range(N) if is_in(i, int(self.own[name][0]))}
+
+
+def by_hand(sets, isolated, alarms, window):
+    """First row that declares, and what: ('faulty' | 'ambiguous', channels)."""
+    for row in range(len(sets)):
+        recent = range(max(0, row - window + 1), row + 1)
+        named = [sum(i in sets[k] for k in recent) for i in range(N)]
+        alone = [sum(i in sets[k] and isolated[k] for k in recent) for i in range(N)]
+        half = -(-alarms // 2)
+        faulty = {i for i in range(N) if named[i] >= alarms and alone[i] >= half}
+        often = {i for i in range(N) if named[i] >= half}
+        if not faulty and max(named) >= alarms and len(often) == 1:
+            faulty = often
+        if faulty:
+            return row, "faulty", faulty
+        if max(named) >= alarms:
+            return row, "ambiguous", often
+        if sum(bool(sets[k]) for k in recent) == window:
+            return row, "ambiguous", often or {i for i in range(N) if named[i]}
+    return None
+
+
+@given(
+    data=st.lists(st.tuples(st.sampled_from(SETS), st.booleans()), min_size=1, max_size=40),
+    alarms=st.integers(1, 5),
+    extra=st.integers(0, 5),
+)
+@settings(max_examples=150)
+def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
+    decider, window = Decider(alarms, alarms + extra), alarms + extra
+    expected = by_hand(*zip(*data, strict=True), alarms, window)
+    declares = next((row for row, sample in enumerate(data) if decider.take(*sample)), None)
+    if expected is None:
+        assert declares is None
+    else:
+        row, kind, channels = expected
+        assert (declares, decider.channels(kind)) == (row, channels)
+
+
+def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
+    decider, history = Decider(2, 4), []
+    for members, alone in [((0, 1), False)] * 3 + [((1,), True)] * 3:
+        decider.take(members, isolated=alone)
+        history.append((decider.channels("ambiguous"), decider.channels("faulty")))
+    assert ({0, 1}, set()) in history
+    assert history[-1] == (set(), {1})
+
+
+def test_alarms_held_off_are_suspicion_and_never_a_declaration():
+    decider, changes = Decider(2, 4), []
+    for held in (True, True, True, True, False, False):
+        changes.append(decider.take((1,), isolated=True, held=held))
+        assert decider.channels("suspicion") == {1}
+    assert changes == [False] * 5 + [True]

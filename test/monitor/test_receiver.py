@@ -11,7 +11,7 @@ from monitor.streams import START, config, parallel, run, stream
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MORE, SUPPLY, WORKED
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
@@ -38,8 +38,6 @@ class Ear:
                 self.integrity.append(self.receiver.message(INTEGRITY))
             if flags & HAS_EVENTS:
                 self.events += self.receiver.events
-            if flags & MALFORMED:
-                self.receiver.refused(inlet, data)
             flags = self.receiver.go_on() if flags & MORE else 0
 
     def rates(self):
@@ -90,21 +88,6 @@ def test_arrays_are_stamped_when_they_arrive_even_by_a_clock_set_back():
     assert stamps[22:] == clock[22:]
 
 
-def test_malformed_messages_are_counted_and_named():
-    ear = Ear(Pipeline(parallel(2)))
-    good = ImuTemplate("imu").fill(START, (0.0,) * 3, (0.0,) * 9)
-    wrong = bytearray(good)
-    wrong[8:12] = (10**9).to_bytes(4, "little")
-    for data in (b"", b"\0\1\0\0", good[:100], bytes(wrong)):
-        ear.take(0, data)
-        ear.take(1, good)
-    assert ear.receiver.counts(0)["malformed"] == 4
-    assert ear.receiver.counts(1)["malformed"] == 0
-    assert ear.receiver.counts(1)["duplicate"] == 3
-    assert "1000000000 ns" in ear.receiver.errors[0]
-    assert not ear.receiver.errors[1]
-
-
 @pytest.mark.parametrize("leap", [-0.06, -0.03, 0.004, 0.03, 0.06])
 @pytest.mark.parametrize("motion", [0.0, 1.0])
 def test_a_clock_that_leaps_once_by_less_than_the_timeout_blames_no_other_unit(leap, motion):
@@ -140,15 +123,3 @@ def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     assert len(ear.integrity) >= 99
     assert len(set(thresholds[1:])) == len(names)
     assert pipeline.status().detector in names
-
-
-def test_live_stamps_ahead_of_the_clock_are_refused_and_said():
-    ear = Ear(Pipeline(parallel(2)))
-    for k, (unit, data) in enumerate(messages(stream(ear.receiver.pipeline.geometry, 100), 2)):
-        ear.take(unit, data, START + STEP * (k // 2) - (2_000_000_000 if unit else 0))
-    assert ear.receiver.counts(1)["ahead"] == 100
-    assert ear.receiver.counts(0)["ahead"] == 0
-    assert not ear.receiver.alignment.is_live(1)
-    # A recording has no clock.
-    ear.take(1, ImuTemplate("imu").fill(START + 100 * STEP, (0.0,) * 3, (0.0,) * 9))
-    assert ear.receiver.alignment.is_live(1)

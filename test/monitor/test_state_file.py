@@ -78,16 +78,6 @@ def test_a_restarted_monitor_goes_on_where_it_was(path):
     assert after.status().channels[3].reason == before.status().channels[3].reason == Reason.DISAGREES
 
 
-def test_a_declared_channel_returns_only_after_the_clean_time(path):
-    forgiving = {"decision__latch": False, "decision__clean_time": 0.5}
-    StateFile(path, 60.0).save(flown(**forgiving))
-    after = Pipeline(config(**LEARNING, **forgiving))
-    assert StateFile(path, 60.0).restore(after)
-    output = after.process(rest(after, 200, seed=5))
-    assert (output.state[:50, 3] == ChannelState.FAULTY).all()
-    assert (output.state[60:, 3] == ChannelState.OK).all()
-
-
 def test_written_once_for_each_change(path):
     file, pipeline = StateFile(path, 60.0), Pipeline(config())
     block = struck(rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], NAMES)

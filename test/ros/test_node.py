@@ -100,6 +100,7 @@ def test_no_message_stops_it_and_no_bad_value_reaches_the_output(listener) -> No
         ("imu_2.y", "out of range", 3),
         ("input imu_1", "backward", 2),
         ("input imu_1", "duplicate", 1),
+        ("input imu_1", "ahead", 1),
         ("input imu_2", "malformed", 4),
     ):
         assert wait(lambda name=name, kind=kind, least=least: int(listener.value(name, kind)) >= least), kind

@@ -9,8 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 
 import pytest
@@ -18,12 +16,8 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Vector3
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from ros.harness import TWO_IMUS, Listener, healthy, listening
+from ros.harness import TWO_IMUS, healthy, listening
 from ros.processes import ROOT, parameter_file, running, wait
-from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
@@ -137,77 +131,6 @@ def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
     assert len([line for line in said if "[/red][bold]" in line]) >= 12
 
 
-@contextmanager
-def speaker(listener: Listener, *remaps: str) -> Iterator[Callable[[object], None]]:
-    """Start a node that looks like a monitor, and publishes what a test wants."""
-    node = Node("fdi_node", namespace="/a", cli_args=["--ros-args", *remaps], context=listener.context)
-    node.create_service(Trigger, "~/relearn_bias", lambda _, answer: answer)
-    outputs = {Imu: node.create_publisher(Imu, "fused", 10)}
-    outputs[DiagnosticArray] = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-    try:
-        yield lambda message: outputs[type(message)].publish(message)
-    finally:
-        node.destroy_node()
-
-
-def diagnostics(name: str = "a/fdi_node", level: int = 0, state: str = "OK", said: str = "sound") -> DiagnosticArray:
-    value = KeyValue(key="detector", value="sequential")
-    return DiagnosticArray(
-        status=[
-            DiagnosticStatus(level=bytes([level]), name=f"{name}: monitor", message=said, values=[value]),
-            DiagnosticStatus(name=f"{name}: g1", message="", values=[KeyValue(key="state", value=state)]),
-        ]
-    )
-
-
-def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is_back_elsewhere() -> None:
-    with listening(()) as listener:
-        watcher, executor = Watcher("/a/fdi_node", "fdi_watch_odd"), SingleThreadedExecutor()
-        executor.add_node(watcher)
-        picture, waited = watcher.picture, []
-        # Another one, which publishes on the same topic as long as this test runs.
-        other = listener.create_publisher(DiagnosticArray, "/diagnostics", 10)
-
-        def comes(until: Callable[[], bool], say: Callable[[], None] = lambda: None) -> bool:
-            def look() -> bool:
-                other.publish(diagnostics("b/fdi_node"))
-                say()
-                watcher.look()
-                waited.append(picture.waiting)
-                for _ in range(8):
-                    # More than comes in, or it waits.
-                    executor.spin_once(0.01)
-                return until()
-
-            return wait(look)
-
-        with speaker(listener) as say:
-            assert comes(lambda: picture.whole.message == "sound", lambda: say(diagnostics())), picture.waiting
-            for odd in (diagnostics(state="WELL"), diagnostics(level=9), Imu(angular_velocity=Vector3(x=math.nan))):
-
-                def say_both(odd: object = odd) -> None:
-                    said = (picture.whole.message, picture.channels["g1"].value("state"), picture.rate)
-                    assert said in (("sound", "OK", None), ("after it", "OK", None))
-                    say(odd)
-                    say(diagnostics(said="after it"))
-
-                assert comes(lambda: picture.whole.message == "after it", say_both)
-                assert comes(lambda: picture.whole.message == "sound", lambda: say(diagnostics()))
-            # Killed: DDS keeps it for there, but it says nothing.
-            picture.heard["diagnostics"] -= 10
-            assert comes(lambda: "/a/fdi_node is silent: it was killed or hangs" in picture.waiting)
-        assert comes(lambda: "/a/fdi_node is gone: waiting" in picture.waiting), picture.waiting
-        with speaker(listener, "-r", "fused:=/x/rate", "-r", "/diagnostics:=/x/diagnostics") as say:
-            waited.clear()
-            faulty = partial(say, diagnostics(state="FAULTY"))
-            assert comes(lambda: picture.channels["g1"].value("state") == "FAULTY", faulty)
-            assert not picture.is_silent("diagnostics")
-            # It has only just begun.
-            assert not [words for words in waited if "silent" in words]
-        executor.remove_node(watcher)
-        watcher.destroy_node()
-
-
 def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> None:
     path, file = tmp_path / "said", parameter_file(TWO_IMUS, tmp_path)
     with path.open("w") as out, listening(tuple(f"/drone/{topic}" for topic in TWO_IMUS.topics)) as listener:
@@ -216,7 +139,7 @@ def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> Non
         obeys = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         watch = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=ROOT, preexec_fn=obeys)
         assert wait(lambda: "waiting for a monitor (fdi_node) on ROS_DOMAIN_ID" in path.read_text()), path.read_text()
-        with running("fdi_node", file, "__ns:=/drone", "fused:=rate"):
+        with running("fdi_node", file, "__ns:=/drone", "fused:=rate") as monitor:
             z = healthy(50)[1]
             # The node starts within this time, too.
             assert wait(lambda: listener.play(z) is not None and "6 of 6 channels healthy" in path.read_text(), 240)
@@ -230,7 +153,21 @@ def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> Non
             with pytest.raises(FdiError, match=r"2 monitors are running.*/drone/fdi_node, /other"):
                 wait(watcher.look)
             watcher.destroy_node()
+            # What no monitor says is left aside.
+            odd = listener.create_publisher(DiagnosticArray, "/diagnostics", 10)
+            assert wait(lambda: odd.get_subscription_count() > 1)
+            for state, level in (("WELL", 0), ("OK", 9)):
+                values = [KeyValue(key="state", value=state)]
+                status = DiagnosticStatus(level=bytes([level]), name="drone/fdi_node: imu_1.x", values=values)
+                odd.publish(DiagnosticArray(status=[status]))
+            # One that hangs is missed as one that was killed: DDS keeps both.
+            monitor.popen.send_signal(signal.SIGSTOP)
+            assert wait(lambda: "/drone/fdi_node is silent: it was killed or hangs" in path.read_text())
+            monitor.popen.send_signal(signal.SIGCONT)
         assert wait(lambda: "/drone/fdi_node is gone: waiting for it to come back" in path.read_text())
+        known, z = len(path.read_text()), healthy(50)[1]
+        with running("fdi_node", file, "__ns:=/drone", "/diagnostics:=/x/diagnostics"):
+            assert wait(lambda: listener.play(z) is not None and "6 of 6 channels" in path.read_text()[known:])
         watch.send_signal(signal.SIGINT)
         assert watch.wait(60) == 0
     assert "Traceback" not in path.read_text()
