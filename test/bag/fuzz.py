@@ -244,7 +244,7 @@ def flight_log(draw, stem):
     if kind == "csv":
         path = table(draw, stem.with_name(f"{stem.name}.csv"), made)
     elif kind == "tlog":
-        path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), made)
+        path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), draw.choice((1.0, 5.0)))
     else:
         suffix, write_log = ("bin", logs.write_dataflash) if kind in dataflash else ("ulg", logs.write_ulog)
         path = write_log(stem.with_name(f"{stem.name}.{suffix}"), made, kind, draw.random() < 0.7)

@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from mavlink.autopilots import NS, Autopilot
 
 HEAD = b"\xa3\x95"
 FORMATS = {"b": "i1", "B": "u1", "H": "<u2", "I": "<u4", "E": "<u4", "Q": "<u8", "f": "<f4", "d": "<f8"}
@@ -230,26 +230,27 @@ def _fifo(unit, number):
 
 # Telemetry log ------------------------------------------------------------------------------------------------------
 
+SCALED = {26: 50.0, 116: 50.0, 129: 50.0}
+"""Messages of IMUs and their rates, Hz."""
 
-def write_tlog(path, units):
-    """A log as a ground station writes it of ArduPilot's SCALED_IMU, SCALED_IMU2 and SCALED_IMU3, each 20 ms late."""
-    kinds = (
-        mavlink.MAVLink_scaled_imu_message,
-        mavlink.MAVLink_scaled_imu2_message,
-        mavlink.MAVLink_scaled_imu3_message,
-    )
-    codec, first = mavlink.MAVLink(None, 1, 1), int(units[0].stamp[0])
-    beats = range(first, int(max(unit.stamp[-1] for unit in units)) % 10**8, 1_000_000)
-    records = [(at, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)) for at in beats]
-    for unit, kind in zip(units, kinds, strict=False):
-        rate = np.clip(np.nan_to_num(unit.rate * 1e3), -32768, 32767).astype(int).tolist()
-        force = np.clip(np.nan_to_num(unit.acceleration / 9.80665e-3), -32768, 32767).astype(int).tolist()
-        records += [
-            (stamp, kind(stamp // 1000 % 2**32, *acceleration, *gyro, 0, 0, 0, 0))
-            for stamp, gyro, acceleration in zip(unit.stamp.tolist(), rate, force, strict=True)
-        ]
-    records.sort(key=lambda record: record[0])
-    start = UTC // 1000 - FIX
-    times = [struct.pack(">Q", (start + at + 20_000) % 2**64) for at, _ in records]
-    path.write_bytes(b"".join(t + bytes(m.pack(codec)) for t, (_, m) in zip(times, records, strict=True)))
+
+def telemetry(*autopilots, seconds=6.0, version=2):
+    """What a ground station writes down: each message some ms after it was sent."""
+    out = b""
+    for now in range(0, round(seconds * NS), 1_000_000):
+        for autopilot in autopilots:
+            for data in autopilot.step(now):
+                data = data if version == 2 else as_version_1(autopilot, data)
+                late = 4000 + int(autopilot.random.integers(3000))
+                out += struct.pack(">Q", (UTC + now) // 1000 + late) + data
+    return out
+
+
+def as_version_1(autopilot, data):
+    (message,) = autopilot.inbound.parse_buffer(data)
+    return bytes(message.pack(autopilot.mav, force_mavlink1=True))
+
+
+def write_tlog(path, seconds=20.0):
+    path.write_bytes(telemetry(Autopilot(rates=SCALED), seconds=seconds))
     return path

@@ -5,10 +5,8 @@
 
 import contextlib
 import os
-import signal
 import sqlite3
 import struct
-import threading
 from functools import partial
 
 import pytest
@@ -234,24 +232,13 @@ def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path,
     assert "/gyros: 1200000000 values, not 4 to 12" in out
 
 
-def test_a_query_ends_by_a_signal_and_by_itself(tmp_path):
+def test_a_query_ends_by_itself(tmp_path):
     """A database whose pages point at each other is endless for SQLite; so is, for a moment, a large one."""
     database(tmp_path / "bag.db3", fuzz.PLAIN).close()
-    file, asked = (
-        SqliteFile(tmp_path / "bag.db3", Damage(), 1 << 30),
-        f"SELECT MAX(x) FROM ({fuzz.ENDLESS} SELECT x FROM c)",
-    )
-    file._steps = 1 << 62
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
-        with bounded(5), pytest.raises(KeyboardInterrupt):
-            next(file._query(asked))
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    file = SqliteFile(tmp_path / "bag.db3", Damage(), 1 << 30)
     file._steps = 1 << 20
     with bounded(5), pytest.raises(sqlite3.OperationalError, match="more steps"):
-        next(file._query(asked))
+        next(file._query(f"SELECT MAX(x) FROM ({fuzz.ENDLESS} SELECT x FROM c)"))
     file.close()
 
 
@@ -309,13 +296,7 @@ def test_what_a_file_says_is_shown_and_not_obeyed(fdi, refused, tmp_path):
     assert Config.from_file(made).imus.topics == ("/imu_0", "/imu_1")
 
 
-def test_a_date_in_a_config_is_a_text_and_names_are_names(tmp_path):
-    path = tmp_path / "c.yaml"
-    path.write_text("/**:\n  ros__parameters:\n    sample_rate: 2020-01-01\n")
-    with pytest.raises(ConfigError, match="sample_rate is '2020-01-01', expected a number"):
-        Config.from_file(path)
-    path.write_text("/**:\n  ros__parameters:\n    hardware_id: 2020-13-45\n")
-    assert Config.from_file(path).hardware_id == "2020-13-45"
+def test_names_in_a_config_are_names():
     for topic in ("/a b", "/a//b", "/a/", "/1a", "~a", "/a\n", "a" * 300, "~", "/"):
         with pytest.raises(ConfigError, match="is no ROS name"):
             Config.from_parameters({"input": "channels", "channels.topic": topic})

@@ -9,33 +9,14 @@ import struct
 import numpy as np
 import pytest
 from bag import test_logs as logs
+from bag.logs import SCALED, UTC, telemetry
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink.autopilots import NS, Autopilot
+from mavlink.autopilots import Autopilot
 from pymavlink import mavutil
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.errors import BagError
-
-UTC = 1_790_000_000_000_000
-"""Of the start of a log, us."""
-SCALED = {26: 50.0, 116: 50.0, 129: 50.0}
-
-
-def record(*autopilots, seconds=6.0, latency=4000, version=2):
-    """What a ground station writes down: each message some ms after it was sent."""
-    out = b""
-    for now in range(0, round(seconds * NS), 1_000_000):
-        for autopilot in autopilots:
-            for data in autopilot.step(now):
-                data = data if version == 2 else as_version_1(autopilot, data)
-                out += struct.pack(">Q", UTC + now // 1000 + latency + int(autopilot.random.integers(3000))) + data
-    return out
-
-
-def as_version_1(autopilot, data):
-    (message,) = autopilot.inbound.parse_buffer(data)
-    return bytes(message.pack(autopilot.mav, force_mavlink1=True))
 
 
 def messages(path, topic):
@@ -53,7 +34,7 @@ def written(path, data):
 @pytest.mark.parametrize("stack", ["px4", "ardupilot"])
 def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, version):
     rates = {**SCALED, 27: 10.0, 105: 10.0}
-    path = written(tmp_path / "FLIGHT.TLOG", record(Autopilot(stack, rates=rates), version=version))
+    path = written(tmp_path / "FLIGHT.TLOG", telemetry(Autopilot(stack, rates=rates), version=version))
     with Recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [(f"/imu_{k}", 300) for k in range(3)]
         assert not recording.damage
@@ -76,24 +57,24 @@ def test_of_two_vehicles_the_first_is_read(tmp_path):
     one, other = Autopilot("px4", rates=SCALED, system=5), Autopilot("ardupilot", rates=SCALED, system=9, seed=4)
     alone = Autopilot("px4", rates=SCALED, system=5)
     mixed, alone = (
-        messages(written(tmp_path / "a.tlog", record(*some)), "/imu_1") for some in ((one, other), (alone,))
+        messages(written(tmp_path / "a.tlog", telemetry(*some)), "/imu_1") for some in ((one, other), (alone,))
     )
     assert list(mixed.values()) == list(alone.values())
 
 
 def test_what_has_no_two_imus_is_refused(tmp_path):
     """Ten a second are enough, two are not; nor raw counts, which of autopilots other than ArduPilot are no rates."""
-    path = written(tmp_path / "a.tlog", record(Autopilot(rates=dict.fromkeys(SCALED, 10.0))))
+    path = written(tmp_path / "a.tlog", telemetry(Autopilot(rates=dict.fromkeys(SCALED, 10.0))))
     assert len(messages(path, "/imu_2")) == 60
-    slow = record(Autopilot(rates=dict.fromkeys(SCALED, 2.0)), seconds=20.0)
+    slow = telemetry(Autopilot(rates=dict.fromkeys(SCALED, 2.0)), seconds=20.0)
     one = Autopilot("ardupilot", rates={27: 50.0}, units=1)
-    raw = record(one)
+    raw = telemetry(one)
     beat = bytes(one.mav.heartbeat_encode(2, 4, 0, 0, 4).pack(one.mav))
     for data, words in (
         (slow, r"at 2 Hz; needed: two IMUs .* at 5 Hz or more, .* ArduPilot: SRn_RAW_SENS"),
         (raw, "this autopilot sent one IMU"),
-        (struct.pack(">Q", UTC) + beat + raw, "has no SCALED_IMU"),
-        (record(Autopilot()), "has no SCALED_IMU"),
+        (struct.pack(">Q", UTC // 1000) + beat + raw, "has no SCALED_IMU"),
+        (telemetry(Autopilot()), "has no SCALED_IMU"),
         (b"FMT, 128, 89", "is no log of a ground station"),
     ):
         with pytest.raises(BagError, match=words):
@@ -102,13 +83,13 @@ def test_what_has_no_two_imus_is_refused(tmp_path):
 
 def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path):
     """What its ground stations ask for (RAW_SENS) is RAW_IMU, SCALED_IMU2 and SCALED_IMU3."""
-    path = written(tmp_path / "a.tlog", record(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)))
+    path = written(tmp_path / "a.tlog", telemetry(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)))
     first, second = messages(path, "/imu_0"), messages(path, "/imu_1")
     assert len(first) == len(second) == 300
     assert np.abs(np.array(list(first.values())) - list(second.values())).max() < 0.02
 
 
-LOG = record(Autopilot("px4", rates=SCALED), seconds=3.0)
+LOG = telemetry(Autopilot("px4", rates=SCALED), seconds=3.0)
 
 
 @settings(max_examples=60)

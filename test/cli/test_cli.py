@@ -292,7 +292,7 @@ def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_pat
         ["convert", flight, "--output", tmp_path / "converted"],
         ["inspect", logs.write_dataflash(tmp_path / "log.bin", logs.units())],
         ["inspect", logs.write_ulog(tmp_path / "log.ulg", logs.units())],
-        ["inspect", logs.write_tlog(tmp_path / "log.tlog", logs.units())],
+        ["inspect", logs.write_tlog(tmp_path / "log.tlog")],
     ]
     commands = repr([[str(word) for word in [*words, "--quiet"]] for words in used])
     done = subprocess.run([sys.executable, "-c", NEW_FORMS, commands], capture_output=True, text=True, check=True)

@@ -264,44 +264,6 @@ def test_no_alarm_without_noise(name):
     assert (verdict.statistic < (math.log(501) if name == "sequential" else 1e-6)).all()
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"sequential"}))
-def test_verdict_does_not_depend_on_the_body_rate(name):
-    """Of `sequential` it does: scale errors, which are never known to be zero, show in motion alone."""
-    rng = np.random.default_rng(16)
-    z, _ = stream(rng, usual_geometry(name), 500)
-    z[200:, 1] += LASTING.get(name, 0.0)
-    turned = z + rng.uniform(-3, 3, (500, 3)) @ usual_geometry(name).axes.T
-    still, moved = detector_of(name).detect(z), detector_of(name).detect(turned)
-    np.testing.assert_allclose(moved.statistic, still.statistic, rtol=1e-7, atol=1e-7)
-    clear = np.abs(still.statistic / still.threshold - 1) > 1e-6
-    assert np.array_equal(moved.alarm[clear], still.alarm[clear])
-    assert still.alarm.any()
-    assert (moved.suspects == still.suspects).all(axis=1)[clear].mean() > 0.999
-    np.testing.assert_allclose(moved.error[clear], still.error[clear], atol=1e-9)
-
-
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"recursive"}))
-def test_verdict_does_not_depend_on_the_order_of_channels(name):
-    """`recursive` takes its equations in their order."""
-    rng = np.random.default_rng(19)
-    n = usual_geometry(name).n
-    for geometry in (usual_geometry(name), random_axes(rng, n)):
-        order = rng.permutation(n)
-        z, _ = stream(rng, geometry, 500)
-        z[200:, 1] += LASTING.get(name, 0.0)
-        one = create_detector(name, geometry, CONSTANT).detect(z)
-        units = [geometry.unit_of[i] for i in order]
-        other = create_detector(name, Geometry(geometry.axes[order], units=units), CONSTANT).detect(z[:, order])
-        np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-7, atol=1e-9)
-        assert np.array_equal(other.alarm, one.alarm)
-        assert one.alarm.any()
-        # On lopsided axes suspects may rest on trials; of several sums at their limit `cusum` takes the first.
-        if geometry.isolable.all() and name != "cusum":
-            assert np.array_equal(other.suspects, one.suspects[:, order])
-            assert np.array_equal(other.isolated, one.isolated)
-            np.testing.assert_allclose(other.error, one.error[:, order], atol=1e-12)
-
-
 def unequal(seed, n):
     """Random axes, channels of unequal noise."""
     rng = np.random.default_rng(seed)

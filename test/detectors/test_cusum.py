@@ -93,16 +93,12 @@ def test_what_a_start_up_average_leaves_is_no_drift():
     geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
     noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
     # A small shift has a small k: this is where the bias adds up.
-    aware, unaware = (Cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
-    usual, found = Cusum(geometry, noise), 0
+    slow, usual = Cusum(geometry, noise, shift=0.1), Cusum(geometry, noise)
     for _ in range(12):
         z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
-        for detector in (aware, usual, unaware):
+        for detector in (slow, usual):
             detector.reset()
-        assert not aware.detect(z).alarm.any()
-        assert not usual.detect(z).alarm.any()
-        found += bool(unaware.detect(z).alarm.any())
-    assert found >= 6
+            assert not detector.detect(z).alarm.any()
     usual.reset()
     drifting = usual.detect(z + 0.003 * np.eye(6)[2])
     assert drifting.isolated[-1]

@@ -122,21 +122,6 @@ def test_scores_are_j_by_its_definition(n, construction):
     np.testing.assert_allclose(verdict.error[rows, named[rows]], kappa[rows, named[rows]], rtol=1e-9)
 
 
-@pytest.mark.parametrize("n", [5, 6, 7, 9])
-def test_names_the_likelihood_ratio_choice(n):
-    rng = np.random.default_rng(n)
-    for _ in range(20):
-        geometry = random_axes(rng, n)
-        z = noisy(rng, geometry, 200)
-        one, other = Projector(geometry, UNIT).detect(z), create_detector("likelihood_ratio", geometry, UNIT).detect(z)
-        second, largest = np.sort(other.scores, axis=1)[:, -2:].T
-        clear = largest - second > 1e-9
-        assert np.array_equal(one.scores.argmin(axis=1)[clear], other.scores.argmax(axis=1)[clear])
-        np.testing.assert_allclose(one.statistic, other.statistic, rtol=1e-9)
-        np.testing.assert_allclose(one.threshold, other.threshold, rtol=1e-9)
-        assert np.array_equal(one.alarm, other.alarm)
-
-
 @pytest.mark.parametrize("n", [4, 5, 6, 7])
 def test_least_one_norm_equals_a_linear_programme(n):
     rng = np.random.default_rng(n)

@@ -61,16 +61,6 @@ def after(size, rows):
 fresh, measured, rested = partial(after, 1.0, 0), partial(after, 1.0, 4000), partial(after, 0.2, 20_000)
 
 
-def test_sums_are_no_more_than_the_number_of_samples_in_the_mean():
-    """What makes the run length exact: their mean less the number of samples never tends upward."""
-    detector, sums = sequential(run_length=1e15), []
-    for k in range(400):
-        detector.reset()
-        sums.append(math.expm1(detector.detect(white(k, 100)).statistic[-1]))
-    assert np.mean(sums) < 100 + 3 * np.std(sums) / 20
-    assert np.median(sums) > 1
-
-
 @pytest.mark.parametrize(
     ("geometry", "noise"),
     [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
@@ -196,27 +186,13 @@ def stamped(seconds, z):
     return Block(START + (seconds * 1e9).astype(np.int64), z)
 
 
-def flown(fault, seed, **changes):
-    """Three parallel triads at rest in the monitor, after ten seconds with a bias of so many noise_std on imu_2.y."""
-    pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
-    z = SIGMA * white(seed, 2500, 9)
-    z[1000:, 4] += fault * SIGMA
-    return pipeline, pipeline.process(stamped(np.arange(2500) / RATE, z))
-
-
-@pytest.mark.parametrize(("rule", "after"), [("evidence", 0), ("votes", 19)])
-def test_an_alarm_declares_at_once_or_after_as_many_votes_as_asked_for(rule, after):
-    changes = {"decision__rule": rule, "decision__confirm_alarms": 20, "decision__confirm_window": 20}
-    pipeline, output = flown(50.0, 20, **changes)
-    assert [name for name, state in declarations(pipeline, output) if state == "FAULTY"] == ["imu_2.y"]
-    declared = np.isin(output.state, (ChannelState.AMBIGUOUS, ChannelState.FAULTY)).any(axis=1)
-    assert int(declared.argmax()) == int(output.alarm.argmax()) + after < 1040
-
-
 def test_an_undecided_set_leaves_the_culprit_as_evidence_grows():
-    sizes = []
+    """Three parallel triads at rest in the monitor, after ten seconds with a bias of four noise_std on imu_2.y."""
+    settings, sizes = parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0), []
     for seed in range(8):
-        pipeline, output = flown(4.0, seed)
+        pipeline, z = Pipeline(settings), SIGMA * white(seed, 2500, 9)
+        z[1000:, 4] += 4.0 * SIGMA
+        output = pipeline.process(stamped(np.arange(2500) / RATE, z))
         sizes += [(output.state == ChannelState.AMBIGUOUS).sum(axis=1).max()]
         assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
         assert output.state[-1].tolist() == [ChannelState.FAULTY * (i == 4) for i in range(9)]
@@ -302,29 +278,14 @@ def test_after_a_reset_a_clock_that_was_set_is_followed(offset):
     assert status.delay_std[1] < 0.001
 
 
-def judged_with_biases(axes, faults, seed):
-    """The output on biases from 12 s on, whether the level covers the error a second later, and the level then."""
-    seconds = np.arange(3000) / RATE
-    rate = swing(seconds) * (seconds > 5.0)[:, None]
-    z = rate @ axes.T + SIGMA * white(seed, 3000, len(axes))
-    for channel, bias in faults.items():
-        z[1200:, channel] += bias
-    output = Pipeline(mounted(axes, bias__startup_bias_duration=4.0)).process(stamped(seconds, z))
-    return output, (np.abs(output.rate - rate) <= output.level)[1301:].all(), output.level[1301:]
-
-
 @pytest.mark.parametrize("size", [0.03, 0.3])
 def test_the_level_covers_a_pair_that_has_the_third_named(size):
-    """Two of three parallel gyros that are wrong alike, as parity must see it."""
-    output, covered, level = judged_with_biases(np.tile(np.eye(3), (3, 1)), {0: size, 3: size}, 1)
+    """Two of three parallel gyros that are wrong alike from 12 s on, as parity must see it."""
+    axes, seconds = np.tile(np.eye(3), (3, 1)), np.arange(3000) / RATE
+    rate = swing(seconds) * (seconds > 5.0)[:, None]
+    z = rate @ axes.T + SIGMA * white(1, 3000, 9)
+    z[1200:, [0, 3]] += size
+    output = Pipeline(mounted(axes, bias__startup_bias_duration=4.0)).process(stamped(seconds, z))
     assert [event.channel for event in output.events if event.after is ChannelState.FAULTY] == [6]
-    assert covered
-    assert size < level[:, 0].max() < size + 0.1
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_what_no_others_explain_leaves_the_level_alone(seed):
-    """On the cone no one or two channels look like a large fault of another; what is left is checked by fewer."""
-    output, covered, level = judged_with_biases(CONE.axes, {0: 0.5}, seed)
-    assert covered
-    assert np.median(level) < 3.0 * np.median(output.level[900:1200])
+    assert (np.abs(output.rate - rate) <= output.level)[1301:].all()
+    assert size < output.level[1301:, 0].max() < size + 0.1
