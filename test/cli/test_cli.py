@@ -6,7 +6,6 @@
 import csv
 import io
 import json
-import logging
 import os
 import re
 import shlex
@@ -168,16 +167,6 @@ def test_a_sample_rate_that_is_far_from_the_recordings_is_refused_and_a_near_one
         assert f"{said}: set sample_rate to 100" in refused(words[0], flight, "--config", wrong, *words[1:])
 
 
-def test_a_sound_flight_and_quiet_say_nothing(fdi, replay):
-    words = ("--end", 1, "--check", "judged>=0 unchecked<=6")
-    assert "sample_rate" not in replay(*words).out
-    assert replay(*words, "--quiet") == (0, "", "")
-    # A word on compiling is none for who asked for quiet.
-    assert not logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
-    assert fdi("shipped").code == 0
-    assert logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
-
-
 COMPLETED = {
     "fdi replay --che": "--check",
     "fdi insp": "inspect",
@@ -209,9 +198,7 @@ def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
     first, _, rest = out.partition("then:")
     for name in command_line.FIRST:
         assert command_line.VERBS[name].examples[0] in first
-        assert f"  {name} " not in rest
-    assert all(f"  {name} " in rest for name in command_line.VERBS.keys() - set(command_line.FIRST))
-    assert "for bash, zsh, tcsh or fish" in " ".join(out.split())
+    assert all((f"  {name} " in rest) != (name in command_line.FIRST) for name in command_line.VERBS)
     for words, code, begin in (
         (["--help"], 0, "usage: fdi VERB"),
         (["--version"], 0, "fdi_ros "),
@@ -331,9 +318,7 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
         (f"{REPLAY} --detector magic", "unknown detector 'magic', expected one of"),
-        (f"{REPLAY} --fault 'channel=g9 kind=bias size=1'", "unknown channel 'g9'"),
         (f"{REPLAY} --fault kind=bias", "fault needs channel"),
-        (f"{REPLAY} --scenario none.yaml", "cannot read scenario none.yaml"),
         (f"{REPLAY} --start 9 --end 3", "expected 0 <= start < end"),
         (f"{REPLAY} --start 900", "has no usable message"),
         (f"{REPLAY} --json none/s.json", "there is no folder"),
@@ -481,7 +466,6 @@ REPLACED = [
     *((f"REPLAY --output {name}", "which is read") for name in ("FLIGHT", "FLIGHT/metadata.yaml", "FLIGHT/..")),
     ("geometry CONFIG --report CONFIG --force", "which is read"),
     ("montecarlo STUDY --json STUDY --force", "which is read"),
-    ("montecarlo STUDY --report no/r.html", "there is no folder"),
     ("montecarlo STUDY --json CONFIG", "exists already"),
     ("replay broken.mcap --config CONFIG --output bag --csv s.csv --json s.json", "broken.mcap"),
     ("geometry CONFIG --json CONFIG --force", ""),
@@ -547,31 +531,17 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_sees_a_bar_that_is_wiped_in_the_end():
-    with progress(stream := Terminal(), False) as show:
-        show(0.25)
-        time.sleep(0.11)
-        show(0.5)
-    assert " 50 %|" in stream.getvalue()
-    assert stream.getvalue().endswith(" \r")
-    # What has no share done says what it is and for how long.
-    with progress(timed := Terminal(), False, "fitting", timed=True):
-        pass
-    assert "fitting, 00:00" in timed.getvalue()
-    assert "\n" not in stream.getvalue() + timed.getvalue()
-
-
-def test_where_there_is_no_terminal_a_line_says_now_and_then_how_much_is_done(monkeypatch):
-    with progress(short := io.StringIO(), False, timed=True) as show:
-        show(0.5)
+def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_then(monkeypatch):
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
-    with progress(stream := io.StringIO(), False, "power") as show:
-        show(0.25)
-        while "25%" not in stream.getvalue():
-            time.sleep(0.01)
-    assert re.search(r"^fdi: power: 25% done, about 0 s left after 0 s$", stream.getvalue(), re.MULTILINE)
-    for quiet in (io.StringIO(), Terminal()):
-        with progress(quiet, True) as show:
-            show(0.25)
-            time.sleep(0.1)
-        assert quiet.getvalue() == short.getvalue() == ""
+    for stream, said in (
+        (Terminal(), r" 50 %\|.* \r$"),
+        (io.StringIO(), r"(?m)^fdi: power: 50% done, about 0 s left after 0 s$"),
+    ):
+        for quiet in (True, False):
+            with progress(stream, quiet, "power") as show:
+                show(0.25)
+                time.sleep(0.11)
+                show(0.5)
+                time.sleep(0.11)
+            assert bool(re.search(said, stream.getvalue())) != quiet
+            assert not quiet or stream.getvalue() == ""

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 import pytest
-from faults.examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from replay.summaries import examples
 
 from fdi_ros.config.settings import REQUIRED
 from fdi_ros.errors import FaultError

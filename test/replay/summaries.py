@@ -1,13 +1,28 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What comes of replays, for the tests."""
+"""What replays are given and what comes of them, for the tests: every kind of fault once, outputs, summaries."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from fdi_ros.faults.fault import load_scenario
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
+
+SCENARIO = Path(__file__).parents[2] / "config" / "scenarios" / "every_kind.yaml"
+"""Every kind of fault once."""
+
+
+def examples(channel, unit, start, stop):
+    """A fault of each kind by its name; kinds that strike a whole unit strike that one."""
+    return {
+        fault.kind.name: replace(fault, channel=unit if fault.kind.whole_unit else channel, start=start, stop=stop)
+        for fault in load_scenario(SCENARIO)
+    }
 
 
 class Keep(Sink):

@@ -231,9 +231,7 @@ RATE = np.sin(TIME)
     ("error", "course", "size"),
     [
         (0.1 + CHANCE, "steady", 0.1),
-        (-0.1 + CHANCE, "steady", -0.1),
         (0.02 + 0.01 * TIME + CHANCE, "growing", 0.025),
-        (-0.02 - 0.01 * TIME + CHANCE, "growing", -0.025),
         (0.3 - 0.01 * TIME + CHANCE, "shrinking", 0.295),
         (0.05 * RATE + CHANCE, "proportional", 0.037),
         (20 * CHANCE, "noisy", 0.2),
@@ -306,7 +304,6 @@ WHOSE = {
     "a set, then named": (FAULT, [*PAIR, NAMED], (12, 18, ("g2", "g4")), []),
     "too early": (FAULT, [event(9, 1, S.FAULTY)], UNSEEN, [("g2", 9)]),
     "too late": (FAULT, [event(22, 1, S.FAULTY)], UNSEEN, [("g2", 22)]),
-    "another channel": (FAULT, [event(12, 4, S.FAULTY)], UNSEEN, [("g5", 12)]),
     "another channel, whatever set stands with it": (FAULT, [event(11, 4, S.FAULTY, (1, 4))], UNSEEN, [("g5", 11)]),
     "named later for other reasons is not merged": (
         FAULT.replace("stop=20", ""),

@@ -5,16 +5,13 @@
 
 import math
 import re
-from dataclasses import astuple
 
 import numpy as np
 import pytest
 from bag import recordings
 from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
-from faults.examples import SCENARIO, examples
-from replay.summaries import Keep
+from replay.summaries import Keep, examples
 
-from fdi_ros.bag import samples as samples_module
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.core.decision import ChannelState
@@ -94,28 +91,6 @@ def test_the_error_without_a_monitor_is_that_of_least_squares(told, root):
     assert rms.without_monitor == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
     assert rms.after_detection < 0.05 * rms.without_monitor
     assert rms.before_detection < rms.without_monitor
-
-
-def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
-    z = np.full((60, 6), 0.1)
-    z[20:30, [0, 3]] = 2.0
-    config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
-    fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
-    effect = replay(written(tmp_path, z, apart=0), config, (fault,)).scores.fault_effect_rad_s
-    column = build_geometry(config).least_squares[:, :2].sum(axis=1)
-    assert effect.without_monitor == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
-    assert max(value or 0.0 for value in astuple(effect)) < 0.2
-
-
-def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
-    config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
-    results = []
-    for together in (50, 777, 16384):
-        monkeypatch.setattr(samples_module, "_TOGETHER", together)
-        keep = Keep()
-        scores = replay(flight, config, load_scenario(SCENARIO), sinks=[keep]).scores
-        results.append((scores.events, scores.faults, scores.declared, keep.output.rate.tobytes()))
-    assert results[0] == results[1] == results[2]
 
 
 @pytest.mark.parametrize(("file", "channel"), [("two_triads.yaml", "g2"), ("two_imus.yaml", "imu_1.y")])

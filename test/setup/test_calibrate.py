@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from vehicles import KINDS, NOISE, vehicle
 
 from fdi_ros.bag.samples import read_block
@@ -21,7 +19,6 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.estimate import NormalEquations, find_random_walk, smooth
 from fdi_ros.setup.report import calibration_findings
 from fdi_ros.setup.starting_config import Role, lines_of
 
@@ -49,16 +46,19 @@ def seconds(block):
 @pytest.mark.parametrize("kind", KINDS)
 def test_stated_errors_are_the_actual_ones(kind):
     # Some hundred figures of each; `benchmark/estimator.py calibration` has many vehicles.
-    axes, biases, delays = [], [], []
+    axes, biases, delays, noise = [], [], [], []
     for seed, units in ((0, 3), (1, 2), (2, 3)):
         one, result = made(seed, kind, units)
         axes.append(((result.axes - one.axes) / result.axes_std).ravel())
         biases.append((result.estimate.bias - one.bias) / result.bias_std)
         late, std = result.estimate.delay[::3], result.estimate.delay_std[::3]
         delays.append(((late - one.late) / np.maximum(std, 1e-9))[1:])
+        noise.append(result.settings["noise.noise_std"])
     assert 0.7 < np.sqrt(np.mean(np.concatenate(axes) ** 2)) < 1.3
     assert 0.5 < np.sqrt(np.mean(np.concatenate(biases) ** 2)) < 1.5
     assert np.abs(np.concatenate(delays)).max() < 4.5
+    # No motion is put into the noise, whatever part of a sample a unit is late by.
+    assert all(max(one) < 1.15 * min(one) for one in noise)
 
 
 def slow_units(block):
@@ -86,15 +86,6 @@ def test_any_recording_gives_settings_with_errors_as_stated(kind, rate, change):
     assert np.abs((result.estimate.delay[::3] - one.late)[1:] / result.estimate.delay_std[3::3]).max() < 4.0
     assert result.estimate.delay_std.max() < (1e-3 if rate > 10.0 else 2e-3)
     assert result.scale[0] < (2e-3 if rate > 10.0 else 3e-3)
-
-
-@pytest.mark.parametrize("kind", KINDS[:2])
-def test_vibration_is_no_noise_scale_or_timing_error(kind):
-    _, result = made(0, kind)
-    np.testing.assert_allclose(result.estimate.floor.std, NOISE, rtol=0.1)
-    assert result.scale[0] < 1e-3
-    assert result.timing < 2e-4
-    assert result.settings["imus.delays"] == [pytest.approx(d, abs=5e-4) for d in made(0, kind)[0].late]
     assert not result.faults
 
 
@@ -199,13 +190,6 @@ def test_contradictions_are_refused_and_named():
     assert len(result.settings["geometry.axes"]) == 27
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_delays_put_no_motion_into_the_noise(seed):
-    """All channels are alike, whatever part of a sample their unit is late by."""
-    noise = made(seed, "flight alone")[1].settings["noise.noise_std"]
-    assert max(noise) < 1.15 * min(noise)
-
-
 def test_the_monitor_waits_for_units_that_are_late():
     one, late = hand(), hand().block.z.copy()
     late[:, 3:6] = np.roll(late[:, 3:6], 9, axis=0)
@@ -278,47 +262,3 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     assert "mine.yaml is no result of fdi" in refused(*words, "--output", mine, "--force")
     check_target(output, Kind.PARAMETERS, force=True)
     check_target(report, Kind.PAGE, force=True)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10**6), st.integers(2, 8), st.integers(1, 3), st.integers(1, 4), st.floats(0.05, 3.0))
-def test_the_smoother_solves_all_windows_written_into_one_large_system(seed, windows, n, m, walk):
-    rng, size = np.random.default_rng(seed), windows * n + m
-    rows, y = rng.standard_normal((windows, n + m + 2, n + m)), rng.standard_normal((windows, n + m + 2))
-    normal, rights = np.einsum("kai,kaj->kij", rows, rows), np.einsum("kai,ka->ki", rows, y)
-    apart, start = rng.uniform(0.5, 2.0, windows), rng.standard_normal(n + m)
-    prior = np.concatenate([np.full(n, rng.uniform(0.5, 2.0)), rng.uniform(0.5, 2.0, m)])
-    whole, right, constants = np.zeros((size, size)), np.zeros(size), np.arange(windows * n, size)
-    for k in range(windows):
-        own = np.concatenate([np.arange(k * n, k * n + n), constants])
-        whole[np.ix_(own, own)] += normal[k]
-        right[own] += rights[k]
-    first = np.concatenate([np.arange(n), constants])
-    whole[first, first] += prior**-2
-    right[first] += prior**-2 * start
-    for k in range(windows - 1):
-        here, then, weight = np.arange(k * n, k * n + n), np.arange(k * n + n, k * n + 2 * n), 1 / walk**2 / apart[k]
-        for a, b, sign in ((here, here, 1), (then, then, 1), (here, then, -1), (then, here, -1)):
-            whole[a, b] += sign * weight
-    covariance = np.linalg.inv(whole)
-    x, found = covariance @ right, smooth(NormalEquations(n, normal, rights, apart, prior, start), walk)
-    mean = np.hstack([np.kron(np.ones((1, windows)), np.eye(n)) / windows, np.zeros((n, m))])
-    np.testing.assert_allclose(found.curve.ravel(), x[: windows * n], atol=1e-9)
-    np.testing.assert_allclose(found.constant, x[windows * n :], atol=1e-9)
-    np.testing.assert_allclose(found.constant_covariance, covariance[np.ix_(constants, constants)], atol=1e-9)
-    np.testing.assert_allclose(found.mean_covariance, mean @ covariance @ mean.T, atol=1e-9)
-
-
-def test_the_walk_is_found_where_there_is_one():
-    rng, windows, walk, noise = np.random.default_rng(3), 300, 5e-4, 1e-3
-    for true in (walk, 0.0):
-        bias = np.cumsum(true * rng.standard_normal((windows, 3)), axis=0)
-        normal = np.tile(np.diag([noise**-2.0] * 3 + [1e-9]), (windows, 1, 1))
-        right = np.hstack([(bias + noise * rng.standard_normal((windows, 3))) / noise**2, np.zeros((windows, 1))])
-        prior = np.array([0.02] * 3 + [1.0])
-        found = find_random_walk(NormalEquations(3, normal, right, np.ones(windows), prior, np.zeros(4)))
-        if true:
-            assert 0.6 < found.value / true < 1.6
-        else:
-            assert found.value == 0.0
-            assert found.possible < 1e-4

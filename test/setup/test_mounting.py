@@ -16,7 +16,7 @@ from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel, assumption_words, coincidences, smallest_detectable, summary_line
-from fdi_ros.setup.mounting import VIBRATION, WAITS, assess, loss, mounting_text, pair_lines, smallest_shift
+from fdi_ros.setup.mounting import VIBRATION, WAITS, assess, loss, mounting_text, pair_lines
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -52,12 +52,6 @@ def test_smallest_error_is_seen_99_times_in_100(geometry):
         z[:, channel] += smallest[channel]
         # Five standard errors of 20000 draws at 0.99; another channel may pass the threshold where its own does not.
         assert 0.9865 < detector.detect(z).alarm.mean() < 0.9955
-
-
-@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
-def test_smallest_shift_is_the_one_that_the_tuned_cusum_finds_in_that_time(shift):
-    # The integral equation of Page against the closed form, which is good while a delay is of several samples.
-    assert smallest_shift(moustakides_delay(shift, 1e5), 1e5) == pytest.approx(shift, rel=0.02)
 
 
 def test_an_error_as_large_as_stated_is_found_in_the_time_stated():

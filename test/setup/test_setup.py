@@ -94,17 +94,7 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     assert config.imus.delays[1] == pytest.approx(0.0002, abs=2e-4)
     page = (tmp_path / "cone.html").read_text()
     assert f"<li class=good>{out.splitlines()[0]}</li>" in page
-    for title in (
-        "Not shown by this recording",
-        "Spectrum of the differences",
-        "Warnings",
-        "Proof",
-        "What to do next",
-        "Noise over time",
-        "Mounts",
-        "The config",
-    ):
-        assert f"<h2>{title}</h2>" in page
+    assert "<h2>Proof</h2>" in page
     assert "geometry:" in page
     assert re.match(r"USABLE: .* biases of 1.72 to 17.2 deg/s isolated on the last 15 s, kept aside", out)
     assert "noise, deg/s" in page
