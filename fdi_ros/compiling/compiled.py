@@ -32,6 +32,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 import typing
 import warnings
 from collections.abc import Callable, Iterator
@@ -233,6 +234,15 @@ def address_of(rows: NDArray[Any]) -> int:
     if INTERPRETED:
         _by_address[rows.ctypes.data] = rows
     return int(rows.ctypes.data)
+
+
+@contextlib.contextmanager
+def reported(what: str) -> Iterator[None]:
+    """Log one line with the duration if anything is compiled within, and not just loaded."""
+    begun, before = time.perf_counter(), compilations()
+    yield
+    if compilations() > before:
+        LOG.warning("compiled %s in %.1f s, once on this machine", what, time.perf_counter() - begun)
 
 
 def compilations() -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate
+from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.config.config import PARAMETERS, Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits, restart_bias
@@ -332,8 +332,9 @@ class Pipeline:
             raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
-            detector = build_detector(config, self.geometry, self.noise)
-            _ = detector.bank
+            with reported(f"the sample path and {config.detector.name}"):
+                detector = build_detector(config, self.geometry, self.noise)
+                _ = detector.bank
         else:
             detector = self.detector
         if before is None or alarm_probability(config) != alarm_probability(before):

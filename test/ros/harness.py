@@ -17,6 +17,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from monitor.streams import swing as body_rate
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -222,13 +223,22 @@ def listening(topics=(), kind=Imu) -> Iterator[Listener]:
     listener = Listener(topics, kind)
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
-    thread = threading.Thread(target=executor.spin, daemon=True)
+    ended = threading.Event()
+
+    def spin() -> None:
+        while not ended.is_set():
+            # What the test destroys while it is waited for ends the waiting, not the listener.
+            with contextlib.suppress(InvalidHandle):
+                executor.spin_once(0.2)
+
+    thread = threading.Thread(target=spin, daemon=True)
     thread.start()
     try:
         yield listener
     finally:
-        executor.shutdown()
+        ended.set()
         thread.join()
+        executor.shutdown()
         listener.destroy_node()
 
 
