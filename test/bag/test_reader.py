@@ -111,13 +111,6 @@ def with_an_empty_file(path, z):
     (path / "bag_9.mcap").write_bytes(b"")
 
 
-def overwritten(path, z):
-    data, page = bytearray((path / "bag.db3").read_bytes()), 4096
-    middle = len(data) // 2 // page * page
-    data[middle : middle + 20 * page] = b"\xff" * (20 * page)
-    (path / "bag.db3").write_bytes(data)
-
-
 @pytest.mark.parametrize(
     ("make", "damage", "least", "most", "words"),
     [
@@ -126,7 +119,6 @@ def overwritten(path, z):
         ("plain chunks", with_a_flipped_bit, 240, 299, "fails its checksum and was left out"),
         # After the gap the aligner wants to see a second message before it believes the first.
         ("three mcap files", with_an_empty_file, 198, 200, "bag_9.mcap is empty"),
-        ("rosbag2 sqlite3", overwritten, 1, 299, "it is damaged"),
     ],
 )
 def test_what_is_damaged_is_left_out_and_said(make, damage, least, most, words, tmp_path):

@@ -11,7 +11,6 @@ import shutil
 import stat
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import numba
 import pytest
 
 from fdi_ros.compiling.compiled import _Kept
-from fdi_ros.compiling.notice import WORDS, announced, clock, compiling_seconds, refused
+from fdi_ros.compiling.notice import WORDS, announced, refused
 from fdi_ros.errors import FdiError
 
 SCRIPT = """
@@ -266,14 +265,6 @@ def test_compiling_is_announced_before_or_refused(said):
         two(1)
     assert two(1) == 2
     assert said.messages == [WORDS]
-
-
-def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled():
-    wall, own, compiled = time.perf_counter(), clock(), compiling_seconds()
-    new_function()(1)
-    spent = compiling_seconds() - compiled
-    assert spent > 0
-    assert clock() - own <= time.perf_counter() - wall - spent
 
 
 def test_a_verb_says_it_before_its_result(tmp_path, root, flight):

@@ -159,20 +159,8 @@ def test_both_channels_of_an_axis_struck_leave_it_without_bounds():
     assert np.isfinite(verdict.error).all()
 
 
-SIX = Geometry.two_triad_cone()
-
-
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (lambda: Guaranteed(SIX, NoiseModel(1.0)), "needs noise.bound"),
-        (lambda: guaranteed(Geometry.cone(5), max_faults=2), "max_faults is 2 with 5 channels, expected at most 1"),
-        (lambda: guaranteed(Geometry.cone(4), max_faults=1), "max_faults is 1 with 4 channels, expected at most 0"),
-        (lambda: guaranteed(SIX).culprits(np.zeros(6)), "z has shape (6,), expected (N, 6)"),
-    ],
-)
-def test_refused(build, words):
-    with pytest.raises(FdiError) as caught:
-        build()
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
+def test_without_a_bound_and_with_too_many_faults_it_is_refused():
+    with pytest.raises(FdiError, match=r"needs noise.bound"):
+        Guaranteed(Geometry.two_triad_cone(), NoiseModel(1.0))
+    with pytest.raises(FdiError, match="max_faults is 2 with 5 channels, expected at most 1"):
+        guaranteed(Geometry.cone(5), max_faults=2)

@@ -162,13 +162,6 @@ def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
         assert not measured().detect(growth * white(seed, 600)).isolated.any()
 
 
-def test_nothing_is_found_in_streams_without_noise():
-    """Not even in the rounding of single precision, after a long time of none."""
-    rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
-    z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
-    assert sequential(noise=NoiseModel(1e-3)).detect(z).statistic.max() < 4.0
-
-
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
 def test_any_axes_without_alarm_for_20_s(seed, n):
