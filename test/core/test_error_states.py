@@ -49,35 +49,68 @@ def estimator(n, units):
     return layout, states
 
 
+class Measured:
+    """States of n channels, three a unit, 3 s after their start and before a sample in motion."""
+
+    def __init__(self, seed, n):
+        self.rng, self.axes, self.noise = random_channels(seed, n)
+        self.layout, self.states = estimator(n, n // 3)
+        predict(self.layout, self.states, 3.0)
+        self.n, self.count = n, int(self.layout["count"])
+        self.x, self.p = self.x_and_p()
+        self.at, self.parity, sensors = (allocate(one)[0] for one in (Projection, Parity, Sensors))
+        self.rate = self.rng.normal(0, 1, 3)
+        fill_signals(self.layout, self.rate, self.rng.normal(0, 5, MAX_CHANNELS), self.at["signals"])
+        project(self.layout, self.states, self.at)
+        known = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
+        known[:n, :n] = self.noise + self.at["covariance"][:n, :n]
+        sensors["n"], sensors["axes"][:n] = n, self.axes
+        fill_joint_parity(self.parity, sensors, (1 << n) - 1, known, 1e-6)
+        self.columns = self.at["columns"][:n, : self.count].copy()
+        self.information = self.parity["information"][:n, :n].copy()
+
+    def x_and_p(self):
+        return self.states["x"][: self.count].copy(), self.states["p"][: self.count, : self.count].copy()
+
+    def after(self, innovation, least):
+        innovation = np.pad(innovation, (0, MAX_CHANNELS - len(innovation)))
+        update(self.layout, self.states, self.at, self.parity["information"], innovation, 1.0, least)
+        return self.x_and_p()
+
+
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9]))
 def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed, n):
     """The joint filter of states and rate, with a prior of the rate as wide as that of the elimination."""
-    rng, axes, noise = random_channels(seed, n)
-    layout, states = estimator(n, n // 3)
-    predict(layout, states, 3.0)
-    count, rate = int(layout["count"]), rng.normal(0, 1, 3)
-    x, p = states["x"][:count].copy(), states["p"][:count, :count].copy()
-    at, parity, sensors = (allocate(one)[0] for one in (Projection, Parity, Sensors))
-    fill_signals(layout, rate, rng.normal(0, 5, MAX_CHANNELS), at["signals"])
-    project(layout, states, at)
-    matrix = np.zeros((n, count))
-    for i, k in np.argwhere(layout["place"][:n] >= 0):
-        matrix[i, layout["place"][i, k]] = at["signals"][i, k]
-    np.testing.assert_allclose(at["covariance"][:n, :n], matrix @ p @ matrix.T, rtol=1e-9, atol=1e-15)
-    known = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
-    known[:n, :n] = noise + at["covariance"][:n, :n]
-    sensors["n"], sensors["axes"][:n] = n, axes
-    fill_joint_parity(parity, sensors, (1 << n) - 1, known, 1e-6)
-    y, innovation = axes @ rate + rng.normal(0, 0.01, n), np.zeros(MAX_CHANNELS)
-    subtract_errors(layout, states, at["signals"], np.pad(y, (0, MAX_CHANNELS - n)), innovation)
-    update(layout, states, at, parity["information"], innovation, 1.0, np.zeros(MAX_STATES))
-    joint = np.block([[p, np.zeros((count, 3))], [np.zeros((3, count)), 1e6 * np.eye(3)]])
-    both = np.hstack([matrix, axes])
-    gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + noise)
-    expected = (np.pad(x, (0, 3)) + gain @ (y - matrix @ x))[:count]
-    np.testing.assert_allclose(states["x"][:count], expected, atol=1e-7)
-    np.testing.assert_allclose(states["p"][:count, :count], (joint - gain @ both @ joint)[:count, :count], atol=1e-9)
+    one = Measured(seed, n)
+    matrix = np.zeros((n, one.count))
+    for i, k in np.argwhere(one.layout["place"][:n] >= 0):
+        matrix[i, one.layout["place"][i, k]] = one.at["signals"][i, k]
+    np.testing.assert_allclose(one.at["covariance"][:n, :n], matrix @ one.p @ matrix.T, rtol=1e-9, atol=1e-15)
+    y, innovation = one.axes @ one.rate + one.rng.normal(0, 0.01, n), np.zeros(MAX_CHANNELS)
+    subtract_errors(one.layout, one.states, one.at["signals"], np.pad(y, (0, MAX_CHANNELS - n)), innovation)
+    joint = np.block([[one.p, np.zeros((one.count, 3))], [np.zeros((3, one.count)), 1e6 * np.eye(3)]])
+    both = np.hstack([matrix, one.axes])
+    gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + one.noise)
+    x, p = one.after(innovation[:n], np.zeros(MAX_STATES))
+    np.testing.assert_allclose(x, (np.pad(one.x, (0, 3)) + gain @ (y - matrix @ one.x))[: one.count], atol=1e-7)
+    np.testing.assert_allclose(p, (joint - gain @ both @ joint)[: one.count, : one.count], atol=1e-9)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.2))
+def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
+    """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
+    one = Measured(seed, 6)
+    whole = one.columns.T @ one.information @ one.columns
+    least, innovation, motion = np.zeros(MAX_STATES), one.rng.normal(0, 0.01, 6), slice(6, 6 + 18)
+    least[motion] = (np.diag(one.p) - share * np.diag(whole))[motion]
+    x, p = one.after(innovation, least)
+    assert (np.diag(p)[motion] >= (np.diag(one.p - min(share, 1.0) * whole))[motion] * (1 - 1e-9)).all()
+    taught = np.diag(least[: one.count])
+    np.testing.assert_allclose(p, one.p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12)
+    np.testing.assert_allclose(x, one.x + taught @ one.columns.T @ one.information @ innovation, atol=1e-12)
+    assert np.linalg.eigvalsh(p).min() > -1e-12
 
 
 @settings(max_examples=20)

@@ -199,6 +199,34 @@ def test_scores_are_determinants_or_condition_numbers_of_the_2_norm(criterion, d
         np.testing.assert_allclose(scores[ordinary], expected[ordinary], rtol=1e-8, atol=1e-11)
 
 
+TABLE_2 = np.array(
+    [
+        [0.0814, 0.6730, 1.0075, 0.9572, 0.5413],
+        [0.4245, 0.1671, 0.6949, 0.9572, 0.8539],
+        [0.7371, 0.3388, 0.1890, 0.6446, 0.8539],
+        [0.8999, 0.9857, 0.6949, 0.1387, 0.4705],
+        [0.5873, 0.9857, 1.0075, 0.6446, 0.0354],
+    ]
+)
+"""Of the paper on identification: [i, j] is d_j with a fault of 1 in channel i; omega = (1, 2, 3)."""
+
+
+def test_determinants_are_those_of_table_2():
+    """The noise is not printed; off the diagonal the fault decides the sign, and entries are linear in the noise."""
+    struck = np.array(
+        [
+            [np.linalg.det(np.delete(np.column_stack([FIVE, channel]), j, axis=0)) for channel in np.eye(5)]
+            for j in range(5)
+        ]
+    )
+    off, clean = ~np.eye(5, dtype=bool), struck.T
+    left = (np.sign(clean) * TABLE_2 - clean)[off]
+    noise = np.linalg.lstsq(np.broadcast_to(struck, (5, 5, 5))[off], left, rcond=None)[0]
+    scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ [1.0, 2.0, 3.0] + noise + np.eye(5)).scores
+    np.testing.assert_allclose(scores, TABLE_2, atol=1e-4)
+    assert np.abs(noise).max() <= 0.1
+
+
 def test_an_infinite_condition_number_is_no_alarm():
     verdict = Determinant(Geometry(FIVE), UNIT, criterion="condition_number").detect(np.zeros((3, 5)))
     assert np.isposinf(verdict.scores).all()
