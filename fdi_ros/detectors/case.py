@@ -57,7 +57,8 @@ STANDS = 0.6
 than the sums need, as what is not known is counted here in full."""
 ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
 RENAME = 16  # channels are named again when the time since the onset has grown by this part: little is new before
-SETTLED, SETTLED_AMONG_FEW, SETTLED_TOGETHER = 0.2, 0.5, 1.0
+SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
+SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
 """s that a name must stand, of one channel, where at most `FEW_CHECKS` check it, and of two: several faults look like
 one at first, and with so few checks three faults explain anything."""
 FEW_CHECKS = 3
@@ -67,10 +68,11 @@ five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS, TURNED = 6.0, 0.3
 """What is left of other channels in a block, if only those named are faulty: within so many standard deviations, that
 noise does not reach in a flight, and so much of the others' error, as axes are learned while they are watched."""
-LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
-"""A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
+DRIFT_TIMES = 4
+LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
+"""A slow drift is looked for over so many s (480), as long as states are kept, and half as long, so many times."""
 LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biases by some 5 mrad/s, and no more
 FASTEST = 2.5  # and so many times as fast as that for a moment: warming is quickest at first
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]

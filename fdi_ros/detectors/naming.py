@@ -42,7 +42,7 @@ COINCIDENCE = 0.1
 """Prior odds of all pairs of one channel together, and of each way in which any unit is wrong, against a channel. It
 is large for what it stands for: of three parallel gyros, two with the same fault look like the third with the
 opposite one, and only the odds of such a coincidence keep a healthy gyro from being named."""
-TWO_CHECKS = 0.05
+TWO_CHECKS = COINCIDENCE / 2
 """Of the odds of pairs where there are two checks: two of five explain anything, and no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.01
 """Of a unit that is wrong as a whole: gain, as by a wrong range, and delay in s, as of a clock that was set."""

@@ -50,7 +50,8 @@ WILD = 5.0  # standard deviations that no normal value reaches: gone with the ne
 WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0  # before any was seen: one in 200 000, of which 4000 samples tell more
 SURELY = 0.8  # share of a level of long times that is no scatter of its estimate, which is from some 80 values at most
 TRUST = 50.0  # degrees of freedom at most: what has more is normal
-TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
+TAIL_MEMORY = 6000.0
+TAIL_FIRST = TAIL_MEMORY / 3.0
 """Samples over which the weight of the tails is averaged: a minute tells some; and that the first guess counts for."""
 TAIL_SCATTER = 2.8  # standard deviation of those products in white noise, cut at `FAR`
 LEARNED_IN = 64.0  # samples for each degree of freedom to be earned: all of `TRUST` within half a minute at 100 Hz

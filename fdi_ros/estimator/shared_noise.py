@@ -36,7 +36,8 @@ from fdi_ros.model.samples import Array
 
 MEMORY = 2.0  # half seconds that everything here is a mean of
 LINE = 1.0 / 6.0  # excess of the inverse of the dimensions where all is a line: two dimensions in a parity of three
-INCOHERENT, COHERENT = 0.25, 0.75  # squared correlation that chance reaches in a second, and from which all is coherent
+INCOHERENT = 0.25  # squared correlation that chance reaches in a second
+COHERENT = 1.0 - INCOHERENT  # from which all is coherent: as far from one
 STEADY = 4.0
 """Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
 parallel channels see a tenth more or less makes a variance wrong by a sixth there."""

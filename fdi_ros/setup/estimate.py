@@ -37,7 +37,8 @@ from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
 from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment, projector
 
 SCALE_STD = 0.008  # of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg
-PASSES, TRUSTING = 12, 4
+PASSES = 12
+TRUSTING = PASSES // 3
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
 SETTLED = 2e-5  # s of delays, and share of the rate of axes: what changes less has settled
