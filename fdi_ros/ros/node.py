@@ -151,7 +151,9 @@ class InputQueue:
 
         def take_event(data: bytes) -> None:
             self._taken += 1
-            self.subscriptions[subscription](data)
+            # An event outlives its subscription where the node is cleaned up before its turn.
+            if subscription in self.subscriptions:
+                take(data)
 
         # A new QoS each time, as overrides are written into it.
         qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)

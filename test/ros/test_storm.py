@@ -34,7 +34,9 @@ def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(t
             assert told["answered"] == told["sent"], kind
             for name, process in (("monitor", over.monitor), ("link", over.link)):
                 assert process.popen.poll() is None
-                assert told[f"{name}: lines of the log a second"] < 3 * MOST_LINES + THROTTLED, process.said()
+                # A storm of little more than a second lies in two periods of the log.
+                assert told[f"{name}: lines of the log a second"] < 2 * (3 * MOST_LINES + THROTTLED), process.said()
+                assert "Exception in" not in process.said()
                 assert told[f"{name}: memory, MB"] < 400
         assert over.listener.trigger("reset").success
         over.listener.clear()
