@@ -48,7 +48,12 @@ setup(
         "logs": ["pyulog>=1.3", "pymavlink>=2.4.40"],
         "mavlink": ["pymavlink>=2.4.40", "pyserial>=3.5"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
-        "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0", "sphinx-copybutton>=0.5"],
+        "docs": [
+            "sphinx>=7.3",
+            "furo>=2024.1",
+            "myst-parser>=3.0",
+            "sphinx-copybutton>=0.5",
+        ],
         "notebook": ["pandas>=2.0", "matplotlib>=3.8", "ipykernel>=6.29"],
         "test": [
             "pytest>=8.0",

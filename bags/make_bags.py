@@ -34,8 +34,14 @@ def fly() -> Block:
     """Simulate the six channels of the two-triad cone over one flight."""
     motion_seed, unit_seed, noise_seed = np.random.SeedSequence(SEED).spawn(3)
     motion = vehicle_motion(DURATION, np.random.default_rng(motion_seed), rest=8.0)
-    gyros = GyroErrors().draw(Geometry.two_triad_cone(), np.random.default_rng(unit_seed))
-    return gyros.measure(motion, regular_stamps(DURATION, SAMPLE_RATE, START), np.random.default_rng(noise_seed))
+    gyros = GyroErrors().draw(
+        Geometry.two_triad_cone(), np.random.default_rng(unit_seed)
+    )
+    return gyros.measure(
+        motion,
+        regular_stamps(DURATION, SAMPLE_RATE, START),
+        np.random.default_rng(noise_seed),
+    )
 
 
 def write(block: Block, path: Path) -> None:
@@ -52,15 +58,26 @@ def write(block: Block, path: Path) -> None:
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         channels = writer.add_connection("/gyro_channels", array, typestore=store)
-        imus = [writer.add_connection(f"/imu_{k}/data_raw", imu, typestore=store) for k in (1, 2)]
+        imus = [
+            writer.add_connection(f"/imu_{k}/data_raw", imu, typestore=store)
+            for k in (1, 2)
+        ]
         for stamp, z in zip(block.stamp.tolist(), block.z, strict=True):
-            writer.write(channels, stamp, store.serialize_cdr(types[array](layout, z), array))
+            writer.write(
+                channels, stamp, store.serialize_cdr(types[array](layout, z), array)
+            )
             time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
             for k, rate in enumerate((z * UNIT_SIGNS).reshape(2, 3)):
                 header = types["std_msgs/msg/Header"](time, f"imu_{k + 1}")
                 turning = types["geometry_msgs/msg/Vector3"](*rate.tolist())
-                message = types[imu](header, upright, absent, turning, rate_covariance, nothing, absent)
-                writer.write(imus[k], stamp + (k + 1) * TRANSPORT, store.serialize_cdr(message, imu))
+                message = types[imu](
+                    header, upright, absent, turning, rate_covariance, nothing, absent
+                )
+                writer.write(
+                    imus[k],
+                    stamp + (k + 1) * TRANSPORT,
+                    store.serialize_cdr(message, imu),
+                )
 
 
 if __name__ == "__main__":

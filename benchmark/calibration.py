@@ -42,7 +42,9 @@ def errors_of(seed: int, kind: str, units: int) -> tuple[float, ...]:
     found, n = result.estimate, len(made.axes)
     off = (found.axes - made.axes).ravel()
     # What all channels have in common is no channel's error.
-    left = np.linalg.svd(np.kron(np.eye(n) - made.axes @ np.linalg.pinv(made.axes), np.eye(3)))[0][:, : 3 * (n - 3)]
+    left = np.linalg.svd(
+        np.kron(np.eye(n) - made.axes @ np.linalg.pinv(made.axes), np.eye(3))
+    )[0][:, : 3 * (n - 3)]
     apart, known = left.T @ off, left.T @ found.axes_covariance @ left
     size, uncertainty = result.scale
     delays = (found.delay[::3] - made.late)[1:] / found.delay_std[3::3]

@@ -24,7 +24,11 @@ from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.core.path import MORE, SUPPLY
 from fdi_ros.monitor.receiver import Receiver
 
-FIGURES = {**dict.fromkeys(("statistic", "sample", "times", "messages", "message_times"), ".2f")}
+FIGURES = {
+    **dict.fromkeys(
+        ("statistic", "sample", "times", "messages", "message_times"), ".2f"
+    )
+}
 FOUR = {
     **PARALLEL,
     "imus.topics": (*PARALLEL["imus.topics"], "imu_4/data_raw"),
@@ -65,7 +69,10 @@ def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
     S, z, units = pipeline.geometry.S, block.z, range(pipeline.geometry.n // 3)
     receiver, template = Receiver(Pipeline.from_config(config)), ImuTemplate("imu")
     messages = [
-        [template.fill(int(stamp), row[3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9) for unit in units]
+        [
+            template.fill(int(stamp), row[3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
+            for unit in units
+        ]
         for stamp, row in zip(block.stamp, z, strict=True)
     ]
 
@@ -107,9 +114,14 @@ def measure(asked: Asked) -> Iterator[Row]:
         single = one_by_one(config, asked)
         yield f"{mounting}, one by one", single
         for rate in (100.0, 1000.0):
-            pipeline = Pipeline.from_config(config.replaced({**FORGIVING, "sample_rate": rate}))
+            pipeline = Pipeline.from_config(
+                config.replaced({**FORGIVING, "sample_rate": rate})
+            )
             for situation in SITUATIONS:
-                spent = offline(pipeline, stream(pipeline, asked, 1000 * asked.count(300), situation))
+                spent = offline(
+                    pipeline,
+                    stream(pipeline, asked, 1000 * asked.count(300), situation),
+                )
                 yield (
                     f"{mounting}, offline, {rate:g} Hz, {situation}",
                     {

@@ -25,7 +25,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from trials import IDEAL, NOISE, RATE, Array, Asked, Flight, Rng, Row, Sines, fresh, is_state, labelled, walks
+from trials import (
+    IDEAL,
+    NOISE,
+    RATE,
+    Array,
+    Asked,
+    Flight,
+    Rng,
+    Row,
+    Sines,
+    fresh,
+    is_state,
+    labelled,
+    walks,
+)
 
 from fdi_ros import Pipeline
 from fdi_ros.monitor.output import ChannelState
@@ -54,7 +68,11 @@ def louder(count: int, factor: float) -> Change:
 
     def change(flight: Flight, rng: Rng, added: Array) -> Array:
         std, n = np.ones(flight.shape[1]), flight.shape[1]
-        std[int(rng.integers(n)) if count == 1 else 3 * int(rng.integers(n // 3)) + np.arange(3)] = factor
+        std[
+            int(rng.integers(n))
+            if count == 1
+            else 3 * int(rng.integers(n // 3)) + np.arange(3)
+        ] = factor
         added[round(ONSET * RATE) :] *= std
         return std
 
@@ -71,7 +89,9 @@ def biased(flight: Flight, rng: Rng, added: Array) -> Array:
 
 def two_biases(flight: Flight, rng: Rng, added: Array) -> Array:
     """Of two channels that are parallel where there are three units, 12 and 20 sigma."""
-    added[round(ONSET * RATE) :, [0, 3]] += np.array([12.0, 20.0]) * rng.choice([-1, 1], 2)
+    added[round(ONSET * RATE) :, [0, 3]] += np.array([12.0, 20.0]) * rng.choice(
+        [-1, 1], 2
+    )
     return np.ones(flight.shape[1])
 
 
@@ -117,23 +137,38 @@ def measure(asked: Asked) -> Iterator[Row]:
         case, parts = CASES[name], []
         for k in range(asked.count(4)):
             rng = asked.rng("nees", label, k)
-            flight = Flight.of(pipeline, rng, case.length, Sines.drawn(case.amplitude, rng))
+            flight = Flight.of(
+                pipeline, rng, case.length, Sines.drawn(case.amplitude, rng)
+            )
             added = rng.standard_normal(flight.shape)
             added += walks(rng, flight.shape, case.walk) if case.walk else 0.0
             std = case.change(flight, rng, added)
             output = fresh(pipeline, flight.block(added))
-            after, doubt = flight.seconds >= ONSET + SETTLED, is_state(output, ChannelState.AMBIGUOUS).any(axis=1)
+            after, doubt = (
+                flight.seconds >= ONSET + SETTLED,
+                is_state(output, ChannelState.AMBIGUOUS).any(axis=1),
+            )
             rows = after & doubt if case.doubt else after
             error, cov = (output.rate - flight.truth)[rows], output.covariance[rows]
             given = np.isfinite(error).all(axis=1)
             error, cov = error[given], cov[given]
             H = flight.geometry.axes
-            best = NOISE**2 * np.trace(np.linalg.inv(H.T @ (H / std[:, None] ** 2))) if case.known else np.nan
+            best = (
+                NOISE**2 * np.trace(np.linalg.inv(H.T @ (H / std[:, None] ** 2)))
+                if case.known
+                else np.nan
+            )
             sigmas = np.abs(error) / np.sqrt(np.einsum("kii->ki", cov))
             parts.append(
                 {
-                    "nees": np.einsum("ki,ki->k", error, np.linalg.solve(cov, error[..., None])[..., 0]) / 3,
-                    "over_best": (error**2).sum(axis=1, keepdims=True).mean(axis=0) / best,
+                    "nees": np.einsum(
+                        "ki,ki->k",
+                        error,
+                        np.linalg.solve(cov, error[..., None])[..., 0],
+                    )
+                    / 3,
+                    "over_best": (error**2).sum(axis=1, keepdims=True).mean(axis=0)
+                    / best,
                     "beyond_5": (sigmas > 5).any(axis=1),
                     "doubt": doubt[after],
                     "no_rate": ~output.valid[after],
@@ -145,10 +180,17 @@ def measure(asked: Asked) -> Iterator[Row]:
 def figures(parts: list[dict[str, Array]]) -> dict[str, Any]:
     """Means over all samples of all flights, or medians of the flights."""
     every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    means: dict[str, Any] = {name: float(values.mean()) if len(values) else None for name, values in every.items()}
+    means: dict[str, Any] = {
+        name: float(values.mean()) if len(values) else None
+        for name, values in every.items()
+    }
     each = [float(part["nees"].mean()) for part in parts if len(part["nees"])]
     middle = {"nees_median": float(np.median(each)) if each else None}
-    return {**means, **middle, "over_best": float(np.sqrt(np.median(every["over_best"])))}
+    return {
+        **means,
+        **middle,
+        "over_best": float(np.sqrt(np.median(every["over_best"]))),
+    }
 
 
 # Protection level -----------------------------------------------------------------------------------------------------
@@ -166,7 +208,11 @@ LEVEL_FIGURES = {
     "age": "d",
     "no_level": ".1%",
 }
-MOTIONS = {"at rest": (0.0, READY), "in motion": (0.5, READY), "an hour at rest": (0.0, HOUR)}
+MOTIONS = {
+    "at rest": (0.0, READY),
+    "in motion": (0.5, READY),
+    "an hour at rest": (0.0, HOUR),
+}
 """Amplitude, rad/s, and when the fault begins, s."""
 
 
@@ -184,16 +230,36 @@ def measure_level(asked: Asked) -> Iterator[Row]:
                 ratios = []
                 for k in range(trials):
                     rng = asked.rng("level", label, size, k)
-                    flight = Flight.of(pipeline, rng, begin + WATCHED, Sines.drawn(amplitude, rng))
-                    added, onset = rng.standard_normal(flight.shape), round(begin * RATE)
-                    added[onset:, int(rng.integers(flight.shape[1]))] += rng.choice([-1, 1]) * size
+                    flight = Flight.of(
+                        pipeline, rng, begin + WATCHED, Sines.drawn(amplitude, rng)
+                    )
+                    added, onset = (
+                        rng.standard_normal(flight.shape),
+                        round(begin * RATE),
+                    )
+                    added[onset:, int(rng.integers(flight.shape[1]))] += (
+                        rng.choice([-1, 1]) * size
+                    )
                     output = fresh(pipeline, flight.block(added))
                     # No rate, or no level, claims nothing.
-                    ratio = np.nan_to_num(np.abs(output.rate - flight.truth) / output.level)
+                    ratio = np.nan_to_num(
+                        np.abs(output.rate - flight.truth) / output.level
+                    )
                     ratios.append(ratio[onset + AGES])
-                    without.append(float((~np.isfinite(output.level[onset:, 0])).mean()))
+                    without.append(
+                        float((~np.isfinite(output.level[onset:, 0])).mean())
+                    )
                 points = np.quantile(ratios, POINT, axis=0, method="higher").max(axis=1)
-                worst = max(worst, (float(points.max()), size, int(AGES[points.argmax()])))
+                worst = max(
+                    worst, (float(points.max()), size, int(AGES[points.argmax()]))
+                )
             figures = dict(zip(("worst", "sigma", "age"), worst, strict=True))
             level_over = 1 / worst[0] if worst[0] else None
-            yield label, {**figures, "level_over": level_over, "no_level": float(np.mean(without))}
+            yield (
+                label,
+                {
+                    **figures,
+                    "level_over": level_over,
+                    "no_level": float(np.mean(without)),
+                },
+            )

@@ -49,14 +49,33 @@ WIDTH = 58  # of labels
 
 def arguments_of() -> argparse.Namespace:
     about = (__doc__ or "").format(parts=", ".join(PARTS))
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("part", choices=PARTS)
-    parser.add_argument("--trials", type=int, help="of each row; what they are is the part's")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="folder of the recordings")
-    parser.add_argument("--only", default="", metavar="TEXT", help="rows with this in their label")
+    parser.add_argument(
+        "--trials", type=int, help="of each row; what they are is the part's"
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path("../shared/data"),
+        help="folder of the recordings",
+    )
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="rows with this in their label"
+    )
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    parser.add_argument("--detector", help="detector.name; as in the config unless given")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="parameter that wins")
+    parser.add_argument(
+        "--detector", help="detector.name; as in the config unless given"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="parameter that wins",
+    )
     parser.add_argument("--seed", type=int, default=1)
     return parser.parse_args()
 
@@ -71,22 +90,37 @@ def main() -> None:
     arguments = arguments_of()
     name, function, formats = PARTS[arguments.part]
     module = importlib.import_module(name)
-    settings = {key: yaml.safe_load(value) for key, _, value in (text.partition("=") for text in arguments.set)}
+    settings = {
+        key: yaml.safe_load(value)
+        for key, _, value in (text.partition("=") for text in arguments.set)
+    }
     settings |= {"detector.name": arguments.detector} if arguments.detector else {}
-    asked = Asked(arguments.trials, arguments.seed, arguments.data, arguments.only, settings)
+    asked = Asked(
+        arguments.trials, arguments.seed, arguments.data, arguments.only, settings
+    )
     print(f"{(module.__doc__ or '').rstrip()}\n")
     columns = {**getattr(module, formats), "took_s": ".1f"}
     widths = {column: max(len(column), 7) for column in columns}
-    print(f"{'':{WIDTH}}" + " ".join(f"{column.replace('_', ' '):>{widths[column]}}" for column in columns))
+    print(
+        f"{'':{WIDTH}}"
+        + " ".join(
+            f"{column.replace('_', ' '):>{widths[column]}}" for column in columns
+        )
+    )
     rows: list[dict[str, Any]] = []
     begun = time.perf_counter()
     for label, figures in getattr(module, function)(asked):
         figures["took_s"], begun = time.perf_counter() - begun, time.perf_counter()
-        cells = " ".join(f"{cell(figures.get(column), form):>{widths[column]}}" for column, form in columns.items())
+        cells = " ".join(
+            f"{cell(figures.get(column), form):>{widths[column]}}"
+            for column, form in columns.items()
+        )
         print(f"{label:{WIDTH}}{cells} {figures.get('words', '')}".rstrip(), flush=True)
         rows.append({"label": label, **figures})
     if arguments.json:
-        result = json.dumps({"command": sys.argv, "rows": rows}, indent=1, default=float)
+        result = json.dumps(
+            {"command": sys.argv, "rows": rows}, indent=1, default=float
+        )
         arguments.json.write_text(result, encoding="utf-8")
 
 

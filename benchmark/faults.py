@@ -76,14 +76,25 @@ def measure_drifts(asked: Asked) -> Iterator[Row]:
         outcomes, errors = [], []
         for k in range(trials):
             rng = asked.rng("drift", label, k)
-            flight = Flight.of(pipeline, rng, ONSET + FLOWN, Sines.drawn(0.6, rng), GyroErrors())
+            flight = Flight.of(
+                pipeline, rng, ONSET + FLOWN, Sines.drawn(0.6, rng), GyroErrors()
+            )
             added = rng.standard_normal(flight.shape)
             channel, sign = int(rng.integers(flight.shape[1])), rng.choice([-1, 1])
-            added[:, channel] += sign * np.radians(drift) / NOISE * np.maximum(flight.seconds - ONSET, 0)
+            added[:, channel] += (
+                sign * np.radians(drift) / NOISE * np.maximum(flight.seconds - ONSET, 0)
+            )
             output = fresh(pipeline, flight.block(added))
             outcomes.append(found(output, channel, round(ONSET * RATE)))
             errors.append(off(output, flight.truth))
-        yield f"{label} deg/s^2", {**_times(outcomes), "off": float(np.median(errors)), "most_off": max(errors)}
+        yield (
+            f"{label} deg/s^2",
+            {
+                **_times(outcomes),
+                "off": float(np.median(errors)),
+                "most_off": max(errors),
+            },
+        )
 
 
 def _times(outcomes: Any) -> dict[str, Any]:
@@ -110,7 +121,11 @@ CALM = WATCHED = 60.0  # s
 MOTIONS = {
     "at rest": (0.0, NO_ERRORS, IDEAL),
     "gentle motion": (0.05, NO_ERRORS, IDEAL),
-    "motion 0.5 rad/s, scale errors": (0.5, GyroErrors(scale_std=0.002, misalignment_std=0.002, delay_std=0.0003), {}),
+    "motion 0.5 rad/s, scale errors": (
+        0.5,
+        GyroErrors(scale_std=0.002, misalignment_std=0.002, delay_std=0.0003),
+        {},
+    ),
 }
 """Amplitude, rad/s, errors of the gyros and settings: axes and clocks are known, or off by what is configured."""
 FIRST = 20.0  # size of the fault before, sigma
@@ -121,19 +136,31 @@ def measure_delays(asked: Asked) -> Iterator[Row]:
     """One bias."""
     trials = asked.count(50)
     for motion, (amplitude, errors, settings) in MOTIONS.items():
-        for mounting, pipeline in asked.monitors({**settings, "detector.false_alarms_per_hour": 0.001}).items():
+        for mounting, pipeline in asked.monitors(
+            {**settings, "detector.false_alarms_per_hour": 0.001}
+        ).items():
             for size in SIZES:
                 if not asked.wants(label := f"{mounting}, {motion}, {size:g} sigma"):
                     continue
                 outcomes = []
                 for k in range(trials):
                     rng = asked.rng("delay", label, k)
-                    flight = Flight.of(pipeline, rng, CALM + WATCHED, Sines.drawn(amplitude, rng), errors)
+                    flight = Flight.of(
+                        pipeline,
+                        rng,
+                        CALM + WATCHED,
+                        Sines.drawn(amplitude, rng),
+                        errors,
+                    )
                     added, onset = rng.standard_normal(flight.shape), round(CALM * RATE)
                     channel = int(rng.integers(flight.shape[1]))
                     added[onset:, channel] += rng.choice([-1, 1]) * size
-                    outcomes.append(found(fresh(pipeline, flight.block(added)), channel, onset))
-                bound = moustakides_delay(size * math.sqrt(pipeline.geometry.S[0, 0]), RUN_LENGTH)
+                    outcomes.append(
+                        found(fresh(pipeline, flight.block(added)), channel, onset)
+                    )
+                bound = moustakides_delay(
+                    size * math.sqrt(pipeline.geometry.S[0, 0]), RUN_LENGTH
+                )
                 figures = summary(outcomes, WATCHED * RATE)
                 times = figures["declared"] / bound if "declared" in figures else None
                 yield label, {"bound": bound, "times_bound": times, **figures}
@@ -143,12 +170,17 @@ def measure_next(asked: Asked) -> Iterator[Row]:
     """Add the next bias, of another channel."""
     trials = asked.count(20)
     settings = {**IDEAL, "detector.false_alarms_per_hour": 0.001}
-    for (mounting, config), size in ((c, s) for c in asked.configs(settings).items() for s in (2.0, 4.0)):
+    for (mounting, config), size in (
+        (c, s) for c in asked.configs(settings).items() for s in (2.0, 4.0)
+    ):
         if not asked.wants(f"{mounting}, {size:g} sigma"):
             continue
         pipeline = Pipeline.from_config(config)
         names = pipeline.channel_names
-        without = [Pipeline.from_config(config.replaced({"excluded_channels": (name,)})) for name in names]
+        without = [
+            Pipeline.from_config(config.replaced({"excluded_channels": (name,)}))
+            for name in names
+        ]
         outcomes: dict[str, list[Found]] = {}
         for k in range(trials):
             rng = asked.rng("after", mounting, size, k)
@@ -159,8 +191,12 @@ def measure_next(asked: Asked) -> Iterator[Row]:
             second = noise.copy()
             second[onset:, other] += faults[1]
             block = flight.block(second)
-            outcomes.setdefault("alone", []).append(found(fresh(pipeline, block), other, onset))
-            outcomes.setdefault("other excluded", []).append(found(fresh(without[one], block), other, onset, (one,)))
+            outcomes.setdefault("alone", []).append(
+                found(fresh(pipeline, block), other, onset)
+            )
+            outcomes.setdefault("other excluded", []).append(
+                found(fresh(without[one], block), other, onset, (one,))
+            )
             for gap in GAPS:
                 both = noise.copy()
                 # The fault before is declared at a sample that is not known beforehand.
@@ -168,10 +204,23 @@ def measure_next(asked: Asked) -> Iterator[Row]:
                 alone = faulty(fresh(pipeline, flight.block(both)))[:, one]
                 begin = int(alone.argmax()) + round(gap * RATE)
                 both[begin:, other] += faults[1]
-                struck = found(fresh(pipeline, flight.block(both)), other, begin, (one,), int(alone.argmax()))
-                outcomes.setdefault(f"{gap:g} s after", []).append(struck._replace(judged=bool(alone.any())))
-        figures = {name: summary(those, WATCHED * RATE) for name, those in outcomes.items()}
+                struck = found(
+                    fresh(pipeline, flight.block(both)),
+                    other,
+                    begin,
+                    (one,),
+                    int(alone.argmax()),
+                )
+                outcomes.setdefault(f"{gap:g} s after", []).append(
+                    struck._replace(judged=bool(alone.any()))
+                )
+        figures = {
+            name: summary(those, WATCHED * RATE) for name, those in outcomes.items()
+        }
         base = figures["other excluded"].get("declared")
         for name, those in figures.items():
             times = those["declared"] / base if base and "declared" in those else None
-            yield f"{mounting}, {size:g} sigma, {name}", {"times_excluded": times, **those}
+            yield (
+                f"{mounting}, {size:g} sigma, {name}",
+                {"times_excluded": times, **those},
+            )

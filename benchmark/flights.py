@@ -37,17 +37,31 @@ from fdi_ros.replay.run import Sink, replay
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.starting_config import starting_config_of
 
-WITHIN = (1.0, 4.0, 10.0)  # times to the name, s; the last is how long a fault is watched
+WITHIN = (
+    1.0,
+    4.0,
+    10.0,
+)  # times to the name, s; the last is how long a fault is watched
 MATTERS = 4.0  # what a set, or a miss, is judged by, s
 OTHERS = ("in a set", "missed", "false set", "wrong", "before")
 FIGURES = {
     **dict.fromkeys(("faulty", "in_sets", "trials"), "d"),
-    **dict.fromkeys((*(f"in_{limit:g}_s" for limit in WITHIN), *(name.replace(" ", "_") for name in OTHERS)), ".1%"),
+    **dict.fromkeys(
+        (
+            *(f"in_{limit:g}_s" for limit in WITHIN),
+            *(name.replace(" ", "_") for name in OTHERS),
+        ),
+        ".1%",
+    ),
     **dict.fromkeys(("late_off", "late_sigmas"), ".2f"),
 }
 GROUPS: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "phantom4, units together": tuple((f"phantom4/{name}", 0.0, np.inf) for name in ("h02", "h04", "h05", "v01")),
-    "phantom4, units 20 to 44 ms apart": tuple((f"phantom4/{name}", 0.0, np.inf) for name in ("h20", "h24", "v09")),
+    "phantom4, units together": tuple(
+        (f"phantom4/{name}", 0.0, np.inf) for name in ("h02", "h04", "h05", "v01")
+    ),
+    "phantom4, units 20 to 44 ms apart": tuple(
+        (f"phantom4/{name}", 0.0, np.inf) for name in ("h20", "h24", "v09")
+    ),
     "solo": (("solo", 0.0, 105.0), ("solo", 105.0, 145.0)),
     "mimu": (("mimu_exp1", 0.0, 180.0), ("mimu_exp6", 0.0, np.inf)),
     "mimu, shaken": (("mimu_exp1", 180.0, 210.0),),
@@ -56,8 +70,14 @@ GROUPS: dict[str, tuple[tuple[str, float, float], ...]] = {
 NO_FAULTS = ("mimu, shaken",)  # until the gyros saturate
 EXCEPTED = {"solo": "imu_1.x"}  # channels that are not known to be healthy
 BASE: dict[str, dict[str, Any]] = {
-    "phantom4": {"sample_rate": 120.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 5))},
-    "solo": {"sample_rate": 50.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 4))},
+    "phantom4": {
+        "sample_rate": 120.0,
+        "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 5)),
+    },
+    "solo": {
+        "sample_rate": 50.0,
+        "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 4)),
+    },
 }
 """Settings that no calibration finds out; mounts are the identity. mimu: config/three_imus.yaml."""
 BIASES = (0.03, 0.1, 0.3)  # rad/s
@@ -81,12 +101,16 @@ class Recorded:
     @property
     def name(self) -> str:
         """For labels."""
-        return self.path.name + (f" {self.start:g}-{self.end:g} s" if np.isfinite(self.end) else "")
+        return self.path.name + (
+            f" {self.start:g}-{self.end:g} s" if np.isfinite(self.end) else ""
+        )
 
     def base(self) -> Config:
         """Return the settings before any calibration."""
         if self.vehicle == "mimu":
-            return Config.from_file(CONFIGS / "three_imus.yaml", {"bias.startup_bias_duration": 0.0})
+            return Config.from_file(
+                CONFIGS / "three_imus.yaml", {"bias.startup_bias_duration": 0.0}
+            )
         return Config.from_parameters({"input": "imus", **BASE[self.vehicle]})
 
     def block(self) -> Block:
@@ -118,31 +142,55 @@ class Replayed:
     pipeline: Pipeline
 
 
-def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), end: float = np.inf) -> Replayed:
+def replayed(
+    recorded: Recorded,
+    config: Config,
+    faults: tuple[Any, ...] = (),
+    end: float = np.inf,
+) -> Replayed:
     """Replay a recording, or its beginning."""
     kept = Kept()
-    replay(recorded.path, config, faults, recorded.start, min(end, recorded.end), sinks=[kept])
+    replay(
+        recorded.path,
+        config,
+        faults,
+        recorded.start,
+        min(end, recorded.end),
+        sinks=[kept],
+    )
     assert kept.pipeline is not None
     stamp = np.concatenate([output.stamp for output in kept.outputs])
     alone = np.concatenate([faulty(output) for output in kept.outputs])
-    named = np.concatenate([is_state(output, ChannelState.FAULTY) for output in kept.outputs])
-    among = np.concatenate([is_state(output, ChannelState.AMBIGUOUS) for output in kept.outputs])
-    excepted = np.array([name == EXCEPTED.get(recorded.vehicle) for name in kept.pipeline.channel_names])
+    named = np.concatenate(
+        [is_state(output, ChannelState.FAULTY) for output in kept.outputs]
+    )
+    among = np.concatenate(
+        [is_state(output, ChannelState.AMBIGUOUS) for output in kept.outputs]
+    )
+    excepted = np.array(
+        [name == EXCEPTED.get(recorded.vehicle) for name in kept.pipeline.channel_names]
+    )
     among[among[:, excepted].any(axis=1)] = False
-    return Replayed(seconds_of(stamp), alone & ~excepted, named & ~excepted, among, kept.pipeline)
+    return Replayed(
+        seconds_of(stamp), alone & ~excepted, named & ~excepted, among, kept.pipeline
+    )
 
 
 @functools.cache
 def inspected(recorded: Recorded) -> Config:
     """Return what `fdi inspect` writes, with the mounts that are known."""
-    found = starting_config_of(recorded.path, f"{recorded.path}: no settings for it").parameters
+    found = starting_config_of(
+        recorded.path, f"{recorded.path}: no settings for it"
+    ).parameters
     return Config.from_parameters({**found, "imus.mounts": recorded.base().imus.mounts})
 
 
 @functools.cache
 def calibrated(recorded: Recorded) -> Config:
     """Return what `fdi calibrate` gives."""
-    return recorded.base().replaced(calibrate(recorded.block(), recorded.base()).settings)
+    return recorded.base().replaced(
+        calibrate(recorded.block(), recorded.base()).settings
+    )
 
 
 def cross_correlated(recorded: Recorded, geometry: Any) -> Array:
@@ -150,15 +198,25 @@ def cross_correlated(recorded: Recorded, geometry: Any) -> Array:
     block = recorded.block()
     t = seconds_of(block.stamp)
     rate = 1 / float(np.median(np.diff(t)))
-    smooth = sosfiltfilt(butter(4, 8.0, fs=rate, output="sos"), np.where(np.isfinite(block.z), block.z, 0.0), axis=0)
-    body = [smooth[:, k : k + 3] @ geometry.axes[k : k + 3] for k in range(0, geometry.n, 3)]
+    smooth = sosfiltfilt(
+        butter(4, 8.0, fs=rate, output="sos"),
+        np.where(np.isfinite(block.z), block.z, 0.0),
+        axis=0,
+    )
+    body = [
+        smooth[:, k : k + 3] @ geometry.axes[k : k + 3] for k in range(0, geometry.n, 3)
+    ]
     inside = (t > LAG) & (t < t[-1] - LAG)
     lags = np.arange(-LAG, LAG, 1e-3)
     first, late = CubicSpline(t, body[0]), [0.0]
     for unit in body[1:]:
         own = unit[inside] - unit[inside].mean(axis=0)
         score = [
-            float((own * (w := first(t[inside] - lag))).sum() / np.linalg.norm(w - w.mean(axis=0))) for lag in lags
+            float(
+                (own * (w := first(t[inside] - lag))).sum()
+                / np.linalg.norm(w - w.mean(axis=0))
+            )
+            for lag in lags
         ]
         k = int(np.clip(np.argmax(score), 1, len(lags) - 2))
         a, b, c = score[k - 1 : k + 2]
@@ -174,7 +232,10 @@ def delays_of(flown: Replayed, true: Array) -> dict[str, Any]:
         return {}
     off = np.abs(delays + (status.config.imus.delays or 0.0) - true)[1:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return {"late_off": 1e3 * float(off.max()), "late_sigmas": float((off / std[1:]).max())}
+        return {
+            "late_off": 1e3 * float(off.max()),
+            "late_sigmas": float((off / std[1:]).max()),
+        }
 
 
 def healthy(recorded: Recorded, config: Config) -> dict[str, Any]:
@@ -184,16 +245,28 @@ def healthy(recorded: Recorded, config: Config) -> dict[str, Any]:
     alone, among = flown.named.any(axis=0), flown.among.any(axis=0)
     for i in np.flatnonzero(alone | among):
         rows = flown.named[:, i] if alone[i] else flown.among[:, i]
-        words.append(("{}@{:.1f}" if alone[i] else "({}@{:.1f})").format(names[i], flown.seconds[rows.argmax()]))
+        words.append(
+            ("{}@{:.1f}" if alone[i] else "({}@{:.1f})").format(
+                names[i], flown.seconds[rows.argmax()]
+            )
+        )
     true = cross_correlated(recorded, flown.pipeline.geometry)
     said = " ".join(f"{1e3 * late:.1f}" for late in true[1:])
     counts = {"faulty": int(alone.sum()), "in_sets": int((among & ~alone).sum())}
-    return {**counts, **delays_of(flown, true), "words": f"late {said} ms; {' '.join(words)}"}
+    return {
+        **counts,
+        **delays_of(flown, true),
+        "words": f"late {said} ms; {' '.join(words)}",
+    }
 
 
-def struck(recorded: Recorded, config: Config, channel: str, size: float, at: float) -> list[Any]:
+def struck(
+    recorded: Recorded, config: Config, channel: str, size: float, at: float
+) -> list[Any]:
     """Replay with a bias, rad/s, from a time on, s; return what came of it, and the time to the name, s."""
-    struck = fault_from({"channel": channel, "start": recorded.start + at, "kind": "bias", "size": size})
+    struck = fault_from(
+        {"channel": channel, "start": recorded.start + at, "kind": "bias", "size": size}
+    )
     flown = replayed(recorded, config, (struck,), recorded.start + at + WITHIN[-1])
     i = list(flown.pipeline.channel_names).index(channel)
     row, since = int(np.searchsorted(flown.seconds, at)), flown.seconds - at
@@ -201,11 +274,18 @@ def struck(recorded: Recorded, config: Config, channel: str, size: float, at: fl
         return ["before", np.inf]
     if np.delete(flown.alone[row:], i, axis=1).any():
         return ["wrong", np.inf]
-    delay = float(since[row + flown.alone[row:, i].argmax()]) if flown.alone[row:, i].any() else np.inf
+    delay = (
+        float(since[row + flown.alone[row:, i].argmax()])
+        if flown.alone[row:, i].any()
+        else np.inf
+    )
     if delay <= MATTERS:
         return ["named", delay]
     soon = flown.among[(since >= 0) & (since <= MATTERS)]
-    return ["in a set" if soon[:, i].any() else "false set" if soon.any() else "missed", delay]
+    return [
+        "in a set" if soon[:, i].any() else "false set" if soon.any() else "missed",
+        delay,
+    ]
 
 
 def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
@@ -218,20 +298,39 @@ def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
 
 def measure(asked: Asked) -> Iterator[Row]:
     """Healthy flights one by one, then faults by vehicle."""
-    groups = {g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts] for g, parts in GROUPS.items()}
+    groups = {
+        g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts]
+        for g, parts in GROUPS.items()
+    }
     for way in ("calibrated", "inspected"):
         for group, flights in groups.items():
             if not asked.wants(f"{way}, {group}"):
                 continue
-            sisters = [s for s in itertools.chain(*groups.values()) if s.vehicle == flights[0].vehicle]
-            sisters = [s for s in sisters if s.group not in NO_FAULTS and "apart" not in s.group]
+            sisters = [
+                s
+                for s in itertools.chain(*groups.values())
+                if s.vehicle == flights[0].vehicle
+            ]
+            sisters = [
+                s
+                for s in sisters
+                if s.group not in NO_FAULTS and "apart" not in s.group
+            ]
             ready = []
             for k, target in enumerate(flights):
-                sources = [s for s in sisters if s is not target] if way == "calibrated" else [target]
+                sources = (
+                    [s for s in sisters if s is not target]
+                    if way == "calibrated"
+                    else [target]
+                )
                 for n, source in enumerate(sources):
-                    label = f"{way}, {target.name}" + (f" < {source.name}" if source is not target else "")
+                    label = f"{way}, {target.name}" + (
+                        f" < {source.name}" if source is not target else ""
+                    )
                     try:
-                        config = (calibrated if way == "calibrated" else inspected)(source).replaced(asked.settings)
+                        config = (calibrated if way == "calibrated" else inspected)(
+                            source
+                        ).replaced(asked.settings)
                     except FdiError as error:
                         yield label, {"words": f"no settings: {str(error)[:60]}"}
                         continue
@@ -242,13 +341,25 @@ def measure(asked: Asked) -> Iterator[Row]:
                 yield f"{way}, {group}, {size:g} rad/s", injected(asked, ready, size)
 
 
-def injected(asked: Asked, ready: list[tuple[Recorded, Config]], size: float) -> dict[str, Any]:
+def injected(
+    asked: Asked, ready: list[tuple[Recorded, Config]], size: float
+) -> dict[str, Any]:
     """Inject a bias of either sign, rad/s, into every channel of some flights, at several times."""
     outcomes, count = [], asked.count(1)
     for target, config in ready:
         length = float(seconds_of(target.block().stamp)[-1])
         for name in Pipeline.from_config(config).channel_names:
             for k in range(count if name != EXCEPTED.get(target.vehicle) else 0):
-                sign = float(asked.rng("flight", target.name, name, k).choice([-1.0, 1.0]))
-                outcomes.append(struck(target, config, name, sign * size, (k + 1) / (count + 1) * length))
+                sign = float(
+                    asked.rng("flight", target.name, name, k).choice([-1.0, 1.0])
+                )
+                outcomes.append(
+                    struck(
+                        target,
+                        config,
+                        name,
+                        sign * size,
+                        (k + 1) / (count + 1) * length,
+                    )
+                )
     return shares(outcomes)

@@ -43,14 +43,22 @@ from fdi_ros import Pipeline
 from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState
 
-FALSE_FIGURES = {"events": "d", "hours": ".2f", "an_hour": ".2f", "over_asked": ".3f", "error": ".3f"}
+FALSE_FIGURES = {
+    "events": "d",
+    "hours": ".2f",
+    "an_hour": ".2f",
+    "over_asked": ".3f",
+    "error": ".3f",
+}
 ASKED = 10.0  # an hour
 LENGTH = 600.0  # of a flight, s
 
 
 def student(freedom: float) -> Noise:
     """Student's t, of unit variance."""
-    return lambda rng, rows, n: rng.standard_t(freedom, (rows, n)) / np.sqrt(freedom / (freedom - 2))
+    return lambda rng, rows, n: (
+        rng.standard_t(freedom, (rows, n)) / np.sqrt(freedom / (freedom - 2))
+    )
 
 
 def laplace(rng: Rng, rows: int, n: int) -> Array:
@@ -73,7 +81,9 @@ def volatile(of_each: bool) -> Noise:
     """White noise whose strength changes within half a second, by a factor of 1.6, of each channel or of all alike."""
 
     def noise(rng: Rng, rows: int, n: int) -> Array:
-        level = autoregressive(np.exp(-1 / (0.5 * RATE)))(rng, rows, n if of_each else 1)
+        level = autoregressive(np.exp(-1 / (0.5 * RATE)))(
+            rng, rows, n if of_each else 1
+        )
         return np.asarray(rng.standard_normal((rows, n)) * np.exp(0.5 * level - 0.25))
 
     return noise
@@ -85,10 +95,20 @@ def bursts(rng: Rng, rows: int, n: int) -> Array:
     unit = 3 * int(rng.integers(n // 3))
     for begin in np.flatnonzero(rng.random(rows) < 1 / (5 * RATE)).tolist():
         length = min(int(RATE * rng.uniform(0.4, 2.0)), rows - begin)
-        radius, turn = np.exp(-np.pi * 2.0 / RATE), 2 * np.pi * rng.uniform(10, 45) / RATE
-        tone = lfilter([1.0], [1.0, -2 * radius * np.cos(turn), radius**2], rng.standard_normal((length + 50, 3)), 0)
+        radius, turn = (
+            np.exp(-np.pi * 2.0 / RATE),
+            2 * np.pi * rng.uniform(10, 45) / RATE,
+        )
+        tone = lfilter(
+            [1.0],
+            [1.0, -2 * radius * np.cos(turn), radius**2],
+            rng.standard_normal((length + 50, 3)),
+            0,
+        )
         edge = np.minimum(np.arange(length), np.arange(length)[::-1]) / (0.2 * RATE)
-        noise[begin : begin + length, unit : unit + 3] += 3.0 * tone[50:] / tone.std() * np.minimum(edge, 1)[:, None]
+        noise[begin : begin + length, unit : unit + 3] += (
+            3.0 * tone[50:] / tone.std() * np.minimum(edge, 1)[:, None]
+        )
     return noise
 
 
@@ -107,7 +127,9 @@ NOISES: dict[str, Noise] = {
 
 def measure_false(asked: Asked) -> Iterator[Row]:
     """Count the declarations in so many hours of each noise."""
-    for label, pipeline, name in labelled(asked, {**IDEAL, "detector.false_alarms_per_hour": ASKED}, NOISES):
+    for label, pipeline, name in labelled(
+        asked, {**IDEAL, "detector.false_alarms_per_hour": ASKED}, NOISES
+    ):
         events, flown = 0, 0.0
         for k in range(round(asked.count(3) * 3600 / LENGTH)):
             rng = asked.rng("false", label, k)
@@ -119,7 +141,10 @@ def measure_false(asked: Asked) -> Iterator[Row]:
                 if any(event.declares for event in output.events):
                     events += 1
                     break
-        hourly, one = events / flown, pipeline.config.detector.false_alarms_per_hour * flown
+        hourly, one = (
+            events / flown,
+            pipeline.config.detector.false_alarms_per_hour * flown,
+        )
         over = {"over_asked": events / one, "error": max(events, 1) ** 0.5 / one}
         yield label, {"events": events, "hours": flown, "an_hour": hourly, **over}
 
@@ -136,7 +161,9 @@ CONDITION_FIGURES = {
     **dict.fromkeys(("suspect", "unjudged", "no_rate"), ".3%"),
 }
 
-Extra = Callable[[Rng, Array, int], Array]  # what comes on top of the noise, (rows, n) rad/s, at times (rows,) s
+Extra = Callable[
+    [Rng, Array, int], Array
+]  # what comes on top of the noise, (rows, n) rad/s, at times (rows,) s
 
 
 def walking(walk: float) -> Extra:
@@ -145,7 +172,12 @@ def walking(walk: float) -> Extra:
 
 def warming(drift: float) -> Extra:
     def extra(rng: Rng, seconds: Array, n: int) -> Array:
-        return drift * rng.choice([-1, 1], n) * rng.uniform(0.5, 1, n) * (seconds / WARMING)[:, None]
+        return (
+            drift
+            * rng.choice([-1, 1], n)
+            * rng.uniform(0.5, 1, n)
+            * (seconds / WARMING)[:, None]
+        )
 
     return extra
 
@@ -154,8 +186,13 @@ def spikes(size: float) -> Extra:
     """One per second on one channel or another, in sigma."""
 
     def extra(rng: Rng, seconds: Array, n: int) -> Array:
-        added, struck = np.zeros((len(seconds), n)), np.flatnonzero(rng.random(len(seconds)) < seconds[1])
-        added[struck, rng.integers(n, size=len(struck))] = NOISE * size * rng.choice([-1, 1], len(struck))
+        added, struck = (
+            np.zeros((len(seconds), n)),
+            np.flatnonzero(rng.random(len(seconds)) < seconds[1]),
+        )
+        added[struck, rng.integers(n, size=len(struck))] = (
+            NOISE * size * rng.choice([-1, 1], len(struck))
+        )
         return added
 
     return extra
@@ -176,8 +213,14 @@ CONDITIONS = {
     "white": Condition(),
     "AR(1) 0.5": Condition(autoregressive(0.5)),
     **{f"bias walk {walk:g}": Condition(extra=walking(walk)) for walk in (2e-5, 1e-4)},
-    **{f"temperature {drift:g}": Condition(extra=warming(drift), minutes=20.0) for drift in (0.01, 0.02, 0.05)},
-    **{f"noise x{level:g}": Condition(level=level) for level in (0.5, 1.5, 2.0, 2.5, 3.0)},
+    **{
+        f"temperature {drift:g}": Condition(extra=warming(drift), minutes=20.0)
+        for drift in (0.01, 0.02, 0.05)
+    },
+    **{
+        f"noise x{level:g}": Condition(level=level)
+        for level in (0.5, 1.5, 2.0, 2.5, 3.0)
+    },
     "Student t4": Condition(student(4)),
     "spikes of 30 sigma": Condition(extra=spikes(30.0)),
     **{f"steps of {step:g} sigma": Condition(step=step) for step in (1.0, 4.0)},
@@ -191,13 +234,19 @@ def fly(pipeline: Pipeline, rng: Rng, condition: Condition) -> dict[str, float]:
     if condition.extra:
         block.z[:] += condition.extra(rng, flight.seconds, flight.shape[1])
     if condition.step:
-        block.z[:] = np.round(block.z / (condition.step * NOISE)) * (condition.step * NOISE)
+        block.z[:] = np.round(block.z / (condition.step * NOISE)) * (
+            condition.step * NOISE
+        )
     output, after = fresh(pipeline, block), flight.seconds >= SETTLED
     return {
         "lost": float(faulty(output).any()),
         "in_a_set": float(is_state(output, ChannelState.AMBIGUOUS).any()),
-        "suspect": float(is_state(output, ChannelState.SUSPECT)[after].any(axis=1).mean()),
-        "unjudged": float(is_state(output, ChannelState.UNCHECKED)[after].any(axis=1).mean()),
+        "suspect": float(
+            is_state(output, ChannelState.SUSPECT)[after].any(axis=1).mean()
+        ),
+        "unjudged": float(
+            is_state(output, ChannelState.UNCHECKED)[after].any(axis=1).mean()
+        ),
         "no_rate": float((~output.valid[after]).mean()),
     }
 
@@ -206,7 +255,11 @@ def measure_conditions(asked: Asked) -> Iterator[Row]:
     """Every condition and mounting."""
     for label, pipeline, name in labelled(asked, None, CONDITIONS):
         flights = max(round(asked.count(4) * 10 / CONDITIONS[name].minutes), 1)
-        outcomes = [fly(pipeline, asked.rng(label, k), CONDITIONS[name]) for k in range(flights)]
-        means = {word: float(np.mean([o[word] for o in outcomes])) for word in outcomes[0]}
+        outcomes = [
+            fly(pipeline, asked.rng(label, k), CONDITIONS[name]) for k in range(flights)
+        ]
+        means = {
+            word: float(np.mean([o[word] for o in outcomes])) for word in outcomes[0]
+        }
         counts = {word: round(means[word] * flights) for word in ("lost", "in_a_set")}
         yield label, {"flights": flights, **means, **counts}

@@ -32,7 +32,9 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 # In place of this folder, where this file would be taken for the tests' folder of the same name.
 sys.path[:1] = [str(ROOT), str(ROOT / "test")]
-os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_mavlink_"))
@@ -62,15 +64,23 @@ NOISE, SCALE, MOTION = 0.004, 0.005, 0.6
 Messages = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def flight(stack: str, rate: float, seed: int, count: int, fault: tuple[float, float]) -> Messages:
+def flight(
+    stack: str, rate: float, seed: int, count: int, fault: tuple[float, float]
+) -> Messages:
     """Messages of IMUs in motion: unit, stamp, ns, rates (k, 3); imu_2.y has a bias and a drift from `STRIKES` on.
 
     With noise of 4 mrad/s, scale factors off by 0.5 %, up to about 0.8 rad/s, sampled as the autopilot does,
     in the steps of SCALED_IMU, cut off towards zero.
     """
     random = np.random.default_rng(seed)
-    phase, factor = random.uniform(0, 2 * np.pi, 6), 1 + SCALE * random.standard_normal((3, 3))
-    slow, fast = (2 * np.pi * np.array(hertz) for hertz in ((0.25, 0.41, 0.17), (0.83, 0.67, 0.53)))
+    phase, factor = (
+        random.uniform(0, 2 * np.pi, 6),
+        1 + SCALE * random.standard_normal((3, 3)),
+    )
+    slow, fast = (
+        2 * np.pi * np.array(hertz)
+        for hertz in ((0.25, 0.41, 0.17), (0.83, 0.67, 0.53))
+    )
     units, stamps, rates = [], [], []
     for unit in range(count):
         due = np.arange(round(SECONDS * rate)) / rate
@@ -79,8 +89,13 @@ def flight(stack: str, rate: float, seed: int, count: int, fault: tuple[float, f
             at = np.floor(stamp / 0.0025) * 0.0025
         else:
             first = 0.0007 * unit
-            at = stamp = np.floor((due + random.uniform(0, 0.006) - first) / 0.005) * 0.005 + first
-        omega = np.sin(np.outer(at, slow) + phase[:3]) + 0.4 * np.sin(np.outer(at, fast) + phase[3:])
+            at = stamp = (
+                np.floor((due + random.uniform(0, 0.006) - first) / 0.005) * 0.005
+                + first
+            )
+        omega = np.sin(np.outer(at, slow) + phase[:3]) + 0.4 * np.sin(
+            np.outer(at, fast) + phase[3:]
+        )
         z = MOTION * omega * factor[unit] + NOISE * random.standard_normal(omega.shape)
         if unit == 1:
             z[:, 1] += (fault[0] + fault[1] * (at - STRIKES)) * (at >= STRIKES)
@@ -89,7 +104,11 @@ def flight(stack: str, rate: float, seed: int, count: int, fault: tuple[float, f
         stamps.append(np.round((stamp + 100.0) * NS).astype(np.int64))
         rates.append(z)
     order = np.argsort(np.concatenate(stamps), kind="stable")
-    return np.concatenate(units)[order], np.concatenate(stamps)[order], np.concatenate(rates)[order]
+    return (
+        np.concatenate(units)[order],
+        np.concatenate(stamps)[order],
+        np.concatenate(rates)[order],
+    )
 
 
 class Told(NamedTuple):
@@ -108,7 +127,9 @@ def judged(config: Config, messages: Messages, struck: bool) -> Told:
     from fdi_ros.monitor.pipeline import Pipeline
 
     pipeline = Pipeline.from_config(config)
-    declared = pipeline.process(Alignment(*source_of(config).alignment).push_block(*messages)).events
+    declared = pipeline.process(
+        Alignment(*source_of(config).alignment).push_block(*messages)
+    ).events
     first, named, wrong, early = np.inf, np.inf, 0, 0
     for event in declared:
         if not event.declares:
@@ -131,18 +152,37 @@ def found(flights: int) -> None:
     for count in (3, 2):
         for stack in ("ardupilot", "px4"):
             whole = Config.from_file(ROOT / "config" / f"{stack}.yaml")
-            given = {"imus.topics": whole.imus.topics[:count], "imus.names": whole.imus.names[:count]}
+            given = {
+                "imus.topics": whole.imus.topics[:count],
+                "imus.names": whole.imus.names[:count],
+            }
             given |= {"imus.mounts": whole.imus.mounts[: 9 * count]}
             for rate in RATES:
-                config, row, wrong, early = whole.replaced({**given, "sample_rate": rate}), [], 0, 0
+                config, row, wrong, early = (
+                    whole.replaced({**given, "sample_rate": rate}),
+                    [],
+                    0,
+                    0,
+                )
                 for name, fault in FAULTS.items():
                     told = [
-                        judged(config, flight(stack, rate, seed, count, fault), any(fault)) for seed in range(flights)
+                        judged(
+                            config, flight(stack, rate, seed, count, fault), any(fault)
+                        )
+                        for seed in range(flights)
                     ]
-                    wrong, early = wrong + sum(t.wrong for t in told), early + sum(t.early for t in told)
+                    wrong, early = (
+                        wrong + sum(t.wrong for t in told),
+                        early + sum(t.early for t in told),
+                    )
                     if any(fault):
-                        row.append(f"{name}: {_share([t.first for t in told])}, {_share([t.named for t in told])}")
-                print(f"{count} {stack:10}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}", flush=True)
+                        row.append(
+                            f"{name}: {_share([t.first for t in told])}, {_share([t.named for t in told])}"
+                        )
+                print(
+                    f"{count} {stack:10}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}",
+                    flush=True,
+                )
 
 
 def _share(times: list[float]) -> str:
@@ -170,7 +210,15 @@ def started(*words: str) -> Iterator[subprocess.Popen]:
 def node(name: str, stack: str, *parameters: str) -> list[str]:
     values = [word for parameter in parameters for word in ("-p", parameter)]
     file = str(ROOT / "config" / f"{stack}.yaml")
-    return ["-m", "fdi_ros.ros.process", name, "--ros-args", "--params-file", file, *values]
+    return [
+        "-m",
+        "fdi_ros.ros.process",
+        name,
+        "--ros-args",
+        "--params-file",
+        file,
+        *values,
+    ]
 
 
 def cpu_seconds(pid: int) -> float:
@@ -198,16 +246,38 @@ def cpu(seconds: float) -> None:
         port = free_port()
         words = [__file__, "reader", str(port)]
         if name == "mavlink_node":
-            words = node("mavlink_node", "px4", f"url:=udpin:127.0.0.1:{port}", "mavlink_node:rate:=100.0")
-        autopilot = Autopilot(boot=time.monotonic_ns() - 100 * NS, rates={26: 100.0, 116: 100.0, 129: 100.0})
-        with OverUdp(port, autopilot), listening(()) as listener, started(*words) as process:
+            words = node(
+                "mavlink_node",
+                "px4",
+                f"url:=udpin:127.0.0.1:{port}",
+                "mavlink_node:rate:=100.0",
+            )
+        autopilot = Autopilot(
+            boot=time.monotonic_ns() - 100 * NS,
+            rates={26: 100.0, 116: 100.0, 129: 100.0},
+        )
+        with (
+            OverUdp(port, autopilot),
+            listening(()) as listener,
+            started(*words) as process,
+        ):
             for unit in (1, 2, 3):
                 topic = f"imu_{unit}/data_raw"
-                listener.create_subscription(Imu, topic, lambda _: came.append(time.monotonic()), 50, raw=True)
+                listener.create_subscription(
+                    Imu, topic, lambda _: came.append(time.monotonic()), 50, raw=True
+                )
             time.sleep(8.0)
-            before, begin, sent = cpu_seconds(process.pid), time.monotonic(), autopilot.sent
+            before, begin, sent = (
+                cpu_seconds(process.pid),
+                time.monotonic(),
+                autopilot.sent,
+            )
             time.sleep(seconds)
-            used, took, sent = cpu_seconds(process.pid) - before, time.monotonic() - begin, autopilot.sent - sent
+            used, took, sent = (
+                cpu_seconds(process.pid) - before,
+                time.monotonic() - begin,
+                autopilot.sent - sent,
+            )
         heard = sum(begin <= at < begin + took for at in came)
         print(
             f"{name:24}{100 * used / took:6.1f} % CPU, {1e6 * used / sent:.0f} us a message; "
@@ -225,18 +295,28 @@ def failover(trials: int) -> None:
     from ros.processes import wait
 
     random = np.random.default_rng(0)
-    print(f"onset to PARAM_SET, s, of {trials} biases each; load of the machine {os.getloadavg()[0]:.1f}")
+    print(
+        f"onset to PARAM_SET, s, of {trials} biases each; load of the machine {os.getloadavg()[0]:.1f}"
+    )
     for rate in (50.0, 100.0):
         fault = np.zeros((3, 3))
         autopilot = Autopilot("ardupilot", boot=time.monotonic_ns() - 100 * NS)
         healthy = autopilot.motion
         autopilot.motion = lambda t, healthy=healthy, fault=fault: healthy(t) + fault
         port, folder = free_port(), tempfile.mkdtemp()
-        words = (f"mavlink_node:url:=udpin:127.0.0.1:{port}", "mavlink_node:failover:=ardupilot")
+        words = (
+            f"mavlink_node:url:=udpin:127.0.0.1:{port}",
+            "mavlink_node:failover:=ardupilot",
+        )
         words += (f"mavlink_node:failover_file:={folder}/out.json",)
         monitor = node("fdi_node", "ardupilot", f"sample_rate:={rate}")
         link = node("mavlink_node", "ardupilot", f"sample_rate:={rate}", *words)
-        with OverUdp(port, autopilot), started(*monitor), started(*link), listening(()) as listener:
+        with (
+            OverUdp(port, autopilot),
+            started(*monitor),
+            started(*link),
+            listening(()) as listener,
+        ):
             for size in (0.1, 0.3, 1.0):
                 times, wrong = [], 0
                 for _ in range(trials):
@@ -244,15 +324,24 @@ def failover(trials: int) -> None:
                     autopilot.armed = False
                     listener.trigger("reset")
                     time.sleep(10.0)
-                    assert wait(lambda own=autopilot: all(own.parameters.values())), "not put back"
+                    assert wait(lambda own=autopilot: all(own.parameters.values())), (
+                        "not put back"
+                    )
                     autopilot.armed = True
                     time.sleep(2.0 + random.random())
                     autopilot.sets.clear()
                     unit, begun = int(random.integers(3)), time.monotonic_ns()
                     fault[unit, random.integers(3)] = size * random.choice([-1, 1])
                     wait(lambda own=autopilot: own.sets, 5.0)
-                    times.append((autopilot.sets[0][0] - begun) / NS if autopilot.sets else np.inf)
-                    wrong += autopilot.flies_with == unit or autopilot.parameters[PARAMETERS[unit]] != 0.0
+                    times.append(
+                        (autopilot.sets[0][0] - begun) / NS
+                        if autopilot.sets
+                        else np.inf
+                    )
+                    wrong += (
+                        autopilot.flies_with == unit
+                        or autopilot.parameters[PARAMETERS[unit]] != 0.0
+                    )
                 late = np.sort(times)[int(np.ceil(0.99 * trials)) - 1]
                 said = f"median {np.median(times):.2f}  99 % {late:.2f}  not taken out {wrong}"
                 print(f"{rate:4g} Hz  {size} rad/s  {said}", flush=True)
@@ -268,8 +357,14 @@ def storms(minutes: float, seconds: float, seed: int) -> None:
             kind = KINDS[seed % len(KINDS)]
             over.listener.clear()
             time.sleep(2.5)
-            cost = weather(over, kind, seconds, seed) | {"load of the machine": os.getloadavg()[0]}
-            print(f"{seed:4} {kind:10}", "  ".join(f"{name} {value:.4g}" for name, value in cost.items()), flush=True)
+            cost = weather(over, kind, seconds, seed) | {
+                "load of the machine": os.getloadavg()[0]
+            }
+            print(
+                f"{seed:4} {kind:10}",
+                "  ".join(f"{name} {value:.4g}" for name, value in cost.items()),
+                flush=True,
+            )
             seed += 1
     print("both nodes ended with exit code 0, no traceback")
 
@@ -288,7 +383,9 @@ def main() -> None:
     storm.add_argument("--seconds", type=float, default=30.0, help="of each storm")
     storm.add_argument("--seed", type=int, default=0)
     arguments = vars(parser.parse_args())
-    {"found": found, "cpu": cpu, "failover": failover, "storms": storms}[arguments.pop("verb")](**arguments)
+    {"found": found, "cpu": cpu, "failover": failover, "storms": storms}[
+        arguments.pop("verb")
+    ](**arguments)
 
 
 if __name__ == "__main__":

@@ -27,13 +27,34 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw")
-RATES = (1000, 1500, 2000, 3000, 4000, 5000, 6000, 8000, 10000, 12000, 14000, 16000, 20000)
+RATES = (
+    1000,
+    1500,
+    2000,
+    3000,
+    4000,
+    5000,
+    6000,
+    8000,
+    10000,
+    12000,
+    14000,
+    16000,
+    20000,
+)
 SUSTAINED = 1e-3  # loss above this share is no sustained rate: the listener itself may be kept waiting for a moment
 CANDIDATES = {
     "fdi_node": [
         *("-m", "fdi_ros.ros.process", "fdi_node", "--ros-args"),
         *("--params-file", str(ROOT / "config" / "two_imus.yaml")),
-        *("-p", "bias.startup_bias_duration:=0.0", "-p", "sample_rate:=1000.0", "-p", "health.stuck_time:=0.0"),
+        *(
+            "-p",
+            "bias.startup_bias_duration:=0.0",
+            "-p",
+            "sample_rate:=1000.0",
+            "-p",
+            "health.stuck_time:=0.0",
+        ),
     ],
     "plain relay": [__file__, "relay", "plain"],
     "raw relay": [__file__, "relay", "raw"],
@@ -74,13 +95,18 @@ def source(rate: float, seconds: float) -> None:
 
     rclpy.init()
     node = rclpy.create_node("source")
-    outputs = [node.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in TOPICS]
+    outputs = [
+        node.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in TOPICS
+    ]
     while not all(output.get_subscription_count() for output in outputs):
         time.sleep(0.05)
     time.sleep(0.5)
     template, nothing = ImuTemplate("imu"), (0.0,) * 9
     values = np.random.default_rng(0).normal(0, 0.003, (5000, 2, 3)).tolist()
-    messages = [[bytearray(template.fill(0, value, nothing)) for value in pair] for pair in values]
+    messages = [
+        [bytearray(template.fill(0, value, nothing)) for value in pair]
+        for pair in values
+    ]
     start = time.perf_counter()
     for k in range(round(rate * seconds)):
         due = start + k / rate
@@ -92,7 +118,10 @@ def source(rate: float, seconds: float) -> None:
             struct.pack_into("<iI", message, 4, *stamp)
             output.publish(bytes(message))
     # The achieved rate: a source that cannot keep up is no measure of the node.
-    print(round(rate * seconds), (round(rate * seconds) - 1) / (time.perf_counter() - start))
+    print(
+        round(rate * seconds),
+        (round(rate * seconds) - 1) / (time.perf_counter() - start),
+    )
 
 
 def sink(file: str) -> None:
@@ -109,14 +138,25 @@ def sink(file: str) -> None:
     node = rclpy.create_node("sink")
     arrived: list[tuple[int, bytes]] = []
     qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-    node.create_subscription(Imu, "fused", lambda data: arrived.append((time.time_ns(), data[:12])), qos, raw=True)
+    node.create_subscription(
+        Imu,
+        "fused",
+        lambda data: arrived.append((time.time_ns(), data[:12])),
+        qos,
+        raw=True,
+    )
     executor = EventsExecutor()
     executor.add_node(node)
     while not stop:
         executor.spin_once(timeout_sec=0.1)
     stamps = [struct.unpack_from("<iI", head, 4) for _, head in arrived]
     Path(file).write_text(
-        json.dumps([(at, sec * 10**9 + ns) for (at, _), (sec, ns) in zip(arrived, stamps, strict=True)])
+        json.dumps(
+            [
+                (at, sec * 10**9 + ns)
+                for (at, _), (sec, ns) in zip(arrived, stamps, strict=True)
+            ]
+        )
     )
 
 
@@ -130,14 +170,18 @@ def measure(candidate: str, rate: float, seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/arrived.json"
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        node = subprocess.Popen([sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet)
+        node = subprocess.Popen(
+            [sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet
+        )
         listener = subprocess.Popen([sys.executable, __file__, "sink", file])
         try:
             time.sleep(2.5)
             before = cpu_seconds(node.pid)
             begin = time.perf_counter()
             words = [sys.executable, __file__, "source", str(rate), str(seconds)]
-            said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60 + seconds).stdout
+            said = subprocess.run(
+                words, capture_output=True, text=True, check=True, timeout=60 + seconds
+            ).stdout
             used = cpu_seconds(node.pid) - before
             time.sleep(0.5)
         finally:
@@ -152,7 +196,9 @@ def measure(candidate: str, rate: float, seconds: float) -> dict[str, float]:
         "achieved_rate": achieved,
         "sent": sent,
         "lost": sent - len(arrived),
-        "cpu_percent": 100 * used / min(seconds * rate / achieved, time.perf_counter() - begin),
+        "cpu_percent": 100
+        * used
+        / min(seconds * rate / achieved, time.perf_counter() - begin),
         "p50_us": latency[len(latency) // 2] if latency else float("nan"),
         "p99_us": latency[len(latency) * 99 // 100] if latency else float("nan"),
     }
@@ -164,7 +210,10 @@ def highest(candidate: str, seconds: float) -> tuple[float, list[dict[str, float
     for rate in RATES:
         run = measure(candidate, rate, seconds)
         runs.append(run)
-        print(f"  {candidate}: {rate} Hz, achieved {run['achieved_rate']:.0f}, lost {run['lost']:.0f}", flush=True)
+        print(
+            f"  {candidate}: {rate} Hz, achieved {run['achieved_rate']:.0f}, lost {run['lost']:.0f}",
+            flush=True,
+        )
         if run["lost"] > SUSTAINED * run["sent"] or run["achieved_rate"] < 0.97 * rate:
             break
         best = rate
@@ -180,17 +229,32 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_benchmark_")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    runs = {candidate: measure(candidate, 1000, arguments.seconds) for candidate in CANDIDATES}
-    best = {candidate: highest(candidate, arguments.search_seconds) for candidate in CANDIDATES}
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
+    runs = {
+        candidate: measure(candidate, 1000, arguments.seconds)
+        for candidate in CANDIDATES
+    }
+    best = {
+        candidate: highest(candidate, arguments.search_seconds)
+        for candidate in CANDIDATES
+    }
     load = os.getloadavg()[0]
-    print(f"\n2 x 1 kHz for {arguments.seconds:g} s, {os.cpu_count()} cores, load of the machine {load:.1f}")
-    print(f"{'':14}{'CPU %':>8}{'p50 us':>9}{'p99 us':>9}{'lost':>6}{'highest rate without loss, Hz':>32}")
+    print(
+        f"\n2 x 1 kHz for {arguments.seconds:g} s, {os.cpu_count()} cores, load of the machine {load:.1f}"
+    )
+    print(
+        f"{'':14}{'CPU %':>8}{'p50 us':>9}{'p99 us':>9}{'lost':>6}{'highest rate without loss, Hz':>32}"
+    )
     for candidate, run in runs.items():
         figures = f"{run['cpu_percent']:8.1f}{run['p50_us']:9.0f}{run['p99_us']:9.0f}{run['lost']:6.0f}"
         print(f"{candidate:14}{figures}{best[candidate][0]:32.0f}")
     if arguments.json:
-        result = {c: {"at_1_khz": runs[c], "highest_rate": best[c][0], "search": best[c][1]} for c in CANDIDATES}
+        result = {
+            c: {"at_1_khz": runs[c], "highest_rate": best[c][0], "search": best[c][1]}
+            for c in CANDIDATES
+        }
         arguments.json.write_text(json.dumps(result, indent=2))
 
 

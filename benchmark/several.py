@@ -19,7 +19,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trials import Array, Asked, Flight, Mask, Rng, Row, faulty, first, fresh, is_state, ways
+from trials import (
+    Array,
+    Asked,
+    Flight,
+    Mask,
+    Rng,
+    Row,
+    faulty,
+    first,
+    fresh,
+    is_state,
+    ways,
+)
 
 from fdi_ros import Pipeline
 from fdi_ros.experiments.flight import GyroErrors
@@ -28,9 +40,16 @@ from fdi_ros.monitor.output import ChannelState
 LENGTH, ONSET = 40.0, 10.0  # of a flight, and when faults begin, s
 GROWTH = 5.0  # a ramp has its size after so long, s
 COUNTED = ("wrong", "held", "named", "early", "unjudged")
-FIGURES = {"flights": "d", **dict.fromkeys(COUNTED, "d"), "set_size": ".1f", "delay": ".2f"}
+FIGURES = {
+    "flights": "d",
+    **dict.fromkeys(COUNTED, "d"),
+    "set_size": ".1f",
+    "delay": ".2f",
+}
 
-Courses = Callable[[Array, Rng, int], Array]  # errors of the guilty channels, (N, k) in sigma, at times (N,) s
+Courses = Callable[
+    [Array, Rng, int], Array
+]  # errors of the guilty channels, (N, k) in sigma, at times (N,) s
 
 
 def sizes(rng: Rng, count: int, least: float = 8.0, most: float = 50.0) -> Array:
@@ -51,12 +70,16 @@ def of_a_unit(seconds: Array, rng: Rng, count: int) -> Array:
 
 
 def sequence(seconds: Array, rng: Rng, count: int) -> Array:
-    return (seconds[:, None] >= ONSET + np.array([0.0, rng.choice([0.05, 0.5, 5.0])])) * sizes(rng, count)
+    return (
+        seconds[:, None] >= ONSET + np.array([0.0, rng.choice([0.05, 0.5, 5.0])])
+    ) * sizes(rng, count)
 
 
 def intermittent(seconds: Array, rng: Rng, count: int) -> Array:
     periods, duties = rng.uniform(0.2, 3.0, count), rng.uniform(0.1, 0.6, count)
-    on = (seconds[:, None] >= ONSET) & ((seconds[:, None] - ONSET) % periods < duties * periods)
+    on = (seconds[:, None] >= ONSET) & (
+        (seconds[:, None] - ONSET) % periods < duties * periods
+    )
     return on * sizes(rng, count)
 
 
@@ -95,7 +118,8 @@ def fly(pipeline: Pipeline, rng: Rng, count: int, courses: Courses) -> dict[str,
         "named": bool(alone[-1, guilty].all()) and not wrong,
         "early": bool(declared[:onset].any()),
         "set_size": int(among[-1].sum()),
-        "delay": (first(declared[onset:].any(axis=1)) - 1) / pipeline.config.sample_rate,
+        "delay": (first(declared[onset:].any(axis=1)) - 1)
+        / pipeline.config.sample_rate,
     }
 
 
@@ -104,8 +128,22 @@ def measure(asked: Asked) -> Iterator[Row]:
     flights = asked.count(20)
     for label, mounting, config, name in ways(asked, None, KINDS):
         pipeline = Pipeline.from_config(config)
-        outcomes = [fly(pipeline, asked.rng("several", mounting, name, k), *KINDS[name]) for k in range(flights)]
+        outcomes = [
+            fly(pipeline, asked.rng("several", mounting, name, k), *KINDS[name])
+            for k in range(flights)
+        ]
         sets = [o["set_size"] for o in outcomes if o.get("set_size")]
         counts = {word: sum(o.get(word, False) for o in outcomes) for word in COUNTED}
-        size, delays = float(np.mean(sets)) if sets else None, [o.get("delay", np.inf) for o in outcomes]
-        yield label, {"flights": flights, **counts, "set_size": size, "delay": float(np.median(delays))}
+        size, delays = (
+            float(np.mean(sets)) if sets else None,
+            [o.get("delay", np.inf) for o in outcomes],
+        )
+        yield (
+            label,
+            {
+                "flights": flights,
+                **counts,
+                "set_size": size,
+                "delay": float(np.median(delays)),
+            },
+        )

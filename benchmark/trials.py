@@ -22,7 +22,13 @@ from rosbags.typesys import Stores, get_typestore
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.experiments.flight import GyroErrors, Gyros, Motion, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import (
+    GyroErrors,
+    Gyros,
+    Motion,
+    regular_stamps,
+    vehicle_motion,
+)
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.output import ChannelState, Output
 
@@ -47,7 +53,9 @@ PARALLEL: dict[str, Any] = {
     "imus.mounts": (),
 }
 """What makes three parallel units of the two of two_imus.yaml."""
-NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)  # only the biases are not as they should be
+NO_ERRORS = GyroErrors(
+    scale_std=0.0, misalignment_std=0.0, delay_std=0.0
+)  # only the biases are not as they should be
 REST = 6.0  # at the start of every flight, s
 
 
@@ -71,7 +79,9 @@ class Asked:
 
     def rng(self, *words: object) -> Rng:
         """Random generator of each trial's own: what is measured beside it changes nothing."""
-        return np.random.default_rng([self.seed, zlib.crc32(" ".join(map(str, words)).encode())])
+        return np.random.default_rng(
+            [self.seed, zlib.crc32(" ".join(map(str, words)).encode())]
+        )
 
     def configs(self, settings: dict[str, Any] | None = None) -> dict[str, Config]:
         """Return the configs of six channels on a cone and nine of three parallel units; the command line wins."""
@@ -84,7 +94,10 @@ class Asked:
 
     def monitors(self, settings: dict[str, Any] | None = None) -> dict[str, Pipeline]:
         """Return the monitors of `configs`."""
-        return {name: Pipeline.from_config(config) for name, config in self.configs(settings).items()}
+        return {
+            name: Pipeline.from_config(config)
+            for name, config in self.configs(settings).items()
+        }
 
 
 def fresh(pipeline: Pipeline, block: Block) -> Output:
@@ -104,7 +117,9 @@ class Sines:
     @classmethod
     def drawn(cls, amplitude: float, rng: Rng) -> Sines:
         """With periods of 3 to 10 s."""
-        return cls(amplitude, 2 * np.pi / rng.uniform(3, 10, 3), rng.uniform(0, 2 * np.pi, 3))
+        return cls(
+            amplitude, 2 * np.pi / rng.uniform(3, 10, 3), rng.uniform(0, 2 * np.pi, 3)
+        )
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
@@ -125,12 +140,22 @@ class Flight:
 
     @classmethod
     def of(
-        cls, pipeline: Pipeline, rng: Rng, seconds: float, motion: Motion | Sines | None, errors: GyroErrors = NO_ERRORS
+        cls,
+        pipeline: Pipeline,
+        rng: Rng,
+        seconds: float,
+        motion: Motion | Sines | None,
+        errors: GyroErrors = NO_ERRORS,
     ) -> Flight:
         """Make gyros and fly them; None: as a small vehicle flies."""
         gyros = errors.draw(pipeline.geometry, rng)
         stamp = regular_stamps(seconds, pipeline.config.sample_rate, START)
-        return cls(pipeline.geometry, gyros, motion or vehicle_motion(seconds, rng, rest=REST), stamp)
+        return cls(
+            pipeline.geometry,
+            gyros,
+            motion or vehicle_motion(seconds, rng, rest=REST),
+            stamp,
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -182,7 +207,9 @@ def white(rng: Rng, rows: int, n: int) -> Array:
 
 def faulty(output: Output) -> Mask:
     """(N, n) whether a channel is declared by itself."""
-    return np.asarray((output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE))
+    return np.asarray(
+        (output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE)
+    )
 
 
 def is_state(output: Output, state: ChannelState) -> Mask:
@@ -205,7 +232,13 @@ class Found(NamedTuple):
     judged: bool  # the channels were checked when it began
 
 
-def found(output: Output, channel: int, onset: int, guilty: tuple[int, ...] = (), since: int = 0) -> Found:
+def found(
+    output: Output,
+    channel: int,
+    onset: int,
+    guilty: tuple[int, ...] = (),
+    since: int = 0,
+) -> Found:
     """Say what came of a fault of one channel from a sample on; guilty: others that are faulty, all clear since."""
     alone, among = faulty(output), is_state(output, ChannelState.AMBIGUOUS)
     alone[:, list(guilty)] = among[:, list(guilty)] = False
@@ -213,14 +246,23 @@ def found(output: Output, channel: int, onset: int, guilty: tuple[int, ...] = ()
     early = (alone | among)[since:onset].any()
     own = alone[onset:, channel]
     judged = not is_state(output, ChannelState.UNCHECKED)[onset - 1, channel]
-    return Found(first(own | among[onset:, channel]), first(own), bool(wrong), bool(early), bool(judged))
+    return Found(
+        first(own | among[onset:, channel]),
+        first(own),
+        bool(wrong),
+        bool(early),
+        bool(judged),
+    )
 
 
 def summary(outcomes: list[Found], most: float) -> dict[str, Any]:
     """Figures of faults that were watched for at most so many samples: mean and median (missed ones count as that)."""
     kept = [o for o in outcomes if o.judged and not o.early]
     declared, named = (np.array([o[k] for o in kept]) for k in (0, 1))
-    share = {name: sum(getattr(o, name) for o in outcomes) / len(outcomes) for name in ("wrong", "early")}
+    share = {
+        name: sum(getattr(o, name) for o in outcomes) / len(outcomes)
+        for name in ("wrong", "early")
+    }
     share["unjudged"] = sum(not o.judged for o in outcomes) / len(outcomes)
     if not kept:
         return share
@@ -243,7 +285,9 @@ FOUND = {
 """Formats of the figures of `summary`."""
 
 
-def labelled(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Iterator[tuple[str, Pipeline, Any]]:
+def labelled(
+    asked: Asked, settings: dict[str, Any] | None, kinds: Any
+) -> Iterator[tuple[str, Pipeline, Any]]:
     """Every kind with both mountings that is asked for: its label, the monitor and the kind."""
     for mounting, pipeline in asked.monitors(settings).items():
         for kind in kinds:
@@ -254,14 +298,23 @@ def labelled(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Itera
 def array_of(config: Config) -> Config:
     """Return the config of one array of the channels of a config of units."""
     axes = Pipeline.from_config(config).geometry.axes
-    mounting = {"geometry.preset": "axes", "geometry.axes": tuple(axes.ravel().tolist())}
+    mounting = {
+        "geometry.preset": "axes",
+        "geometry.axes": tuple(axes.ravel().tolist()),
+    }
     # The cone's own preset knows its triads; its fourth axis is the reverse of the unit's.
     mounting = mounting if len(axes) > 6 else {"geometry.preset": "two_triad_cone"}
-    same = {name: value for name, value in config.parameters().items() if name.split(".")[0] in ("bias", "detector")}
+    same = {
+        name: value
+        for name, value in config.parameters().items()
+        if name.split(".")[0] in ("bias", "detector")
+    }
     return Config.from_parameters({"input": "channels", **STATED, **mounting, **same})
 
 
-def ways(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Iterator[tuple[str, str, Config, Any]]:
+def ways(
+    asked: Asked, settings: dict[str, Any] | None, kinds: Any
+) -> Iterator[tuple[str, str, Config, Any]]:
     """Every kind with both mountings and both inputs: its label, the mounting, the config and the kind."""
     for mounting, units in asked.configs(settings).items():
         for way, config in (("Imu topics", units), ("array", array_of(units))):
@@ -270,14 +323,25 @@ def ways(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Iterator[
                     yield label, mounting, config, kind
 
 
-def write_bag(block: Block, topics: tuple[str, ...], path: Path, late: Array | float = 0.0) -> None:
+def write_bag(
+    block: Block, topics: tuple[str, ...], path: Path, late: Array | float = 0.0
+) -> None:
     """Write samples as messages of each unit, stamped late by (N, units) s; they arrive when they are stamped."""
-    stamps = block.stamp[:, None] + np.round(1e9 * np.broadcast_to(late, (len(block.stamp), len(topics)))).astype(int)
+    stamps = block.stamp[:, None] + np.round(
+        1e9 * np.broadcast_to(late, (len(block.stamp), len(topics)))
+    ).astype(int)
     template = ImuTemplate("imu")
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         store = get_typestore(Stores.ROS2_JAZZY)
-        units = [writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store) for topic in topics]
+        units = [
+            writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store)
+            for topic in topics
+        ]
         for at in np.argsort(stamps, axis=None, kind="stable"):
             row, unit = divmod(int(at), len(topics))
-            data = template.fill(stamps[row, unit], block.z[row, 3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
+            data = template.fill(
+                stamps[row, unit],
+                block.z[row, 3 * unit : 3 * unit + 3].tolist(),
+                (0.0,) * 9,
+            )
             writer.write(units[unit], int(stamps[row, unit]), data)

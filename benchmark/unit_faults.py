@@ -25,14 +25,28 @@ from typing import Any
 
 import numpy as np
 from flights import Kept
-from trials import START, Array, Asked, Flight, Rng, Row, faulty, is_state, ways, write_bag
+from trials import (
+    START,
+    Array,
+    Asked,
+    Flight,
+    Rng,
+    Row,
+    faulty,
+    is_state,
+    ways,
+    write_bag,
+)
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.flight import GyroErrors
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import replay
 
-LENGTH, ONSET = 120.0, 20.0  # of a flight, and when a fault begins that is not there from the start, s
+LENGTH, ONSET = (
+    120.0,
+    20.0,
+)  # of a flight, and when a fault begins that is not there from the start, s
 COUNTED = ("other", "single", "unit", "in_sets")
 FIGURES = {
     "flights": "d",
@@ -42,7 +56,9 @@ FIGURES = {
     **dict.fromkeys(("off", "sigmas", "nees"), ".2f"),
 }
 
-Late = Callable[[Array, Rng], Array]  # by how much the stamps of the unit are late, (N,) s, at times (N,) s
+Late = Callable[
+    [Array, Rng], Array
+]  # by how much the stamps of the unit are late, (N,) s, at times (N,) s
 Change = Callable[[Array, Array, Array, Rng], Array]
 """What the unit shows instead: of times (N,) s, values (N, 3) rad/s and axes (3, 3)."""
 
@@ -57,7 +73,9 @@ def running(share: float) -> Late:
 
 def jittering(std: float) -> Late:
     # A stamp never comes before that of the sample before.
-    return lambda seconds, rng: np.clip(std * rng.standard_normal(len(seconds)), -0.0045, 0.0045)
+    return lambda seconds, rng: np.clip(
+        std * rng.standard_normal(len(seconds)), -0.0045, 0.0045
+    )
 
 
 def gain(factor: float) -> Change:
@@ -79,13 +97,18 @@ def turning(growth: float, step: float = 0.0) -> Change:
     def change(seconds: Array, shown: Array, axes: Array, rng: Rng) -> Array:
         direction = rng.standard_normal(3)
         course = (seconds >= ONSET) * (step + growth * (seconds - ONSET))
-        return shown + course[:, None] * (axes @ (direction / np.linalg.norm(direction)))
+        return shown + course[:, None] * (
+            axes @ (direction / np.linalg.norm(direction))
+        )
 
     return change
 
 
 LATE: dict[str, Late] = {
-    **{f"late by {late:g} ms": constant(1e-3 * late) for late in (0, 0.5, 1, 2, 3, 5, 10, 20, 50)},
+    **{
+        f"late by {late:g} ms": constant(1e-3 * late)
+        for late in (0, 0.5, 1, 2, 3, 5, 10, 20, 50)
+    },
     **{f"early by {late:g} ms": constant(-1e-3 * late) for late in (0.5, 2, 5, 10)},
     **{f"clock {share:g} ppm off": running(1e-6 * share) for share in (20, 100, 200)},
     **{f"jitter {std:g} ms": jittering(1e-3 * std) for std in (1, 3)},
@@ -125,18 +148,27 @@ def fly(config: Config, rng: Rng, kind: str) -> dict[str, Any]:
         late[:, unit] = LATE[kind](seconds, rng)
     # Samples of an array have one stamp, whenever they were taken; messages have their own.
     noise = rng.standard_normal(flight.shape)
-    block = (flight if config.input == "imus" else replace(flight, late=late)).block(noise)
+    block = (flight if config.input == "imus" else replace(flight, late=late)).block(
+        noise
+    )
     if kind in CHANGES:
-        block.z[:, own] = CHANGES[kind](seconds, block.z[:, own], flight.gyros.axes[own], rng)
+        block.z[:, own] = CHANGES[kind](
+            seconds, block.z[:, own], flight.gyros.axes[own], rng
+        )
     given, pipeline = outputs(config, block, late)
-    stamp, rate = np.concatenate([o.stamp for o in given]), np.concatenate([o.rate for o in given])
+    stamp, rate = (
+        np.concatenate([o.stamp for o in given]),
+        np.concatenate([o.rate for o in given]),
+    )
     after = (stamp - START) * 1e-9 >= ONSET
     at, valid = (stamp - START) * 1e-9, after & np.isfinite(rate).all(axis=1)
     information = np.linalg.inv(np.concatenate([o.covariance for o in given])[valid])
     nees = []
     for shift in (0.0, np.interp(at, seconds, late[:, unit])):
         error = (rate - flight.motion.rate_at(at - shift))[valid]
-        nees.append(float(np.einsum("ki,kij,kj->k", error, information, error).mean()) / 3)
+        nees.append(
+            float(np.einsum("ki,kij,kj->k", error, information, error).mean()) / 3
+        )
     alone = np.concatenate([faulty(o) for o in given]).any(axis=0)
     unchecked = np.concatenate([is_state(o, ChannelState.UNCHECKED) for o in given])
     other = bool(np.delete(alone, own).any())
@@ -146,7 +178,9 @@ def fly(config: Config, rng: Rng, kind: str) -> dict[str, Any]:
         "unit": bool(alone[own].all()) and not other,
         "in_sets": any(bool(is_state(o, ChannelState.AMBIGUOUS).any()) for o in given),
         "unjudged": float(unchecked[after].any(axis=1).mean()),
-        "off": delay_error(pipeline, late[-1] - flight.gyros.delay[::3]) if "jitter" not in kind else None,
+        "off": delay_error(pipeline, late[-1] - flight.gyros.delay[::3])
+        if "jitter" not in kind
+        else None,
         "nees": min(nees) if valid.any() else None,
     }
 
@@ -160,21 +194,37 @@ def delay_error(pipeline: Pipeline, late: Array) -> tuple[float, float] | None:
     error = delays - late
     # Delays common to all units cannot be seen.
     against = np.abs(error - error[0])[1:] / np.maximum(std[1:], 1e-9)
-    return float(np.sqrt(((error - error.mean()) ** 2).sum() / (len(late) - 1))), float(against.max())
+    return float(np.sqrt(((error - error.mean()) ** 2).sum() / (len(late) - 1))), float(
+        against.max()
+    )
 
 
 def measure(asked: Asked) -> Iterator[Row]:
     """Every kind, mounting and input."""
     flights = asked.count(2)
-    for label, mounting, config, kind in ways(asked, {"imus.max_skew": 1e-4}, (*LATE, *CHANGES)):
-        outcomes = [fly(config, asked.rng("unit", mounting, kind, k), kind) for k in range(flights)]
+    for label, mounting, config, kind in ways(
+        asked, {"imus.max_skew": 1e-4}, (*LATE, *CHANGES)
+    ):
+        outcomes = [
+            fly(config, asked.rng("unit", mounting, kind, k), kind)
+            for k in range(flights)
+        ]
         told = np.array([o["off"] for o in outcomes if o["off"] is not None])
         nees = [o["nees"] for o in outcomes if o["nees"] is not None]
         figures = {
             "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
             "told": len(told),
-            "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
+            "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean()))
+            if len(told)
+            else None,
             "sigmas": float(told[:, 1].max()) if len(told) else None,
             "nees": float(np.mean(nees)) if nees else None,
         }
-        yield label, {"flights": flights, **{name: sum(o[name] for o in outcomes) for name in COUNTED}, **figures}
+        yield (
+            label,
+            {
+                "flights": flights,
+                **{name: sum(o[name] for o in outcomes) for name in COUNTED},
+                **figures,
+            },
+        )

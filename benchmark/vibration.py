@@ -28,7 +28,11 @@ from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.flight import Motion, regular_stamps
 from fdi_ros.monitor.output import ChannelState
 
-LENGTH, MOTORS, COUNTED = 60.0, 10.0, 15.0  # s: of a flight, until the motors start, and from where on errors count
+LENGTH, MOTORS, COUNTED = (
+    60.0,
+    10.0,
+    15.0,
+)  # s: of a flight, until the motors start, and from where on errors count
 SCALE, MISALIGNMENT, BIAS = 0.003, float(np.radians(0.2)), 0.01
 SUMS = {
     "nees": (np.mean, ".2f"),
@@ -91,9 +95,16 @@ def manoeuvres(rng: Rng) -> Callable[[Array], Array]:
         if kind == "hover":
             targets = [(0.03 * rng.standard_normal(3), 0.4) for _ in range(8)]
         elif kind == "yaw":
-            targets = [(np.array([0.0, 0.0, rng.choice([-1, 1]) * rng.uniform(0.5, 1.3)]), rng.uniform(1.0, 3.0))]
+            targets = [
+                (
+                    np.array([0.0, 0.0, rng.choice([-1, 1]) * rng.uniform(0.5, 1.3)]),
+                    rng.uniform(1.0, 3.0),
+                )
+            ]
         else:
-            targets = [(rng.uniform(-1.0, 1.0, 3), rng.uniform(0.1, 0.4)) for _ in range(4)]
+            targets = [
+                (rng.uniform(-1.0, 1.0, 3), rng.uniform(0.1, 0.4)) for _ in range(4)
+            ]
         for target, hold in [*targets, (np.zeros(3), 0.3)]:
             ramp = 0.15 + rng.uniform(0.0, 0.2)
             times += [times[-1] + ramp, times[-1] + ramp + hold]
@@ -109,7 +120,16 @@ def flight_of(config: Config, nominal: Array, rng: Rng) -> Flight:
     axes = (nominal + across) * (1 + rng.normal(0, SCALE, (n, 1)))
     t = np.arange(round(LENGTH * rate)) / rate
     noise = rng.normal(0, BIAS, n) + NOISE * rng.standard_normal((len(t), n))
-    return Flight(rng, rate, t, manoeuvres(rng), axes, np.zeros((len(t), n // 3)), noise, np.full(n, NOISE))
+    return Flight(
+        rng,
+        rate,
+        t,
+        manoeuvres(rng),
+        axes,
+        np.zeros((len(t), n // 3)),
+        noise,
+        np.full(n, NOISE),
+    )
 
 
 def white(flight: Flight) -> None:
@@ -127,7 +147,11 @@ def tones(flight: Flight, size: float, *hertz: float) -> None:
     """Lines of their own phase in each channel, amplitude size, rad/s."""
     for frequency in hertz:
         phase = flight.rng.uniform(0, 2 * np.pi, len(flight.axes))
-        flight.noise += size * running_at(flight.t) * np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
+        flight.noise += (
+            size
+            * running_at(flight.t)
+            * np.sin(2 * np.pi * frequency * flight.t[:, None] + phase)
+        )
     flight.std[:] = np.nan
 
 
@@ -138,21 +162,33 @@ def running_at(t: Array) -> Array:
 
 def body(flight: Flight, size: float, hertz: float) -> None:
     """Rotate the whole body, which units see 15 % and 0.15 rad differently."""
-    along, angle = size * flight.rng.uniform(0.5, 1.0, 3), flight.rng.uniform(0, 2 * np.pi, 3)
-    flight.shaken = lambda t: running_at(t) * along * np.sin(2 * np.pi * hertz * t[:, None] + angle)
+    along, angle = (
+        size * flight.rng.uniform(0.5, 1.0, 3),
+        flight.rng.uniform(0, 2 * np.pi, 3),
+    )
+    flight.shaken = lambda t: (
+        running_at(t) * along * np.sin(2 * np.pi * hertz * t[:, None] + angle)
+    )
     flight.gain = np.repeat(1 + 0.15 * flight.rng.standard_normal(flight.units), 3)
-    flight.phase = np.repeat(0.15 * flight.rng.standard_normal(flight.units), 3) / (2 * np.pi * hertz)
+    flight.phase = np.repeat(0.15 * flight.rng.standard_normal(flight.units), 3) / (
+        2 * np.pi * hertz
+    )
     flight.std[:] = np.nan
 
 
 def broad(flight: Flight, size: float) -> None:
     """Vibration of the whole body from 20 to 90 Hz, folded, seen 15 % differently."""
-    hertz, angle = flight.rng.uniform(20, 90, 40), flight.rng.uniform(0, 2 * np.pi, (40, 3))
+    hertz, angle = (
+        flight.rng.uniform(20, 90, 40),
+        flight.rng.uniform(0, 2 * np.pi, (40, 3)),
+    )
     along = size * np.sqrt(2 / 40) * flight.rng.standard_normal((40, 3))
 
     def shaken(t: Array) -> Array:
         parts = zip(hertz, along, angle, strict=True)
-        return running_at(t) * sum(a * np.sin(2 * np.pi * f * t[:, None] + p) for f, a, p in parts)
+        return running_at(t) * sum(
+            a * np.sin(2 * np.pi * f * t[:, None] + p) for f, a, p in parts
+        )
 
     flight.shaken = shaken
     flight.gain = np.repeat(1 + 0.15 * flight.rng.standard_normal(flight.units), 3)
@@ -172,16 +208,27 @@ def low_pass(flight: Flight, hertz: float) -> None:
 
 def clocks(flight: Flight, ppm: float) -> None:
     """Units whose clocks drift apart."""
-    flight.late[:] += 1e-6 * ppm * flight.t[:, None] * flight.rng.permutation(np.linspace(0, 1, flight.units))
+    flight.late[:] += (
+        1e-6
+        * ppm
+        * flight.t[:, None]
+        * flight.rng.permutation(np.linspace(0, 1, flight.units))
+    )
     flight.std[:] = np.nan
 
 
 def louder(flight: Flight, count: int, factor: float) -> None:
     """Noise of one channel, or of a unit, so many times as strong."""
     n = len(flight.axes)
-    own = [int(flight.rng.integers(n))] if count == 1 else 3 * int(flight.rng.integers(n // 3)) + np.arange(3)
+    own = (
+        [int(flight.rng.integers(n))]
+        if count == 1
+        else 3 * int(flight.rng.integers(n // 3)) + np.arange(3)
+    )
     added = flight.rng.standard_normal((len(flight.t), count))
-    flight.noise[:, own] += np.sqrt(factor**2 - 1) * NOISE * running_at(flight.t) * added
+    flight.noise[:, own] += (
+        np.sqrt(factor**2 - 1) * NOISE * running_at(flight.t) * added
+    )
     flight.std[own] *= factor
 
 
@@ -192,23 +239,33 @@ def landing(flight: Flight, size: float) -> None:
 
     def shock(t: Array) -> Array:
         since = np.maximum(t - at, 0.0)[:, None]
-        return before(t) + along * np.sin(2 * np.pi * 12.0 * since) * np.exp(-since / 0.06)
+        return before(t) + along * np.sin(2 * np.pi * 12.0 * since) * np.exp(
+            -since / 0.06
+        )
 
     flight.motion = shock
-    flight.late += flight.rng.uniform(0, 1 / flight.rate, flight.units) - 0.5 / flight.rate
+    flight.late += (
+        flight.rng.uniform(0, 1 / flight.rate, flight.units) - 0.5 / flight.rate
+    )
     flight.std[:] = np.nan
 
 
 def rectified(flight: Flight, size: float) -> None:
     """Biases that move as the motors start."""
-    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * running_at(flight.t)
+    flight.noise += (
+        size * flight.rng.standard_normal(len(flight.axes)) * running_at(flight.t)
+    )
     tones(flight, 0.02, 41.0)
 
 
 def warming(flight: Flight, size: float) -> None:
     """Biases that warm by so much with a time constant of 30 s."""
     since = np.maximum(flight.t - MOTORS, 0.0)[:, None]
-    flight.noise += size * flight.rng.standard_normal(len(flight.axes)) * (1 - np.exp(-since / 30.0))
+    flight.noise += (
+        size
+        * flight.rng.standard_normal(len(flight.axes))
+        * (1 - np.exp(-since / 30.0))
+    )
 
 
 def misaligned(flight: Flight) -> None:
@@ -216,21 +273,36 @@ def misaligned(flight: Flight) -> None:
     turned = flight.rng.normal(0, np.radians(0.5), (flight.units, 3))
     for u, (x, y, z) in enumerate(turned):
         own = slice(3 * u, 3 * u + 3)
-        flight.axes[own] = flight.axes[own] @ (np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+        flight.axes[own] = flight.axes[own] @ (
+            np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        )
     flight.std[:] = np.nan
 
 
 TONES = [
     (size, hertz, rate)
     for size in (0.03, 0.1)
-    for hertz, rate in ((12.7, 100.0), (43.0, 100.0), (87.3, 100.0), (149.0, 100.0), (149.0, 50.0), (87.3, 50.0))
+    for hertz, rate in (
+        (12.7, 100.0),
+        (43.0, 100.0),
+        (87.3, 100.0),
+        (149.0, 100.0),
+        (149.0, 50.0),
+        (87.3, 50.0),
+    )
 ]
 CONDITIONS: dict[str, tuple[Any, ...]] = {
     "white": (100.0, white),
     **{f"unit {u + 1} late by 20 ms": (100.0, late, u) for u in range(4)},
-    **{f"own tones {size} {hertz} Hz at {rate:.0f}": (rate, tones, size, hertz) for size, hertz, rate in TONES},
+    **{
+        f"own tones {size} {hertz} Hz at {rate:.0f}": (rate, tones, size, hertz)
+        for size, hertz, rate in TONES
+    },
     "two own tones 0.1": (100.0, tones, 0.1, 31.0, 43.0),
-    **{f"body {size} {hertz} Hz at {rate:.0f}": (rate, body, size, hertz) for size, hertz, rate in TONES},
+    **{
+        f"body {size} {hertz} Hz at {rate:.0f}": (rate, body, size, hertz)
+        for size, hertz, rate in TONES
+    },
     "body broadband 0.05": (100.0, broad, 0.05),
     "AR 0.9": (100.0, coloured, 0.9),
     "low pass 30 Hz at 400": (400.0, low_pass, 30.0),
@@ -255,7 +327,11 @@ def config_of(units: int, rate: float, asked: Asked) -> Config:
     }
     if units > 2:
         names = tuple(f"imu_{u + 1}" for u in range(units))
-        changes |= {"imus.topics": tuple(f"{name}/data_raw" for name in names), "imus.names": names, "imus.mounts": ()}
+        changes |= {
+            "imus.topics": tuple(f"{name}/data_raw" for name in names),
+            "imus.names": names,
+            "imus.mounts": (),
+        }
     return Config.from_file(CONFIGS / "two_imus.yaml", {**changes, **asked.settings})
 
 
@@ -265,13 +341,26 @@ def measure(asked: Asked) -> Iterator[Row]:
     for name, (rate, *_) in CONDITIONS.items():
         for units in (2, 3, 4):
             label = f"{units} units, {name}"
-            if not asked.wants(label) or (name.startswith("unit ") and int(name[5]) > units):
+            if not asked.wants(label) or (
+                name.startswith("unit ") and int(name[5]) > units
+            ):
                 continue
             if (units, rate) not in monitors:
-                monitors[units, rate] = Pipeline.from_config(config_of(units, rate, asked))
+                monitors[units, rate] = Pipeline.from_config(
+                    config_of(units, rate, asked)
+                )
             pipeline = monitors[units, rate]
-            flights = [judged(pipeline, name, asked.rng(label, k)) for k in range(asked.count(4))]
-            yield label, {key: of([one[key] for one in flights]) for key, (of, _) in SUMS.items()}
+            flights = [
+                judged(pipeline, name, asked.rng(label, k))
+                for k in range(asked.count(4))
+            ]
+            yield (
+                label,
+                {
+                    key: of([one[key] for one in flights])
+                    for key, (of, _) in SUMS.items()
+                },
+            )
 
 
 def judged(pipeline: Pipeline, name: str, rng: Rng) -> dict[str, Any]:
@@ -279,7 +368,12 @@ def judged(pipeline: Pipeline, name: str, rng: Rng) -> dict[str, Any]:
     _, condition, *numbers = CONDITIONS[name]
     flight = flight_of(pipeline.config, pipeline.geometry.axes, rng)
     condition(flight, *numbers)
-    output = fresh(pipeline, Block(regular_stamps(LENGTH, flight.rate, START)[: len(flight.t)], flight.values()))
+    output = fresh(
+        pipeline,
+        Block(
+            regular_stamps(LENGTH, flight.rate, START)[: len(flight.t)], flight.values()
+        ),
+    )
     # The rate is of the instant that the values are of, which delays put before the stamp.
     at = (output.instant - START) * 1e-9
     truth = flight.truth_at(at)
@@ -288,9 +382,18 @@ def judged(pipeline: Pipeline, name: str, rng: Rng) -> dict[str, Any]:
     std = np.sqrt(np.einsum("kii->ki", covariance))
     ok = output.state[rows] == ChannelState.OK
     weighted = flight.axes / flight.std[:, None] ** 2
-    best = np.sqrt(np.trace(np.linalg.inv(flight.axes.T @ weighted))) if np.isfinite(flight.std).all() else np.nan
+    best = (
+        np.sqrt(np.trace(np.linalg.inv(flight.axes.T @ weighted)))
+        if np.isfinite(flight.std).all()
+        else np.nan
+    )
     sigmas = np.abs(error) / std
-    nees = float(np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0]).mean() / 3)
+    nees = float(
+        np.einsum(
+            "ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0]
+        ).mean()
+        / 3
+    )
     return {
         "nees": nees,
         "worst": nees,
@@ -298,6 +401,12 @@ def judged(pipeline: Pipeline, name: str, rng: Rng) -> dict[str, Any]:
         "over_best": float(np.sqrt((error**2).sum(axis=1).mean()) / best),
         "level": float((np.abs(error) > output.level[rows]).any(axis=1).mean()),
         "ok": float((output.state[flight.t >= COUNTED] == ChannelState.OK).mean()),
-        "declared": sum(event.declares and event.after == ChannelState.AMBIGUOUS for event in output.events),
-        "faulty": sum(event.declares and event.after == ChannelState.FAULTY for event in output.events),
+        "declared": sum(
+            event.declares and event.after == ChannelState.AMBIGUOUS
+            for event in output.events
+        ),
+        "faulty": sum(
+            event.declares and event.after == ChannelState.FAULTY
+            for event in output.events
+        ),
     }

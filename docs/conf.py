@@ -24,7 +24,12 @@ author = "fdi_ros maintainers"
 project_copyright = "2026, fdi_ros maintainers"
 version = release = fdi_ros.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
 source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
 
 # Anchors as on the usual hosts of repositories, so that a link works in both places; Sphinx checks them.
@@ -34,7 +39,14 @@ myst_heading_anchors = 3
 default_role = "code"
 
 # ROS 2 need not be installed where the site is built.
-autodoc_mock_imports = ["rclpy", "builtin_interfaces", "diagnostic_msgs", "rcl_interfaces", "sensor_msgs", "std_msgs"]
+autodoc_mock_imports = [
+    "rclpy",
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "rcl_interfaces",
+    "sensor_msgs",
+    "std_msgs",
+]
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_type_aliases = {"ArrayLike": "ArrayLike"}
@@ -59,7 +71,9 @@ def shorten_types(app: Any, doctree: nodes.document, docname: str) -> None:
     for node in [node for kind in types for node in doctree.findall(kind)]:
         text = node.astext().removeprefix(" -> ")
         short = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
-        short = re.sub(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", short)
+        short = re.sub(
+            r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", short
+        )
         if short != text:
             node.children = [nodes.Text(short)]
 

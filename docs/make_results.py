@@ -62,7 +62,10 @@ and waits. `guaranteed` waits for ten bounds of four noise_std by choice.""",
 SHOWN = {
     "reference": ("One fault, two_triad_cone",),
     "residual_search_2019": ("Protocol of 2019, sound", "Protocol of 2019, stands out"),
-    "power": (*(f"One fault, {name}" for name in ("two_triad_cone", "cone_5")), "Delay"),
+    "power": (
+        *(f"One fault, {name}" for name in ("two_triad_cone", "cone_5")),
+        "Delay",
+    ),
     "roc": ("Detection of 6",),
     "double": ("Two faults of 20",),
     "kinds": ("Declared", "Delay"),
@@ -75,7 +78,9 @@ def main() -> None:
     target = ROOT / "docs" / "results.md"
     before = target.read_text(encoding="utf-8")
     measured = re.search(
-        r"^## In flight\n.*^## Settings from a recording\n.*?(?=^## )", before, re.DOTALL | re.MULTILINE
+        r"^## In flight\n.*^## Settings from a recording\n.*?(?=^## )",
+        before,
+        re.DOTALL | re.MULTILINE,
     )
     lines = [
         "# Results",
@@ -112,10 +117,15 @@ def agreement(result: StudyResult) -> str:
         known = [("detection", figures["declared"], closed, 0.0)]
         if cell["size"] in TABULATED[cell["geometry"]]:
             pair = zip(
-                (figures["identified"], figures["right"]), TABULATED[cell["geometry"]][cell["size"]], strict=True
+                (figures["identified"], figures["right"]),
+                TABULATED[cell["geometry"]][cell["size"]],
+                strict=True,
             )
             # Tabulated from 10^6 samples as well, to three digits.
-            known += [("isolation", figure, value, value * (1 - value) / 1e6 + 0.0005**2 / 3) for figure, value in pair]
+            known += [
+                ("isolation", figure, value, value * (1 - value) / 1e6 + 0.0005**2 / 3)
+                for figure, value in pair
+            ]
         for what, figure, value, variance in known:
             error = math.sqrt(value * (1 - value) / cell["trials"] + variance)
             worst[what] = max(worst[what], abs(figure.value - value) / error)
@@ -128,17 +138,38 @@ def agreement(result: StudyResult) -> str:
 def integrity_table() -> list[str]:
     """Levels in standard deviations of one channel; how they are checked stands in docs/integrity.md."""
     rows = []
-    named = {"two_triad_cone": Geometry.two_triad_cone(), "dodecahedron": Geometry.dodecahedron()}
+    named = {
+        "two_triad_cone": Geometry.two_triad_cone(),
+        "dodecahedron": Geometry.dodecahedron(),
+    }
     named |= {f"cone_{n}": Geometry.cone(n) for n in (5, 9)}
     for name, geometry in named.items():
         for prior, risk in ((1e-3, 1e-3), (1e-3, 1e-5), (1e-4, 1e-7)):
-            rate = {"integrity.fault_rate": -math.log1p(-prior), "integrity.exposure": 1.0, "integrity.risk": risk}
-            known = Integrity(Config.from_parameters(rate).integrity, 1e-6, geometry, NoiseModel(1.0))
-            subsets, whole = prepare_subsets(geometry, NoiseModel(1.0)), mask_of(range(geometry.n))
+            rate = {
+                "integrity.fault_rate": -math.log1p(-prior),
+                "integrity.exposure": 1.0,
+                "integrity.risk": risk,
+            }
+            known = Integrity(
+                Config.from_parameters(rate).integrity, 1e-6, geometry, NoiseModel(1.0)
+            )
+            subsets, whole = (
+                prepare_subsets(geometry, NoiseModel(1.0)),
+                mask_of(range(geometry.n)),
+            )
             worst = known.after_loss(subsets, whole)
-            shown = [" ".join(f"{x:.2f}" for x in level) for level in (subsets["level"][whole], worst)]
+            shown = [
+                " ".join(f"{x:.2f}" for x in level)
+                for level in (subsets["level"][whole], worst)
+            ]
             rows.append((name, f"{prior:g}", f"{risk:g}", *shown))
-    head = ("mounting", "prior of a channel", "risk", "level about x, y, z", "after one more loss")
+    head = (
+        "mounting",
+        "prior of a channel",
+        "risk",
+        "level about x, y, z",
+        "after one more loss",
+    )
     hint = "In standard deviations of one channel; separation test at 1e-6 per sample. See docs/integrity.md."
     return markdown(Section("Levels", hint, (head, rows)))
 
@@ -147,7 +178,9 @@ def markdown(one: Section) -> list[str]:
     """Lines of a table in Markdown."""
     assert isinstance(one.content, tuple)
     head, body = one.content
-    rows = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body)]
+    rows = [
+        "| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body)
+    ]
     return [f"**{one.title}** {one.hint}", "", *rows]
 
 

@@ -126,7 +126,10 @@ MEANING: dict[str, dict[str, str]] = {
 }
 """What the settings of each kind of study mean."""
 
-REPLAY = {"replay/outcomes.py": ("Outcome", "StateChange", "FaultEffect", "Scores"), "replay/summary.py": ()}
+REPLAY = {
+    "replay/outcomes.py": ("Outcome", "StateChange", "FaultEffect", "Scores"),
+    "replay/summary.py": (),
+}
 """Modules of which these classes, or all, are the result of a replay."""
 SWEEP_MODULE = "replay/sweep_report.py"
 SWEEP: dict[str, tuple[str, dict[str, str]]] = {
@@ -188,14 +191,24 @@ def parameters() -> str:
         value = [
             kind,
             f"default {default}",
-            *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-"),
+            *(
+                f"{what} {one}"
+                for what, one in (("in", unit), ("", limits))
+                if one != "-"
+            ),
         ]
         running = RUNNING if declared.runtime else ""
-        words = f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
+        words = (
+            f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
+        )
         row = (f"`{name}`", "<br>".join(value), words)
-        sections.setdefault(name.rpartition(".")[0] or "the monitor as a whole", []).append(row)
+        sections.setdefault(
+            name.rpartition(".")[0] or "the monitor as a whole", []
+        ).append(row)
     head = ("name", "type, default, unit, range", "meaning, and when to change it")
-    return "\n\n".join(f"## {section}\n\n{_table(head, rows)}" for section, rows in sections.items())
+    return "\n\n".join(
+        f"## {section}\n\n{_table(head, rows)}" for section, rows in sections.items()
+    )
 
 
 def node_parameters() -> str:
@@ -203,10 +216,16 @@ def node_parameters() -> str:
     parts = []
     for node, fields in NODES.items():
         rows = [
-            (f"`{name}`", *_about(field), f"{_sentence(field.description)}{RUNNING if field.runtime else ''}")
+            (
+                f"`{name}`",
+                *_about(field),
+                f"{_sentence(field.description)}{RUNNING if field.runtime else ''}",
+            )
             for name, field in fields.items()
         ]
-        parts.append(f"### {node}\n\n{_table(('name', 'type', 'default', 'unit', 'range', 'meaning'), rows)}")
+        parts.append(
+            f"### {node}\n\n{_table(('name', 'type', 'default', 'unit', 'range', 'meaning'), rows)}"
+        )
     return "\n\n".join(parts)
 
 
@@ -216,12 +235,18 @@ def studies() -> str:
     _same("MEANING", MEANING, PROTOCOLS)
     for kind in PROTOCOLS:
         schema = protocol_class(kind).schema
-        meaning = {**{name: _COMMON[name] for name in schema if name in _COMMON}, **MEANING[kind]}
+        meaning = {
+            **{name: _COMMON[name] for name in schema if name in _COMMON},
+            **MEANING[kind],
+        }
         _same(f"MEANING of {kind}", meaning, schema)
         rows = [
-            (f"`{name}`", *_about(declared, unit=False), _sentence(meaning[name])) for name, declared in schema.items()
+            (f"`{name}`", *_about(declared, unit=False), _sentence(meaning[name]))
+            for name, declared in schema.items()
         ]
-        parts.append(f"### {kind}\n\n{_table(('name', 'type', 'default', 'range', 'meaning'), rows)}")
+        parts.append(
+            f"### {kind}\n\n{_table(('name', 'type', 'default', 'range', 'meaning'), rows)}"
+        )
     return "\n\n".join(parts)
 
 
@@ -231,7 +256,11 @@ def results() -> str:
     for module, wanted in REPLAY.items():
         for name, words, rows in _classes(PACKAGE / module):
             if name in wanted or (rows and not wanted):
-                parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
+                parts += [
+                    f"### {name}",
+                    words,
+                    _table(("field", "type", "meaning"), rows),
+                ]
     parts.append("## What `fdi sweep --json` writes")
     given = _keys(PACKAGE / SWEEP_MODULE)
     for function, (title, meaning) in SWEEP.items():
@@ -241,7 +270,12 @@ def results() -> str:
     return "\n\n".join(parts)
 
 
-MARKS = {"parameters": parameters, "node parameters": node_parameters, "studies": studies, "results": results}
+MARKS = {
+    "parameters": parameters,
+    "node parameters": node_parameters,
+    "studies": studies,
+    "results": results,
+}
 
 
 PAGES = ("parameters.md", "files.md")  # that have marks
@@ -261,7 +295,9 @@ def filled(text: str) -> str:
 def _same(called: str, given: Iterable[str], expected: Iterable[str]) -> None:
     given, expected = set(given), set(expected)
     if given != expected:
-        raise ValueError(f"{called}: {sorted(expected - given)} missing, {sorted(given - expected)} unknown")
+        raise ValueError(
+            f"{called}: {sorted(expected - given)} missing, {sorted(given - expected)} unknown"
+        )
 
 
 _TYPES = {"numbers": "list of float", "texts": "list of string", "text": "string"}
@@ -271,9 +307,17 @@ def _about(declared: Field, unit: bool = True) -> list[str]:
     """Type, default, unit and range in words."""
     kind = _TYPES.get(declared.kind, declared.kind)
     if declared.per:
-        each = f"{declared.each} per {declared.per}" if declared.each > 1 else f"one per {declared.per}"
+        each = (
+            f"{declared.each} per {declared.per}"
+            if declared.each > 1
+            else f"one per {declared.per}"
+        )
         kind += f", {each}"
-    default = "must be given" if declared.default in (REQUIRED, None) else f"`{_plain(declared.default)}`"
+    default = (
+        "must be given"
+        if declared.default in (REQUIRED, None)
+        else f"`{_plain(declared.default)}`"
+    )
     return [kind, default, *([declared.unit or "-"] if unit else []), _range(declared)]
 
 
@@ -283,7 +327,9 @@ def _plain(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_plain, value))}]"
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{name}: {_plain(one)}' for name, one in value.items())}}}"
+        return (
+            f"{{{', '.join(f'{name}: {_plain(one)}' for name, one in value.items())}}}"
+        )
     return f"{value:g}" if isinstance(value, float) else str(value) or '""'
 
 
@@ -320,10 +366,18 @@ def _classes(path: Path) -> Iterable[tuple[str, str, list[Row]]]:
         rows = []
         for field, after in zip(node.body, [*node.body[1:], None], strict=True):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                said = isinstance(after, ast.Expr) and isinstance(
+                    after.value, ast.Constant
+                )
                 behind = lines[field.lineno - 1].partition("  # ")[2]
                 meaning = str(after.value.value) if said else behind  # type: ignore[union-attr]
-                rows.append((f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", " ".join(meaning.split())))
+                rows.append(
+                    (
+                        f"`{field.target.id}`",
+                        f"`{ast.unparse(field.annotation)}`",
+                        " ".join(meaning.split()),
+                    )
+                )
         yield node.name, (ast.get_docstring(node) or "").partition("\n")[0], rows
 
 
@@ -334,7 +388,10 @@ def _sentence(text: str) -> str:
 
 def _table(head: Row, rows: Sequence[Row]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |"
+        for line in lines
+    )
 
 
 if __name__ == "__main__":

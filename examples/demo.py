@@ -42,10 +42,14 @@ class Observer(Watcher):
     The fault is injected into the channels that are named as struck.
     """
 
-    def __init__(self, begin: float, end: float, fault: Fault, struck: set[str]) -> None:
+    def __init__(
+        self, begin: float, end: float, fault: Fault, struck: set[str]
+    ) -> None:
         super().__init__("/fdi_node", "fdi_demo")
         self.fault, self.struck = fault, struck
-        self.delays: dict[str, float] = {}  # time from the first faulty message to the declaration, s, by channel
+        self.delays: dict[
+            str, float
+        ] = {}  # time from the first faulty message to the declaration, s, by channel
         self.others: set[str] = set()  # healthy channels that were declared faulty
         self._start, self._end, self._now = begin + fault.start, end, 0.0
         self.create_subscription(Clock, "/clock", self._on_clock, DEEP)
@@ -55,7 +59,11 @@ class Observer(Watcher):
 
     def is_over(self) -> bool:
         """Look at what the monitor says now; return whether the flight is over."""
-        state = "now" if self._now >= self._start else f"to come {self.fault.start:g} s after the start"
+        state = (
+            "now"
+            if self._now >= self._start
+            else f"to come {self.fault.start:g} s after the start"
+        )
         self.picture.caption = f"recorded flight; fault {state}: {self.fault}"
         for name, line in self.picture.channels.items():
             since = line.number("state since (stamp, s)")
@@ -74,9 +82,17 @@ class Observer(Watcher):
             else f"missed      {name} was not isolated"
             for name in sorted(self.struck)
         ]
-        in_set = {name for name, line in self.picture.channels.items() if line.value("state") == "AMBIGUOUS"}
+        in_set = {
+            name
+            for name, line in self.picture.channels.items()
+            if line.value("state") == "AMBIGUOUS"
+        }
         others = (self.others | in_set) - self.struck
-        lines.append(f"others      {', '.join(sorted(others))} declared too" if others else "others      none declared")
+        lines.append(
+            f"others      {', '.join(sorted(others))} declared too"
+            if others
+            else "others      none declared"
+        )
         return lines, self.delays.keys() >= self.struck and not others
 
 
@@ -88,7 +104,9 @@ def running(commands: dict[str, list[str]]) -> Iterator[Callable[[], None]]:
         for name, (process, output) in nodes.items():
             if process.poll():
                 output.seek(0)
-                raise FdiError(f"{name} has ended: {(output.read().strip() or 'it said nothing').splitlines()[-1]}")
+                raise FdiError(
+                    f"{name} has ended: {(output.read().strip() or 'it said nothing').splitlines()[-1]}"
+                )
 
     def end(process: subprocess.Popen[bytes]) -> None:
         process.send_signal(signal.SIGINT)
@@ -100,28 +118,67 @@ def running(commands: dict[str, list[str]]) -> Iterator[Callable[[], None]]:
     nodes: dict[str, tuple[subprocess.Popen[bytes], IO[str]]] = {}
     with contextlib.ExitStack() as stack:
         for name, words in commands.items():
-            command = [sys.executable, "-m", "fdi_ros.ros.process", name, "--ros-args", *words]
+            command = [
+                sys.executable,
+                "-m",
+                "fdi_ros.ros.process",
+                name,
+                "--ros-args",
+                *words,
+            ]
             log = stack.enter_context(tempfile.TemporaryFile("w+"))
             nodes[name] = subprocess.Popen(command, stdout=log, stderr=log), log
             stack.callback(end, nodes[name][0])
         yield check
 
 
-def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list[str], bool]:
+def fly(
+    config: Config, fault: Fault, seconds: float, plain: bool
+) -> tuple[list[str], bool]:
     """Run the nodes as replay.launch.py does, show the monitor until the flight is over, and sum up."""
-    names, flight = build_geometry(config).channel_names, read_block(BAG, config, end=seconds)
+    names, flight = (
+        build_geometry(config).channel_names,
+        read_block(BAG, config, end=seconds),
+    )
     begin, end = flight.stamp[0] / 1e9, flight.stamp[-1] / 1e9
     struck = {names[channel] for channel in fault.channels(names)}
     if not fault.start < end - begin:
-        raise FdiError(f"the fault starts at {fault.start:g} s, expected less than {end - begin:g} s")
+        raise FdiError(
+            f"the fault starts at {fault.start:g} s, expected less than {end - begin:g} s"
+        )
     simulated = ["--params-file", str(CONFIG), "-p", "use_sim_time:=true"]
     commands = {
-        "injector_node": [*simulated, "-p", "enabled:=true", "-p", f"faults:='{fault}'", "-p", f"suffix:={SUFFIX}"],
-        "fdi_node": [*simulated, *(word for topic in config.topics for word in ("-r", f"{topic}:={topic}{SUFFIX}"))],
-        "player_node": ["--params-file", str(CONFIG), "-p", f"bag:={BAG}", "-p", f"wait:={PATIENCE}"],
+        "injector_node": [
+            *simulated,
+            "-p",
+            "enabled:=true",
+            "-p",
+            f"faults:='{fault}'",
+            "-p",
+            f"suffix:={SUFFIX}",
+        ],
+        "fdi_node": [
+            *simulated,
+            *(
+                word
+                for topic in config.topics
+                for word in ("-r", f"{topic}:={topic}{SUFFIX}")
+            ),
+        ],
+        "player_node": [
+            "--params-file",
+            str(CONFIG),
+            "-p",
+            f"bag:={BAG}",
+            "-p",
+            f"wait:={PATIENCE}",
+        ],
     }
     domain = os.environ["ROS_DOMAIN_ID"]
-    print(f"{end - begin:.0f} s of {BAG.relative_to(ROOT)} to fdi_node, ROS_DOMAIN_ID {domain}", flush=True)
+    print(
+        f"{end - begin:.0f} s of {BAG.relative_to(ROOT)} to fdi_node, ROS_DOMAIN_ID {domain}",
+        flush=True,
+    )
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         # One process compiles, and all find it done.
@@ -137,10 +194,27 @@ def fly(config: Config, fault: Fault, seconds: float, plain: bool) -> tuple[list
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the demo; 0 if the fault was isolated and nothing else declared."""
-    parser = argparse.ArgumentParser(prog="make demo", description="A gyro goes bad in flight; the real node finds it.")
-    parser.add_argument("--fault", default=FAULT, metavar="TEXT", help=f"what to inject (default: {FAULT})")
-    parser.add_argument("--seconds", type=float, default=32.0, help="how much of the minute of flight to play")
-    parser.add_argument("--plain", action="store_true", help="line by line, as where the output is no terminal")
+    parser = argparse.ArgumentParser(
+        prog="make demo",
+        description="A gyro goes bad in flight; the real node finds it.",
+    )
+    parser.add_argument(
+        "--fault",
+        default=FAULT,
+        metavar="TEXT",
+        help=f"what to inject (default: {FAULT})",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=32.0,
+        help="how much of the minute of flight to play",
+    )
+    parser.add_argument(
+        "--plain",
+        action="store_true",
+        help="line by line, as where the output is no terminal",
+    )
     options = parser.parse_args(argv)
     # To this machine, and out of the way of other ROS programs.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -148,7 +222,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_demo_"))
     try:
         fault = parse_fault(options.fault)
-        lines, good = fly(Config.from_file(CONFIG), fault, options.seconds, options.plain)
+        lines, good = fly(
+            Config.from_file(CONFIG), fault, options.seconds, options.plain
+        )
     except FdiError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 2

@@ -16,7 +16,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Geometry
-from fdi_ros.experiments.flight import GyroErrors, Motion, regular_stamps, vehicle_motion
+from fdi_ros.experiments.flight import (
+    GyroErrors,
+    Motion,
+    regular_stamps,
+    vehicle_motion,
+)
 
 SEED = 42
 START = 1_760_000_000 * 10**9
@@ -64,39 +69,66 @@ def motion(rng: np.random.Generator) -> Motion:
             rate += [swing * axis, swing * axis]
         time, rate = [*time, time[-1] + 2.0], [*rate, np.zeros(3)]
     flight = vehicle_motion(80.0, rng, rest=1.0)
-    return Motion(np.concatenate([time, time[-1] + 1.0 + flight.time]), np.vstack([rate, flight.rate]))
+    return Motion(
+        np.concatenate([time, time[-1] + 1.0 + flight.time]),
+        np.vstack([rate, flight.rate]),
+    )
 
 
 def record() -> Block:
     """Measure with two IMUs."""
-    motion_rng, unit_rng, noise_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(SEED).spawn(3))
+    motion_rng, unit_rng, noise_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(SEED).spawn(3)
+    )
     moved = motion(motion_rng)
     nominal = Geometry.from_triads([np.eye(3), SECOND_MOUNT])
     errors = GyroErrors(scale_std=0.01, misalignment_std=np.radians(1.0), delay_std=0.0)
     gyros = replace(errors.draw(nominal, unit_rng), delay=np.repeat([0.0, 4e-4], 3))
-    return gyros.measure(moved, regular_stamps(float(moved.time[-1]), SAMPLE_RATE, START), noise_rng)
+    return gyros.measure(
+        moved, regular_stamps(float(moved.time[-1]), SAMPLE_RATE, START), noise_rng
+    )
 
 
 def write(block: Block, path: Path) -> None:
     """Write two topics of sensor_msgs/Imu."""
     store, kind = get_typestore(Stores.ROS2_JAZZY), "sensor_msgs/msg/Imu"
     types = store.types
-    vector, upright = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    vector, upright = (
+        types["geometry_msgs/msg/Vector3"],
+        types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
     absent, covariance = np.array([-1.0, *np.zeros(8)]), np.eye(3).ravel() * 0.0025**2
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = [writer.add_connection(f"/{name}/imu", kind, typestore=store) for name in ("front", "rear")]
+        topics = [
+            writer.add_connection(f"/{name}/imu", kind, typestore=store)
+            for name in ("front", "rear")
+        ]
         for stamp, z in zip(block.stamp.tolist(), block.z, strict=True):
             time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
             for k, rate in enumerate(z.reshape(2, 3).tolist()):
                 header = types["std_msgs/msg/Header"](time, f"imu_{k}")
-                message = types[kind](header, upright, absent, vector(*rate), covariance, vector(0.0, 0.0, 0.0), absent)
-                writer.write(topics[k], stamp + 200_000 * (k + 1), store.serialize_cdr(message, kind))
+                message = types[kind](
+                    header,
+                    upright,
+                    absent,
+                    vector(*rate),
+                    covariance,
+                    vector(0.0, 0.0, 0.0),
+                    absent,
+                )
+                writer.write(
+                    topics[k],
+                    stamp + 200_000 * (k + 1),
+                    store.serialize_cdr(message, kind),
+                )
 
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("tutorial")
     if (folder / "bracket").exists():
-        sys.exit(f"{folder / 'bracket'} exists already: remove it first, or name another folder")
+        sys.exit(
+            f"{folder / 'bracket'} exists already: remove it first, or name another folder"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     write(record(), folder / "bracket")
     (folder / "bracket.yaml").write_text(CONFIG, encoding="utf-8")

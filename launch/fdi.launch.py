@@ -22,12 +22,22 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    clock, start = "take the time from /clock; empty: not set here", "false: a lifecycle manager starts it"
+    clock, start = (
+        "take the time from /clock; empty: not set here",
+        "false: a lifecycle manager starts it",
+    )
     return LaunchDescription(
         [
             *arguments("two_imus.yaml"),
-            DeclareLaunchArgument("use_sim_time", default_value="", choices=("", *FLAGS), description=clock),
-            DeclareLaunchArgument("autostart", default_value="true", choices=FLAGS, description=start),
+            DeclareLaunchArgument(
+                "use_sim_time",
+                default_value="",
+                choices=("", *FLAGS),
+                description=clock,
+            ),
+            DeclareLaunchArgument(
+                "autostart", default_value="true", choices=FLAGS, description=start
+            ),
             OpaqueFunction(function=nodes),
         ]
     )

@@ -21,10 +21,15 @@ from launch import LaunchDescription
 
 def nodes(context: LaunchContext) -> list[Node]:
     file, _ = checked(context)
-    link = {name: LaunchConfiguration(name) for name in ("url", "system_id", "named_values")}
+    link = {
+        name: LaunchConfiguration(name) for name in ("url", "system_id", "named_values")
+    }
     # Empty is a text, and so is off, which YAML takes for false.
     texts = ("signing_key", "failover")
-    link |= {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in texts}
+    link |= {
+        name: ParameterValue(LaunchConfiguration(name), value_type=str)
+        for name in texts
+    }
     # Without the link nothing can be monitored; without the monitor the link tells the pilot so.
     return [node("mavlink_node", [file, link], on_exit=end), node("fdi_node", [file])]
 
@@ -34,11 +39,24 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *arguments("px4.yaml"),
-            DeclareLaunchArgument("url", default_value="udpin:0.0.0.0:14540", description=url),
-            DeclareLaunchArgument("system_id", default_value="0", description="of the autopilot; 0: the first heard"),
-            DeclareLaunchArgument("signing_key", default_value="", description="file with the key; empty: off"),
             DeclareLaunchArgument(
-                "named_values", default_value="false", choices=FLAGS, description="send the statistic too"
+                "url", default_value="udpin:0.0.0.0:14540", description=url
+            ),
+            DeclareLaunchArgument(
+                "system_id",
+                default_value="0",
+                description="of the autopilot; 0: the first heard",
+            ),
+            DeclareLaunchArgument(
+                "signing_key",
+                default_value="",
+                description="file with the key; empty: off",
+            ),
+            DeclareLaunchArgument(
+                "named_values",
+                default_value="false",
+                choices=FLAGS,
+                description="send the statistic too",
             ),
             DeclareLaunchArgument(
                 "failover",

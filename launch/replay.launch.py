@@ -29,17 +29,33 @@ PATIENCE = 3600.0
 
 def nodes(context: LaunchContext) -> list[Node]:
     file, config = checked(context)
-    bag, faults = (LaunchConfiguration(name).perform(context) for name in ("bag", "faults"))
+    bag, faults = (
+        LaunchConfiguration(name).perform(context) for name in ("bag", "faults")
+    )
     if not Path(bag).exists():
         raise RuntimeError(f"no recording at {bag}")
     clock = [("/clock", "clock")]
     renamed = [(topic, topic + SUFFIX) for topic in config.topics]
-    text = {name: ParameterValue(value, value_type=str) for name, value in (("bag", bag), ("faults", faults))}
-    injection = {"suffix": SUFFIX, "faults": text["faults"], "enabled": bool(faults), "use_sim_time": True}
-    playing = {"bag": text["bag"], "rate": LaunchConfiguration("rate"), "loop": LaunchConfiguration("loop")}
+    text = {
+        name: ParameterValue(value, value_type=str)
+        for name, value in (("bag", bag), ("faults", faults))
+    }
+    injection = {
+        "suffix": SUFFIX,
+        "faults": text["faults"],
+        "enabled": bool(faults),
+        "use_sim_time": True,
+    }
+    playing = {
+        "bag": text["bag"],
+        "rate": LaunchConfiguration("rate"),
+        "loop": LaunchConfiguration("loop"),
+    }
     return [
         node("injector_node", [file, injection], clock, on_exit=end),
-        node("fdi_node", [file, {"use_sim_time": True}], [*renamed, *clock], on_exit=end),
+        node(
+            "fdi_node", [file, {"use_sim_time": True}], [*renamed, *clock], on_exit=end
+        ),
         node("player_node", [file, {**playing, "wait": PATIENCE}], clock, on_exit=end),
     ]
 
@@ -50,9 +66,17 @@ def generate_launch_description() -> LaunchDescription:
         [
             *arguments("two_imus.yaml"),
             DeclareLaunchArgument("bag", description="rosbag2 folder or .mcap file"),
-            DeclareLaunchArgument("faults", default_value="", description="faults to inject, separated by semicolons"),
-            DeclareLaunchArgument("rate", default_value="1.0", description="speed of playing"),
-            DeclareLaunchArgument("loop", default_value="false", choices=FLAGS, description=again),
+            DeclareLaunchArgument(
+                "faults",
+                default_value="",
+                description="faults to inject, separated by semicolons",
+            ),
+            DeclareLaunchArgument(
+                "rate", default_value="1.0", description="speed of playing"
+            ),
+            DeclareLaunchArgument(
+                "loop", default_value="false", choices=FLAGS, description=again
+            ),
             OpaqueFunction(function=nodes),
         ]
     )

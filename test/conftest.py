@@ -33,14 +33,18 @@ def take_domain():
     # Domains above 101 collide with the ports that Linux gives to other programs.
     for k in range(100):
         domain = str(1 + (os.getpid() + k) % 100)
-        lock = (Path(tempfile.gettempdir()) / f"fdi_ros_domain_{domain}_{os.getuid()}.lock").open("w")
+        lock = (
+            Path(tempfile.gettempdir()) / f"fdi_ros_domain_{domain}_{os.getuid()}.lock"
+        ).open("w")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             lock.close()
             continue
         return domain, lock
-    raise RuntimeError("all of the ROS domains 1 to 100 are in use by other runs of the tests")
+    raise RuntimeError(
+        "all of the ROS domains 1 to 100 are in use by other runs of the tests"
+    )
 
 
 # Before the first import of NumPy. The matrices are small: more threads wait for each other, and for other tests.
@@ -82,12 +86,17 @@ def compiled(tmp_path_factory):
     """All compiled code is there: no process that a test starts has to wait for it, or says that it compiles."""
     # Once in all the processes of a run: they share the folder above their own.
     shared = tmp_path_factory.getbasetemp()
-    done = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "compiled"
+    done = (
+        shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared
+    ) / "compiled"
     with done.open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not done.stat().st_size:
             subprocess.run(
-                [sys.executable, "-m", "fdi_ros.cli", "compile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=True
+                [sys.executable, "-m", "fdi_ros.cli", "compile"],
+                cwd=ROOT,
+                stdout=subprocess.DEVNULL,
+                check=True,
             )
             lock.write("done")
 

@@ -26,7 +26,9 @@ FAULT = "channel=imu_2.y kind=bias size=0.15 start=28"
 
 @pytest.fixture(scope="module")
 def config():
-    return fdi_ros.Config.from_file(Path(__file__).parents[1] / "config" / "two_imus.yaml")
+    return fdi_ros.Config.from_file(
+        Path(__file__).parents[1] / "config" / "two_imus.yaml"
+    )
 
 
 @given(st.lists(st.lists(st.text(max_size=20), min_size=2, max_size=2), max_size=3))
@@ -37,7 +39,15 @@ def test_a_table_shows_any_text_as_it_is(rows):
 
 
 def test_dir_shows_what_there_is():
-    assert {"Config", "Event", "Geometry", "Output", "Pipeline", "read", "replay"} <= set(dir(fdi_ros))
+    assert {
+        "Config",
+        "Event",
+        "Geometry",
+        "Output",
+        "Pipeline",
+        "read",
+        "replay",
+    } <= set(dir(fdi_ros))
     assert all(getattr(fdi_ros, name) is not None for name in dir(fdi_ros))
 
 
@@ -58,16 +68,24 @@ def test_a_replay_says_what_the_verb_says(flight, config, root):
     assert same.isolated == 1
     # A module of it has been imported, and it is a function all the same.
     assert "fdi_ros.replay.run" in sys.modules
-    assert [*inspect.signature(fdi_ros.replay).parameters][:3] == ["path", "config", "faults"]
+    assert [*inspect.signature(fdi_ros.replay).parameters][:3] == [
+        "path",
+        "config",
+        "faults",
+    ]
     for settings, one in ((root / "config" / "two_imus.yaml", fault), (config, FAULT)):
         assert fdi_ros.replay(flight, settings, [one], end=31.0).scores == same
     assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config
     with pytest.raises(fdi_ros.FdiError, match="takes no sise, only"):
-        fdi_ros.replay(flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}])
+        fdi_ros.replay(
+            flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}]
+        )
 
 
 def test_without_settings_units_that_are_turned_are_refused(flight):
-    with pytest.raises(fdi_ros.FdiError, match=r"imu_2 is turned by 109 deg against imu_1.*fdi setup"):
+    with pytest.raises(
+        fdi_ros.FdiError, match=r"imu_2 is turned by 109 deg against imu_1.*fdi setup"
+    ):
         fdi_ros.replay(flight)
 
 
@@ -79,21 +97,35 @@ def test_the_bundled_crash_needs_no_settings(root):
     named = table[table["state"] == "FAULTY"]
     assert named["channel"].tolist() == ["imu_0.x"]
     # Its first message, and the fault 12.96 s later.
-    onset = pandas.Timestamp("2026-11-23 17:10:06.268", tz="UTC") + pandas.Timedelta(12.96, "s")
+    onset = pandas.Timestamp("2026-11-23 17:10:06.268", tz="UTC") + pandas.Timedelta(
+        12.96, "s"
+    )
     assert 0.0 <= (named.index[0] - onset).total_seconds() < 0.2
 
 
 def test_things_say_what_they_are(flight, config):
     pipeline, blocks = fdi_ros.Pipeline(config), fdi_ros.read(flight, config, end=10.0)
     outputs = [pipeline.process(block) for block in blocks]
-    geometry, output, event = fdi_ros.Geometry.two_triad_cone(), outputs[0], outputs[0].events[0]
+    geometry, output, event = (
+        fdi_ros.Geometry.two_triad_cone(),
+        outputs[0],
+        outputs[0].events[0],
+    )
     block = next(iter(fdi_ros.read(flight, config, end=1.0)))
     for one in (config, geometry, pipeline, output, event, block):
         assert repr(one).startswith(f"{type(one).__name__}(")
         assert len(repr(one)) < 3000
-    assert repr(pipeline) == "Pipeline(sequential, 6 channels, 1000 samples; every channel OK)"
+    assert (
+        repr(pipeline)
+        == "Pipeline(sequential, 6 channels, 1000 samples; every channel OK)"
+    )
     assert "UNCHECKED -> OK" in repr(event)
-    for one, words in ((config, "startup_bias_duration"), (geometry, "g6"), (pipeline, "imu_2.z"), (output, "imu_1.x")):
+    for one, words in (
+        (config, "startup_bias_duration"),
+        (geometry, "g6"),
+        (pipeline, "imu_2.z"),
+        (output, "imu_1.x"),
+    ):
         assert words in one._repr_html_()
     assert "imus.mounts" in repr(config)
     assert "imus.max_skew" not in repr(config), "what is as by default"

@@ -33,18 +33,34 @@ LAYERS = (
 )
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 BAG_LIBRARIES = {"rosbags", "mcap"}
-MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "rosgraph", "sensor", "std")}
+MESSAGES = {
+    f"{name}_msgs"
+    for name in ("diagnostic", "geometry", "lifecycle", "rosgraph", "sensor", "std")
+}
 SERVICES = {"builtin_interfaces", "rcl_interfaces", "std_srvs"}
 ROS = MESSAGES | SERVICES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
 ONLY_IN = {
     **dict.fromkeys(ROS, ("ros", "only ros does")),
-    **dict.fromkeys(BAG_LIBRARIES, ("bag", "only bag opens bag files, and replay.outputs writes them")),
-    **dict.fromkeys(("pymavlink", "serial"), ("mavlink", "only mavlink talks to autopilots")),
+    **dict.fromkeys(
+        BAG_LIBRARIES,
+        ("bag", "only bag opens bag files, and replay.outputs writes them"),
+    ),
+    **dict.fromkeys(
+        ("pymavlink", "serial"), ("mavlink", "only mavlink talks to autopilots")
+    ),
 }
 """The only part that imports a library, in words."""
 ASKED_FOR = {"monitor.output": ("pandas",)}
 """Libraries imported only where a user asks for what they make."""
-NUMPY_ALONE = {"model", "compiling", "core", "estimator", "detectors", "monitor", "errors"}
+NUMPY_ALONE = {
+    "model",
+    "compiling",
+    "core",
+    "estimator",
+    "detectors",
+    "monitor",
+    "errors",
+}
 
 
 @cache
@@ -73,12 +89,22 @@ def violations(module, names):
                 found.append(f"{part} imports {name}, which stands above it")
             if target not in LEVEL and target != "__version__" and part != "cli":
                 found.append(f"{part} imports {name} through the package's own front")
-        elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.outputs":
+        elif (
+            package in ONLY_IN
+            and part != ONLY_IN[package][0]
+            and module != "replay.outputs"
+        ):
             found.append(f"{module} imports {name}: {ONLY_IN[package][1]}")
         elif package in ("numba", "llvmlite"):
             if part != "compiling":
-                found.append(f"{module} imports {name}: only compiling knows the compiler")
-        elif part in NUMPY_ALONE and package not in {"numpy", *ASKED_FOR.get(module, ())} | sys.stdlib_module_names:
+                found.append(
+                    f"{module} imports {name}: only compiling knows the compiler"
+                )
+        elif (
+            part in NUMPY_ALONE
+            and package
+            not in {"numpy", *ASKED_FOR.get(module, ())} | sys.stdlib_module_names
+        ):
             found.append(f"{part} imports {name}: it needs NumPy alone")
     return sorted(set(found))
 
@@ -86,13 +112,21 @@ def violations(module, names):
 def modules():
     """Module names and files, the package's own front left out."""
     files = (path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
-    return {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in files}
+    return {
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path
+        for path in files
+    }
 
 
 def test_no_import_points_up():
     known = modules()
-    assert {module.split(".")[1] for module in known} - LEVEL.keys() == set(), "they have no place in the layers"
-    found = {module: violations(module.partition(".")[2], imports(path)) for module, path in known.items()}
+    assert {module.split(".")[1] for module in known} - LEVEL.keys() == set(), (
+        "they have no place in the layers"
+    )
+    found = {
+        module: violations(module.partition(".")[2], imports(path))
+        for module, path in known.items()
+    }
     assert {module: told for module, told in found.items() if told} == {}
 
 
@@ -102,14 +136,24 @@ def test_no_import_goes_in_a_circle():
     def there(name):
         return next((one for one in (name, f"{name}.__init__") if one in known), None)
 
-    graph = {module: {there(name) for name in imports(path)} - {None, module} for module, path in known.items()}
+    graph = {
+        module: {there(name) for name in imports(path)} - {None, module}
+        for module, path in known.items()
+    }
     graphlib.TopologicalSorter(graph).prepare()
 
 
 def python(code, *words):
     """What a fresh interpreter says, in which nothing loaded before hides a missing library."""
     command = [sys.executable, "-c", code, *map(str, words)]
-    return subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True, timeout=400, check=False)
+    return subprocess.run(
+        command,
+        cwd=PACKAGE.parent,
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+    )
 
 
 def names_after(code):
@@ -153,4 +197,6 @@ print([name for name in set(sys.modules) - before if sys.modules[name] is not No
     assert "monitor" in parts
     assert parts.isdisjoint(OFFLINE)
     # Neither does Numba load its part of SciPy.
-    assert {name.partition(".")[0] for name in loaded}.isdisjoint({*REQUIRED, "scipy", "rich", "pyarrow", "pymavlink"})
+    assert {name.partition(".")[0] for name in loaded}.isdisjoint(
+        {*REQUIRED, "scipy", "rich", "pyarrow", "pymavlink"}
+    )

@@ -30,10 +30,16 @@ def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(ro
     known = yaml.safe_load((root / "test" / "rosdep_keys.yaml").read_text())["rosdep"]
     asked = dict(
         re.findall(
-            r'"(numpy|numba|PyYAML|tqdm|joblib|scipy)>=([0-9.]+)(?:,<[0-9.]+)?"', (root / "setup.py").read_text()
+            r'"(numpy|numba|PyYAML|tqdm|joblib|scipy)>=([0-9.]+)(?:,<[0-9.]+)?"',
+            (root / "setup.py").read_text(),
         )
     )
-    tested = dict(re.findall(r"(numpy|numba|PyYAML)==([0-9.]+)", (root / "tools" / "ubuntu.sh").read_text()))
+    tested = dict(
+        re.findall(
+            r"(numpy|numba|PyYAML)==([0-9.]+)",
+            (root / "tools" / "ubuntu.sh").read_text(),
+        )
+    )
     assert set(asked) == {"numpy", "numba", "PyYAML", "tqdm", "joblib", "scipy"}
     for name, least in asked.items():
         there = known[f"python3-{name.lower().removeprefix('py')}"]["version"]
@@ -44,12 +50,18 @@ def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(ro
 
 def test_numba_is_bounded_by_the_version_that_is_tested_here(root):
     """How results are kept rests on names of its own that a next version may change."""
-    (bound,) = re.findall(r'"numba>=[0-9.]+,<([0-9.]+)"', (root / "setup.py").read_text())
-    assert tuple(map(int, numba.__version__.split(".")[:2])) < tuple(map(int, bound.split(".")))
+    (bound,) = re.findall(
+        r'"numba>=[0-9.]+,<([0-9.]+)"', (root / "setup.py").read_text()
+    )
+    assert tuple(map(int, numba.__version__.split(".")[:2])) < tuple(
+        map(int, bound.split("."))
+    )
 
 
 def test_libraries_named_as_required_are_those_of_setup_py(root):
-    (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
+    (required,) = re.findall(
+        r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL
+    )
     names = set(re.findall(r'"(\w+)>=', required))
     assert names == {*system.REQUIRED, "numpy", "numba", "PyYAML"}
 
@@ -67,10 +79,23 @@ for words, lacking in eval(sys.argv[1]):
 
 def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     """Also as after `make demo`, which installs no more than it needs."""
-    config, out = ["--config", PACKAGE.parent / "config" / "two_imus.yaml"], ["--output", tmp_path / "out"]
-    more = {"replay": config, "sweep": config, "calibrate": [*config, *out], "convert": out, "setup": out}
+    config, out = (
+        ["--config", PACKAGE.parent / "config" / "two_imus.yaml"],
+        ["--output", tmp_path / "out"],
+    )
+    more = {
+        "replay": config,
+        "sweep": config,
+        "calibrate": [*config, *out],
+        "convert": out,
+        "setup": out,
+    }
     more |= {"fleet": out, "inspect": []}
-    lacking = {"setup": ["scipy"], "calibrate": ["scipy"], "fleet": ["pyarrow", "scipy"]}
+    lacking = {
+        "setup": ["scipy"],
+        "calibrate": ["scipy"],
+        "fleet": ["pyarrow", "scipy"],
+    }
     if not all(map(system.there, (*system.BAGS, "scipy", "pyarrow"))):
         lacking = {}
     bag = PACKAGE.parent / "bags" / "cone_flight"
@@ -82,7 +107,10 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     lines = done.stderr.splitlines()
     pip = "pip install (--user --break-system-packages )?mcap rosbags lz4 zstandard"
     for verb, line in zip(more, lines[: len(more)], strict=True):
-        assert re.fullmatch(rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*", line), line
+        assert re.fullmatch(
+            rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*",
+            line,
+        ), line
     assert lines[len(more) :] == [
         f"fdi: fdi {verb} needs {' and '.join(names)}: {system._pip()} {' '.join(names)}"
         for verb, names in lacking.items()
@@ -91,7 +119,10 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
 
 def test_without_what_reads_recordings_the_player_says_what_brings_it():
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
-    done = python(WITHOUT_BAGS + "from fdi_ros.ros.process import run; sys.exit(run('player_node', []))")
+    done = python(
+        WITHOUT_BAGS
+        + "from fdi_ros.ros.process import run; sys.exit(run('player_node', []))"
+    )
     assert done.returncode == 2
     words = "reading recordings needs mcap, rosbags, lz4 and zstandard: pip install mcap rosbags lz4 zstandard"
     assert done.stderr == f"player_node: {words}\n"

@@ -20,7 +20,9 @@ from test_layers import ROS, imports
 import fdi_ros
 from fdi_ros.system import BAGS
 
-pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
+pytest.importorskip(
+    "colcon_ros", reason="colcon is not installed: pip install -e '.[test]'"
+)
 
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -34,12 +36,28 @@ INIT = ["tini", "--", "/ros_entrypoint.sh"]
 
 def steps(root):
     """Instructions of the Dockerfile and what they are given."""
-    text = re.sub(r"\\\n\s*", "", re.sub(r"^#.*\n", "", (root / "Dockerfile").read_text(), flags=re.MULTILINE))
-    return [(word, rest) for word, _, rest in (line.partition(" ") for line in text.splitlines()) if word]
+    text = re.sub(
+        r"\\\n\s*",
+        "",
+        re.sub(r"^#.*\n", "", (root / "Dockerfile").read_text(), flags=re.MULTILINE),
+    )
+    return [
+        (word, rest)
+        for word, _, rest in (line.partition(" ") for line in text.splitlines())
+        if word
+    ]
 
 
 def run(command, folder, **options):
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False, **options)
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+        **options,
+    )
     assert done.returncode == 0, (command, done.stdout, done.stderr)
     return done
 
@@ -50,7 +68,11 @@ def colcon():
 
 def with_compiled(command, root):
     """Have the programs that were installed run the modules of the clone, where all is compiled: it takes minutes."""
-    return re.sub(r"(\. install/local_setup\.(ba)?sh)", rf"\1 && export PYTHONPATH={root}:$PYTHONPATH", command)
+    return re.sub(
+        r"(\. install/local_setup\.(ba)?sh)",
+        rf"\1 && export PYTHONPATH={root}:$PYTHONPATH",
+        command,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +84,9 @@ def workspace(tmp_path_factory):
     for command in (rest for word, rest in steps(root) if word == "RUN"):
         if "apt-get" in command or "useradd" in command:
             continue
-        here = command if Path("/opt/ros/jazzy").exists() else command.replace(SOURCED, "")
+        here = (
+            command if Path("/opt/ros/jazzy").exists() else command.replace(SOURCED, "")
+        )
         here = with_compiled(here.replace("colcon build", f"{colcon()} build"), root)
         run(here, place, shell=True)
     yield place
@@ -75,27 +99,47 @@ def install(workspace):
     return workspace / "install" / "fdi_ros"
 
 
-def test_every_executable_has_something_to_run_and_all_settings_are_installed(root, install):
-    names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
+def test_every_executable_has_something_to_run_and_all_settings_are_installed(
+    root, install
+):
+    names = {
+        path.name
+        for path in (install / "lib" / "fdi_ros").iterdir()
+        if os.access(path, os.X_OK)
+    }
     assert {"fdi", "fdi_node"} <= names
-    (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
+    (entry_points,) = install.glob(
+        "lib/python*/site-packages/fdi_ros*/entry_points.txt"
+    )
     targets = re.findall(r"= (fdi_ros\.[\w.]+):(\w+)", entry_points.read_text())
     assert targets
     for module, function in targets:
-        source = next(install.glob("lib/python*/site-packages")) / f"{module.replace('.', '/')}.py"
+        source = (
+            next(install.glob("lib/python*/site-packages"))
+            / f"{module.replace('.', '/')}.py"
+        )
         assert source.is_file()
         assert callable(getattr(importlib.import_module(module), function))
     share = install / "share"
     assert (share / "ament_index/resource_index/packages/fdi_ros").exists()
     assert (share / "fdi_ros/package.xml").exists()
     for folder, pattern in (("config", "*.yaml"), ("launch", "*.launch.py")):
-        sources = {path.relative_to(root / folder) for path in (root / folder).rglob(pattern)}
+        sources = {
+            path.relative_to(root / folder) for path in (root / folder).rglob(pattern)
+        }
         installed = share / "fdi_ros" / folder
-        assert sources <= {path.relative_to(installed) for path in installed.rglob(pattern)}
+        assert sources <= {
+            path.relative_to(installed) for path in installed.rglob(pattern)
+        }
 
 
-def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install, tmp_path):
-    setup, fdi = install.parent / "local_setup.bash", install / "lib" / "fdi_ros" / "fdi"
+def test_the_installed_command_runs_and_finds_its_files_without_a_clone(
+    install, tmp_path
+):
+    setup, fdi = (
+        install.parent / "local_setup.bash",
+        install / "lib" / "fdi_ros" / "fdi",
+    )
     script = f". {setup} && {fdi} shipped two_imus.yaml && exec {fdi} geometry config/two_imus.yaml"
     done = run(["bash", "-c", script], tmp_path)
     shipped = install / "share" / "fdi_ros" / "config" / "two_imus.yaml"
@@ -111,12 +155,16 @@ def test_one_version_everywhere_and_a_changelog_that_bloom_reads(root):
     catkin = pytest.importorskip("catkin_pkg.changelog")
     released = f"{fdi_ros.__version__} (2000-01-01)\n{'-' * 30}"
     text, changelog = (root / "CHANGELOG.rst").read_text(), catkin.Changelog("fdi_ros")
-    catkin.populate_changelog_from_rst(changelog, re.sub(r"^Forthcoming\n-+$", released, text, flags=re.M))
+    catkin.populate_changelog_from_rst(
+        changelog, re.sub(r"^Forthcoming\n-+$", released, text, flags=re.M)
+    )
     assert changelog.get_content_of_version(fdi_ros.__version__)
 
 
 def test_every_source_file_has_copyright_and_licence(root):
-    assert run([sys.executable, "tools/license_headers.py", "--check"], root).stdout == ""
+    assert (
+        run([sys.executable, "tools/license_headers.py", "--check"], root).stdout == ""
+    )
 
 
 def test_the_manifest_names_every_ros_package_in_use(root):
@@ -133,24 +181,38 @@ def test_the_manifest_names_every_ros_package_in_use(root):
 
 def test_the_image_has_what_reads_recordings_and_runs_under_an_init_as_a_user(root):
     order = steps(root)
-    runs, words = [rest for word, rest in order if word == "RUN"], [word for word, _ in order if word != "ENV"]
+    runs, words = (
+        [rest for word, rest in order if word == "RUN"],
+        [word for word, _ in order if word != "ENV"],
+    )
     assert "rosdep install --rosdistro jazzy --from-paths src" in runs[0]
     # By pip what no distribution of ROS has.
     assert {"tini", "pymavlink", "pyserial", *BAGS} <= set(runs[1].split())
     assert words[-4:] == ["RUN", "USER", "ENTRYPOINT", "CMD"]
     assert json.loads(dict(order)["ENTRYPOINT"])[: len(INIT)] == INIT
-    assert {".git", "**/__pycache__", ".venv*"} <= set((root / ".dockerignore").read_text().split())
+    assert {".git", "**/__pycache__", ".venv*"} <= set(
+        (root / ".dockerignore").read_text().split()
+    )
 
 
-def test_the_steps_build_it_and_a_user_runs_it_without_compiling(workspace, root, quiet_domain):
+def test_the_steps_build_it_and_a_user_runs_it_without_compiling(
+    workspace, root, quiet_domain
+):
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     if os.geteuid() != 0 or not shutil.which("setpriv"):
         pytest.skip("only root can start it as another user")
-    entry, given = (json.loads(rest) for word, rest in steps(root) if word in ("ENTRYPOINT", "CMD"))
+    entry, given = (
+        json.loads(rest) for word, rest in steps(root) if word in ("ENTRYPOINT", "CMD")
+    )
     assert given[-1] == "/config.yaml"
     # Of the image: its init, and the ROS in it.
     start = entry[len(INIT) :]
-    command = [*start[:-1], with_compiled(start[-1], root), *given[:-1], "config/two_imus.yaml"]
+    command = [
+        *start[:-1],
+        with_compiled(start[-1], root),
+        *given[:-1],
+        "config/two_imus.yaml",
+    ]
     home = workspace / "home"
     home.mkdir()
     os.chown(home, USER, -1)
@@ -158,8 +220,20 @@ def test_the_steps_build_it_and_a_user_runs_it_without_compiling(workspace, root
     # Where the tests run may be closed to others; reading is all that this user may do there.
     only = "-all,+dac_read_search"
     become = ["setpriv", "--reuid", str(USER), "--regid", str(USER), "--clear-groups"]
-    become += ["--inh-caps", only, "--ambient-caps", "+dac_read_search", "--bounding-set", only]
-    env = {**os.environ, "HOME": str(home), "ROS_LOG_DIR": str(home / "log"), "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    become += [
+        "--inh-caps",
+        only,
+        "--ambient-caps",
+        "+dac_read_search",
+        "--bounding-set",
+        only,
+    ]
+    env = {
+        **os.environ,
+        "HOME": str(home),
+        "ROS_LOG_DIR": str(home / "log"),
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+    }
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     said = []
     with subprocess.Popen([*become, *command], cwd=workspace, env=env, **pipes) as node:

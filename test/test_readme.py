@@ -22,19 +22,29 @@ pytestmark = pytest.mark.usefixtures("compiled")
 ROOT = Path(__file__).parents[1]
 GUIDES = {
     name: (ROOT / name).read_text()
-    for name in ("README.md", *(f"docs/{guide}.md" for guide in ("install", "live", "recordings", "fleet")))
+    for name in (
+        "README.md",
+        *(f"docs/{guide}.md" for guide in ("install", "live", "recordings", "fleet")),
+    )
 }
-COMMANDS = re.findall(r"^    (?:\.venv/bin/)?(fdi .+)$", "\n".join(GUIDES.values()), flags=re.MULTILINE)
+COMMANDS = re.findall(
+    r"^    (?:\.venv/bin/)?(fdi .+)$", "\n".join(GUIDES.values()), flags=re.MULTILINE
+)
 ELSEWHERE = ("fdi montecarlo", "fdi compile", "fdi watch")
 """Takes minutes; is run by the fixture `compiled`; runs until it is interrupted (test_watch.py)."""
-QUICK = [command for command in dict.fromkeys(COMMANDS) if not command.startswith(ELSEWHERE)]
+QUICK = [
+    command for command in dict.fromkeys(COMMANDS) if not command.startswith(ELSEWHERE)
+]
 
 
 def python_of(page):
     """All Python of a page, one block after the other."""
-    pattern = r"^```python\n([\s\S]*?)^```$|^\.\. code-block:: python\n\n((?:    .*\n|\n)+)"
+    pattern = (
+        r"^```python\n([\s\S]*?)^```$|^\.\. code-block:: python\n\n((?:    .*\n|\n)+)"
+    )
     return "\n".join(
-        fenced or textwrap.dedent(block) for fenced, block in re.findall(pattern, page.read_text(), flags=re.MULTILINE)
+        fenced or textwrap.dedent(block)
+        for fenced, block in re.findall(pattern, page.read_text(), flags=re.MULTILINE)
     )
 
 
@@ -63,14 +73,23 @@ def test_every_offline_command_runs(command, root, tmp_path, monkeypatch, capfd)
     faulty = "copter_crash" in command and "replay" in command
     assert main(shlex.split(command)[1:]) == (3 if faulty else 0)
     # On a busy machine a long one says how far it is.
-    assert [line for line in capfd.readouterr().err.splitlines() if not re.search("% done|at work", line)] == []
+    assert [
+        line
+        for line in capfd.readouterr().err.splitlines()
+        if not re.search("% done|at work", line)
+    ] == []
     if "--json" in command:
         assert (tmp_path / "out.json").stat().st_size > 0
 
 
 def test_every_verb_is_shown_with_files_that_are_there(root):
     assert {command.split()[1] for command in COMMANDS} == set(VERBS)
-    named = {word for command in COMMANDS for word in command.split() if word.startswith(("bags/", "config/"))}
+    named = {
+        word
+        for command in COMMANDS
+        for word in command.split()
+        if word.startswith(("bags/", "config/"))
+    }
     assert [word for word in named if not (root / word).exists()] == []
 
 
@@ -78,7 +97,10 @@ def test_every_verb_is_shown_with_files_that_are_there(root):
 def test_the_python_of_a_page_runs(page, root, monkeypatch):
     monkeypatch.chdir(root)
     rng = np.random.default_rng(3)
-    names = {"stamp": 10**16 + 10**7 * np.arange(600), "z": rng.normal(0.0, 0.0025, (600, 6))}
+    names = {
+        "stamp": 10**16 + 10**7 * np.arange(600),
+        "z": rng.normal(0.0, 0.0025, (600, 6)),
+    }
     exec(python_of(page), names)
     # What is shown of them: quiet gyros are healthy, injected faults are isolated.
     assert "verdict" not in names or not names["verdict"].alarm.any()
@@ -93,25 +115,37 @@ def test_every_name_of_the_package_in_a_page_is_there():
 
 
 def test_the_numbers_of_the_states_are_those_of_the_code():
-    stated = {name: int(number) for number, name in re.findall(r"(\d) ([A-Z]+)\b", GUIDES["docs/live.md"])}
+    stated = {
+        name: int(number)
+        for number, name in re.findall(r"(\d) ([A-Z]+)\b", GUIDES["docs/live.md"])
+    }
     assert stated == {state.name: int(state) for state in ChannelState}
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "bags/README.md"])
 def test_every_link_leads_to_a_file(name, root):
     """Those of the pages of the site are checked where it is built, anchors too: make docs."""
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", (root / name).read_text()) if "://" not in link]
+    links = [
+        link
+        for link in re.findall(r"\]\(([^)]+)\)", (root / name).read_text())
+        if "://" not in link
+    ]
     targets = [(root / name).parent / link.partition("#")[0] for link in links]
     assert [target for target in targets if not target.exists()] == []
 
 
 def test_the_notebook_runs_and_shows_what_it_says(root, tmp_path):
     nbformat, nbclient = (
-        pytest.importorskip(name, reason="nbclient is not installed") for name in ("nbformat", "nbclient")
+        pytest.importorskip(name, reason="nbclient is not installed")
+        for name in ("nbformat", "nbclient")
     )
     notebook = nbformat.read(root / "examples" / "recording.ipynb", as_version=4)
-    assert not any(cell.get("outputs") for cell in notebook.cells), "kept without outputs: they would grow stale"
-    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(root / "examples")}}).execute()
+    assert not any(cell.get("outputs") for cell in notebook.cells), (
+        "kept without outputs: they would grow stale"
+    )
+    nbclient.NotebookClient(
+        notebook, timeout=600, resources={"metadata": {"path": str(root / "examples")}}
+    ).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     said = "".join(output.get("text", "") for output in outputs)
     shown = [output["data"] for output in outputs if "data" in output]
@@ -129,4 +163,7 @@ def test_tables_that_follow_from_the_code_are_up_to_date(root, monkeypatch):
     for page in reference.PAGES:
         text = (root / "docs" / page).read_text()
         assert reference.filled(text) == text, "python docs/reference.py writes it"
-    assert all(f"| `{name}` |" in (root / "docs" / "parameters.md").read_text() for name in PARAMETERS)
+    assert all(
+        f"| `{name}` |" in (root / "docs" / "parameters.md").read_text()
+        for name in PARAMETERS
+    )

@@ -43,7 +43,9 @@ class Vehicle:
     @property
     def nominal(self):
         """Axes as configured."""
-        return Geometry.from_triads(list(np.reshape(self.config.imus.mounts, (-1, 3, 3))))
+        return Geometry.from_triads(
+            list(np.reshape(self.config.imus.mounts, (-1, 3, 3)))
+        )
 
 
 def turns_by_hand(begins):
@@ -85,11 +87,15 @@ def vehicle(seed, kind, units=3, sample_rate=100.0):
     ends = time[-1] + (0.0 if kind == "flight alone" else 5.0)
     motion = Motion(np.array([0.0, *time]), np.array([np.zeros(3), *rates]))
     t = np.arange(int(ends * sample_rate)) / sample_rate
-    z = np.hstack([motion.rate_at(t - late[u]) @ axes[3 * u : 3 * u + 3].T for u in range(units)])
+    z = np.hstack(
+        [motion.rate_at(t - late[u]) @ axes[3 * u : 3 * u + 3].T for u in range(units)]
+    )
     walk = np.cumsum(WALK / np.sqrt(sample_rate) * rng.standard_normal(z.shape), axis=0)
     bias = rng.normal(0, BIAS, n) + walk + rng.normal(0, WARMING, n) * t[:, None]
     shaken = 0.0 if hand else rng.uniform(*VIBRATION) * ((t > begins) & (t < time[-1]))
-    z += bias + np.hypot(NOISE, shaken * np.ones(len(t)))[:, None] * rng.standard_normal(z.shape)
+    z += bias + np.hypot(NOISE, shaken * np.ones(len(t)))[
+        :, None
+    ] * rng.standard_normal(z.shape)
     config = Config.from_parameters(
         {
             "input": "imus",
@@ -100,4 +106,10 @@ def vehicle(seed, kind, units=3, sample_rate=100.0):
             "sample_rate": sample_rate,
         }
     )
-    return Vehicle(config, Block(START + np.round(t * 1e9).astype(np.int64), z), axes, bias.mean(axis=0), late)
+    return Vehicle(
+        config,
+        Block(START + np.round(t * 1e9).astype(np.int64), z),
+        axes,
+        bias.mean(axis=0),
+        late,
+    )

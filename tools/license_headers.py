@@ -13,7 +13,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LINES = ("Copyright 2026 fdi_ros maintainers", "SPDX-License-Identifier: Apache-2.0")
-COMMENTS = {".py": ("# ", ""), ".sh": ("# ", ""), ".js": ("// ", ""), ".css": ("/* ", " */")}
+COMMENTS = {
+    ".py": ("# ", ""),
+    ".sh": ("# ", ""),
+    ".js": ("// ", ""),
+    ".css": ("/* ", " */"),
+}
 """What a line of comment begins and ends with, by the suffix of a file."""
 BUILT = {"build", "dist", "install", "log", "__pycache__"}
 
@@ -35,13 +40,21 @@ def with_header(text: str, suffix: str) -> str:
 def sources() -> Iterator[Path]:
     """Source files of the repository, what is built or installed in it left out."""
     for folder, folders, names in os.walk(ROOT):
-        folders[:] = [name for name in folders if name not in BUILT and not name.startswith(".")]
-        yield from (Path(folder) / name for name in names if Path(name).suffix in COMMENTS)
+        folders[:] = [
+            name for name in folders if name not in BUILT and not name.startswith(".")
+        ]
+        yield from (
+            Path(folder) / name for name in names if Path(name).suffix in COMMENTS
+        )
 
 
 def lacking() -> list[Path]:
     """Source files without the header."""
-    return sorted(path for path in sources() if header(path.suffix) not in path.read_text(encoding="utf-8"))
+    return sorted(
+        path
+        for path in sources()
+        if header(path.suffix) not in path.read_text(encoding="utf-8")
+    )
 
 
 def main() -> int:
@@ -50,7 +63,10 @@ def main() -> int:
     for path in paths:
         print(path.relative_to(ROOT))
         if "--check" not in sys.argv:
-            path.write_text(with_header(path.read_text(encoding="utf-8"), path.suffix), encoding="utf-8")
+            path.write_text(
+                with_header(path.read_text(encoding="utf-8"), path.suffix),
+                encoding="utf-8",
+            )
     return 1 if paths and "--check" in sys.argv else 0
 
 

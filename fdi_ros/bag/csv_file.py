@@ -41,12 +41,25 @@ KIND = "columns"
 _PORTION = 1 << 21  # bytes that are read at once
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _DEGREES = math.pi / 180.0
-_RATE_UNITS = {"rad/s": 1.0, "rad_s": 1.0, "radps": 1.0, "deg/s": _DEGREES, "deg_s": _DEGREES, "dps": _DEGREES}
-_UNIT = re.compile(r"[ _]*[\[(]([^\d\])][^\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$")
-_TIME = re.compile(r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)")
+_RATE_UNITS = {
+    "rad/s": 1.0,
+    "rad_s": 1.0,
+    "radps": 1.0,
+    "deg/s": _DEGREES,
+    "deg_s": _DEGREES,
+    "dps": _DEGREES,
+}
+_UNIT = re.compile(
+    r"[ _]*[\[(]([^\d\])][^\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
+)
+_TIME = re.compile(
+    r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)"
+)
 _AXIS = re.compile(r"(.*?)[._ ]*(?:([xyz])|\[([012])\])[._ ]*(\d*)")
 _GYRO = re.compile(r"gyr|omega|angular_?vel|(^|[._ \d])[gw]\d*$")
-_OTHER = re.compile(r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$")
+_OTHER = re.compile(
+    r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$"
+)
 """Heads of names of rates, and of what else has three axes."""
 
 
@@ -55,7 +68,9 @@ class Columns(NamedTuple):
 
     time: int  # index of the column
     tick: float  # seconds of one unit of it; 0: by the size of the first time
-    imus: tuple[tuple[int, int, int], ...]  # indices of the rates about x, y and z of each
+    imus: tuple[
+        tuple[int, int, int], ...
+    ]  # indices of the rates about x, y and z of each
     factors: tuple[float, ...]  # rates of each IMU are multiplied by this for rad/s
 
 
@@ -65,7 +80,9 @@ class CsvLog(FlightLog):
     magic = b""
     refusal = "is no table of text (.csv)"
     kinds = (KIND,)
-    settings = f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"
+    settings = (
+        f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"
+    )
     one_imu = "this table has one IMU ({}): nothing to compare it with"
     slowest = 5.0
 
@@ -74,17 +91,27 @@ class CsvLog(FlightLog):
         delimiter, columns = find_columns(self.file, self.note)
         offset, bad, rest = self.file.tell(), 0, b""
         while rest or offset < self.end:
-            data = rest + self.file.read(max(0, min(_PORTION, self.end - offset - len(rest))))
+            data = rest + self.file.read(
+                max(0, min(_PORTION, self.end - offset - len(rest)))
+            )
             final = offset + len(data) >= self.end
             size = data.rfind(b"\n") + 1
             if not size and not final:
-                raise BagError(f"{self.file.name} has a line of more than {len(data)} bytes at byte {offset}")
+                raise BagError(
+                    f"{self.file.name} has a line of more than {len(data)} bytes at byte {offset}"
+                )
             if final and size < len(data):
                 self.note("the last line is not finished and was left out")
             lines = data[:size].split(b"\n")[:-1]
             ends = offset + np.cumsum([len(one) + 1 for one in lines], dtype=np.int64)
-            used = [k for k, one in enumerate(lines) if one.strip() and not one.startswith(b"#")]
-            table = _numbers([lines[k].decode("utf-8", "replace") for k in used], columns, delimiter)
+            used = [
+                k
+                for k, one in enumerate(lines)
+                if one.strip() and not one.startswith(b"#")
+            ]
+            table = _numbers(
+                [lines[k].decode("utf-8", "replace") for k in used], columns, delimiter
+            )
             good = np.isfinite(table[:, 0])
             bad += int((~good).sum())
             # Numbers of a damaged table may be anything.
@@ -92,7 +119,14 @@ class CsvLog(FlightLog):
                 if not columns.tick and good.any():
                     # Dates by their size, else seconds.
                     first = table[good, 0][0]
-                    tick = next((tick for tick in (1e-9, 1e-6, 1e-3) if first * tick * 1e9 >= EARLIEST), 1.0)
+                    tick = next(
+                        (
+                            tick
+                            for tick in (1e-9, 1e-6, 1e-3)
+                            if first * tick * 1e9 >= EARLIEST
+                        ),
+                        1.0,
+                    )
                     columns = columns._replace(tick=tick)
                 samples = _samples(table[good], ends[used][good], columns)
             self.counts["lines"] += len(used)
@@ -117,7 +151,10 @@ def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Colu
     else:
         raise BagError(f"{file.name} has no line with the names of its columns")
     delimiter = max("\t;,", key=line.count)
-    names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
+    names = [
+        name.strip().strip('"')
+        for name in line.lstrip("\ufeff# ").strip().split(delimiter)
+    ]
     if np.isfinite([_number(names, k) for k in range(len(names))]).all():
         raise BagError(
             f"{file.name} has no names of columns: its first line holds numbers. Put a line of names before"
@@ -126,29 +163,55 @@ def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Colu
     return delimiter, _columns(file, names, note)
 
 
-def _columns(file: BinaryIO, names: Sequence[str], note: Callable[[str], None]) -> Columns:
+def _columns(
+    file: BinaryIO, names: Sequence[str], note: Callable[[str], None]
+) -> Columns:
     """Choose the columns, and say which; `BagError` if there are none, or ``columns.yaml`` asks for others."""
     path = Path(file.name).parent / COLUMNS
     told = read_yaml(path, "file", BagError) if path.exists() else {}
-    if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
+    if not isinstance(told, dict) or set(told) - {
+        "time",
+        "time_unit",
+        "rate_unit",
+        "imus",
+    }:
         raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
     imus = told.get("imus", _imus(names))
-    if not isinstance(imus, list) or any(not isinstance(imu, list) or len(imu) != 3 for imu in imus):
+    if not isinstance(imus, list) or any(
+        not isinstance(imu, list) or len(imu) != 3 for imu in imus
+    ):
         raise BagError(f"{path}: imus is a list of three columns for each IMU")
-    time: Any = told.get("time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None))
+    time: Any = told.get(
+        "time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None)
+    )
     listed = shown(", ".join(names), MOST_SHOWN)
     for name in (time, *(column for imu in imus for column in imu)):
         if name not in names:
             missing = "no column of times" if name is None else f"no column {name!r}"
-            raise BagError(f"{file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}")
+            raise BagError(
+                f"{file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}"
+            )
     if not imus:
-        raise BagError(f"{file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}")
+        raise BagError(
+            f"{file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}"
+        )
     tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
-    rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
+    rates = [
+        _factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x)
+        for x, _, _ in imus
+    ]
     said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
     stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
-    unit = " in deg/s" if _DEGREES in rates else "" if stated else "; no unit is named: taken as rad/s"
-    note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}")
+    unit = (
+        " in deg/s"
+        if _DEGREES in rates
+        else ""
+        if stated
+        else "; no unit is named: taken as rad/s"
+    )
+    note(
+        f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}"
+    )
     places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
     return Columns(names.index(time), tick, places, tuple(rates))
 
@@ -166,13 +229,19 @@ def _split(name: str) -> tuple[str, str]:
     """Return a name in small letters without its unit, and the unit, empty if there is none."""
     name = name.lower()
     unit = _UNIT.search(name)
-    return (name[: unit.start()], next(filter(None, unit.groups())).strip()) if unit else (name, "")
+    return (
+        (name[: unit.start()], next(filter(None, unit.groups())).strip())
+        if unit
+        else (name, "")
+    )
 
 
 def _factor(unit: str, known: dict[str, float], default: float, name: str) -> float:
     """Return what a unit is multiplied by; `BagError` if it is not known."""
     if unit and unit not in known:
-        raise BagError(f"column {name!r} has the unit {unit!r}, expected one of {', '.join(known)}")
+        raise BagError(
+            f"column {name!r} has the unit {unit!r}, expected one of {', '.join(known)}"
+        )
     return known.get(unit, default)
 
 
@@ -184,9 +253,19 @@ def _imus(names: Sequence[str]) -> list[list[str]]:
         if match and not _TIME.fullmatch(_split(name)[0]):
             axis = match[2] or "xyz"[int(match[3])]
             groups.setdefault((match[1], match[4]), {}).setdefault(axis, name)
-    whole = {key: [axes[axis] for axis in "xyz"] for key, axes in groups.items() if len(axes) == 3}
-    gyros = [axes for (head, _), axes in whole.items() if _GYRO.search(head) and "cov" not in head]
-    return gyros or [axes for (head, _), axes in whole.items() if not _OTHER.search(head)]
+    whole = {
+        key: [axes[axis] for axis in "xyz"]
+        for key, axes in groups.items()
+        if len(axes) == 3
+    }
+    gyros = [
+        axes
+        for (head, _), axes in whole.items()
+        if _GYRO.search(head) and "cov" not in head
+    ]
+    return gyros or [
+        axes for (head, _), axes in whole.items() if not _OTHER.search(head)
+    ]
 
 
 def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
@@ -197,7 +276,14 @@ def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
     if delimiter == ";":
         lines = [line.replace(",", ".") for line in lines]
     with contextlib.suppress(ValueError):
-        table = np.loadtxt(lines, delimiter=delimiter, usecols=chosen, comments=None, quotechar='"', ndmin=2)
+        table = np.loadtxt(
+            lines,
+            delimiter=delimiter,
+            usecols=chosen,
+            comments=None,
+            quotechar='"',
+            ndmin=2,
+        )
         if len(table) == len(lines):
             return table
     rows = []
@@ -216,10 +302,14 @@ def _number(cells: Sequence[str], column: int) -> float:
         return math.nan
 
 
-def _samples(table: Array, end: Int, columns: Columns) -> list[tuple[Source, ImuSamples]]:
+def _samples(
+    table: Array, end: Int, columns: Columns
+) -> list[tuple[Source, ImuSamples]]:
     """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at places in the file (k,)."""
     # What no date is, no time is either; it is left out as impossible.
-    stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(np.int64)
+    stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(
+        np.int64
+    )
     found = []
     for k, factor in enumerate(columns.factors):
         rate = table[:, 1 + 3 * k : 4 + 3 * k] * factor

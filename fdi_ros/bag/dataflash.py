@@ -32,7 +32,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.flight_log import FLU, FlightLog, ImuSamples, Portion, Source, imu_samples, per_time, possible_start
+from fdi_ros.bag.flight_log import (
+    FLU,
+    FlightLog,
+    ImuSamples,
+    Portion,
+    Source,
+    imu_samples,
+    per_time,
+    possible_start,
+)
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
@@ -43,8 +52,24 @@ _FMT_SIZE = 89
 _HEAD = 3  # bytes of a record before its values
 _TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
-    | {"i": "<i4", "I": "<u4", "e": "<i4", "E": "<u4", "L": "<i4", "q": "<i8", "Q": "<u8"}
-    | {"g": "<f2", "f": "<f4", "d": "<f8", "n": "S4", "N": "S16", "Z": "S64", "a": "S64"}
+    | {
+        "i": "<i4",
+        "I": "<u4",
+        "e": "<i4",
+        "E": "<u4",
+        "L": "<i4",
+        "q": "<i8",
+        "Q": "<u8",
+    }
+    | {
+        "g": "<f2",
+        "f": "<f4",
+        "d": "<f8",
+        "n": "S4",
+        "N": "S16",
+        "Z": "S64",
+        "a": "S64",
+    }
 )
 """NumPy types of the letters of a FMT record."""
 _NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
@@ -63,15 +88,51 @@ _VALUES = {
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
 """Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
-_TEXTS = {"MSG": ("Message",), "ERR": ("Subsys", "ECode")}  # columns of what the autopilot says
-_UNITS = {"FMTU": ("FmtType", "UnitIds", "MultIds"), "UNIT": ("Id", "Label"), "MULT": ("Id", "Mult")}
+_TEXTS = {
+    "MSG": ("Message",),
+    "ERR": ("Subsys", "ECode"),
+}  # columns of what the autopilot says
+_UNITS = {
+    "FMTU": ("FmtType", "UnitIds", "MultIds"),
+    "UNIT": ("Id", "Label"),
+    "MULT": ("Id", "Mult"),
+}
 """Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
-_OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
+_OPTIONAL = (
+    "TimeUS",
+    "TimeMS",
+    "SampleUS",
+    "I",
+    "Status",
+    "T",
+    "GMS",
+    "GWk",
+    "Week",
+    "DelvT",
+)
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
-    {2: "radio", 3: "compass", 5: "radio failsafe", 6: "battery failsafe", 8: "ground station failsafe"}
-    | {9: "fence failsafe", 10: "flight mode", 11: "GPS", 12: "crash check", 16: "EKF check", 17: "EKF failsafe"}
-    | {18: "barometer", 25: "thrust loss", 29: "vibration failsafe", 30: "internal error"}
+    {
+        2: "radio",
+        3: "compass",
+        5: "radio failsafe",
+        6: "battery failsafe",
+        8: "ground station failsafe",
+    }
+    | {
+        9: "fence failsafe",
+        10: "flight mode",
+        11: "GPS",
+        12: "crash check",
+        16: "EKF check",
+        17: "EKF failsafe",
+    }
+    | {
+        18: "barometer",
+        25: "thrust loss",
+        29: "vibration failsafe",
+        30: "internal error",
+    }
 )
 """Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
@@ -91,11 +152,17 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
     end = position + size
     if end > len(data) or (end + 2 > len(data) and not final):
         return -1
-    return end if end + 2 > len(data) or (data[end] == 0xA3 and data[end + 1] == 0x95) else 0
+    return (
+        end
+        if end + 2 > len(data) or (data[end] == 0xA3 and data[end + 1] == 0x95)
+        else 0
+    )
 
 
 @compiled
-def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int, int, int]:
+def find_records(
+    data: Bytes, sizes: Int, final: bool, found: Int
+) -> tuple[int, int, int]:
     """Find the records in a portion of a log, with which the log ends if it is the final one.
 
     ``sizes`` (256,): bytes of a record of each message, 0 if not known; filled in from FMT records, of which the first
@@ -111,7 +178,9 @@ def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int,
             begin = position
             position += 1
             # A hole of gigabytes is passed at the speed of memory.
-            while position + _HEAD <= len(data) and (data[position] != 0xA3 or data[position + 1] != 0x95):
+            while position + _HEAD <= len(data) and (
+                data[position] != 0xA3 or data[position + 1] != 0x95
+            ):
                 position += 1
             lost += position - begin
             continue
@@ -130,7 +199,8 @@ class DataflashLog(FlightLog):
     refusal = "is no log of ArduPilot"
     kinds = tuple(_VALUES)
     settings = (
-        "ArduPilot: LOG_BITMASK bit 18, Fast IMU (ArduCopter), or bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros"
+        "ArduPilot: LOG_BITMASK bit 18, Fast IMU (ArduCopter), or bit 19, Raw IMU, "
+        "or INS_RAW_LOG_OPT bit 1, all gyros"
     )
     one_imu = (
         "this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
@@ -142,14 +212,20 @@ class DataflashLog(FlightLog):
         """Read the log from its start up to `end`."""
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
-        self._layouts: dict[int, np.dtype[np.void]] = {}  # columns that are read of records of each message
+        self._layouts: dict[
+            int, np.dtype[np.void]
+        ] = {}  # columns that are read of records of each message
         self._lacking: dict[int, str] = {}  # of messages that cannot be read: why
-        self._columns: dict[int, list[str]] = {}  # all columns of each message that is read
+        self._columns: dict[
+            int, list[str]
+        ] = {}  # all columns of each message that is read
         self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _UNITS}
         offset = lost = 0
         while True:
             self.file.seek(offset)
-            data = np.frombuffer(self.file.read(min(_PORTION, self.end - offset)), dtype=np.uint8)
+            data = np.frombuffer(
+                self.file.read(min(_PORTION, self.end - offset)), dtype=np.uint8
+            )
             final = offset + _PORTION >= self.end
             # Numbers of a damaged log may be anything.
             with np.errstate(all="ignore"):
@@ -160,9 +236,13 @@ class DataflashLog(FlightLog):
             if final or not size:
                 break
         if lost + self.end - offset:
-            self.note(f"{lost + self.end - offset} bytes belong to no whole record and were left out")
+            self.note(
+                f"{lost + self.end - offset} bytes belong to no whole record and were left out"
+            )
 
-    def _read(self, data: Bytes, begin: int, final: bool) -> tuple[list[tuple[Source, ImuSamples]], int, int]:
+    def _read(
+        self, data: Bytes, begin: int, final: bool
+    ) -> tuple[list[tuple[Source, ImuSamples]], int, int]:
         """Read a portion that begins at a place in the file.
 
         Returned are its samples, where its last record ends in it, and the bytes before that in no record.
@@ -174,22 +254,33 @@ class DataflashLog(FlightLog):
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
         order = np.argsort(number.astype(np.uint8), kind="stable")
         there, begins = np.unique(number[order], return_index=True)
-        starts = dict(zip(there.tolist(), np.split(offset[order], begins[1:]), strict=False))
+        starts = dict(
+            zip(there.tolist(), np.split(offset[order], begins[1:]), strict=False)
+        )
         for k, of_message in starts.items():
             self.counts[self._names.get(k, "unknown")] += len(of_message)
             if k in self._lacking:
                 self.unread[self._names[k]] = self._lacking[k]
         samples: list[tuple[Source, ImuSamples]] = []
         # Units before the samples: in a short log both are in one portion.
-        for k in sorted(starts.keys() & self._layouts.keys(), key=lambda k: self._names[k] not in _UNITS):
+        for k in sorted(
+            starts.keys() & self._layouts.keys(),
+            key=lambda k: self._names[k] not in _UNITS,
+        ):
             name, layout = self._names[k], self._layouts[k]
-            rows = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[starts[k]].view(layout)[:, 0]
+            rows = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[
+                starts[k]
+            ].view(layout)[:, 0]
             if (sensor := _SENSORS.fullmatch(name)) is not None:
                 source = Source(sensor[1], int(sensor[2] or 1) - 1)
-                samples += _samples(source, rows, begin + starts[k], *self._factors(k, source))
+                samples += _samples(
+                    source, rows, begin + starts[k], *self._factors(k, source)
+                )
             elif name in _UNITS:
                 number, *columns = (rows[column] for column in _UNITS[name])
-                for at, *told in zip(number.astype(np.int64).tolist(), *map(list, columns), strict=True):
+                for at, *told in zip(
+                    number.astype(np.int64).tolist(), *map(list, columns), strict=True
+                ):
                     self._told[name].setdefault(at, told)
             elif name in _TEXTS:
                 self._take_texts(name, rows)
@@ -200,7 +291,9 @@ class DataflashLog(FlightLog):
     def _describe(self, content: bytes) -> None:
         """Take in a FMT record, if it is the first of its message."""
         number, size, *texts = struct.unpack("<BB4s16s64s", content)
-        name, types, columns = (text.partition(b"\0")[0].decode("ascii", "replace") for text in texts)
+        name, types, columns = (
+            text.partition(b"\0")[0].decode("ascii", "replace") for text in texts
+        )
         if number in self._names:
             return
         self._names[number] = name
@@ -208,7 +301,9 @@ class DataflashLog(FlightLog):
         if sensor or _GPS.fullmatch(name) or name in _TEXTS or name in _UNITS:
             self._columns[number] = columns.split(",")
             try:
-                self._layouts[number] = _layout(name, size, types, self._columns[number])
+                self._layouts[number] = _layout(
+                    name, size, types, self._columns[number]
+                )
             except ValueError as error:
                 if sensor:
                     self._lacking[number] = str(error)
@@ -216,9 +311,13 @@ class DataflashLog(FlightLog):
     def _take_texts(self, name: str, rows: Rows) -> None:
         """Take in what records (k,) say."""
         if name == "MSG":
-            texts = [text.decode("ascii", "replace") for text in rows["Message"].tolist()]
+            texts = [
+                text.decode("ascii", "replace") for text in rows["Message"].tolist()
+            ]
         else:
-            texts = list(map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist()))
+            texts = list(
+                map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist())
+            )
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
@@ -228,11 +327,21 @@ class DataflashLog(FlightLog):
         units, multipliers = self._told["FMTU"].get(number, (b"", b""))
         for columns in _VALUES[source.kind]:
             factors = np.ones(3)
-            for i, k in enumerate(self._columns[number].index(one) for one in columns if one in self._columns[number]):
-                (said,) = self._told["MULT"].get(multipliers[k], (1.0,)) if k < len(multipliers) else (1.0,)
+            for i, k in enumerate(
+                self._columns[number].index(one)
+                for one in columns
+                if one in self._columns[number]
+            ):
+                (said,) = (
+                    self._told["MULT"].get(multipliers[k], (1.0,))
+                    if k < len(multipliers)
+                    else (1.0,)
+                )
                 # 0 stands for none.
                 factors[i] = said if math.isfinite(said) and said > 0 else 1.0
-                if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[0].startswith(b"deg"):
+                if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[
+                    0
+                ].startswith(b"deg"):
                     factors[i] *= math.pi / 180.0
             yield factors
 
@@ -245,17 +354,24 @@ def _error_text(subsystem: float, code: float) -> str:
     return f"{name}: error {code:g}" if code else f"{name}: resolved"
 
 
-def _layout(name: str, size: int, types: str, columns: Sequence[str]) -> np.dtype[np.void]:
+def _layout(
+    name: str, size: int, types: str, columns: Sequence[str]
+) -> np.dtype[np.void]:
     """Return what is read of the records of a message; `ValueError` says what it lacks."""
     if len(columns) != len(types) or set(types) - _TYPES.keys():
         raise ValueError("its FMT record is damaged")
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
-    needed = {*{**_TEXTS, **_UNITS}.get(name, rate), *(["DelaT"] if sensor and sensor[1] == "IMT" else [])}
+    needed = {
+        *{**_TEXTS, **_UNITS}.get(name, rate),
+        *(["DelaT"] if sensor and sensor[1] == "IMT" else []),
+    }
     fields: dict[str, tuple[str, int]] = {}
     at = _HEAD
     for column, kind in zip(columns, types, strict=True):
-        if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(column, _NUMBERS):
+        if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(
+            column, _NUMBERS
+        ):
             fields.setdefault(column, (_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
     if at != size:
@@ -265,7 +381,12 @@ def _layout(name: str, size: int, types: str, columns: Sequence[str]) -> np.dtyp
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
         raise ValueError("it has no column of times")
     formats, offsets = ([field[k] for field in fields.values()] for k in (0, 1))
-    layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
+    layout: Any = {
+        "names": list(fields),
+        "formats": formats,
+        "offsets": offsets,
+        "itemsize": size,
+    }
     return np.dtype(layout)
 
 
@@ -280,13 +401,23 @@ def _samples(
     rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
-        acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else acceleration * np.nan
+        acceleration = (
+            per_time(acceleration, rows["DelvT"])
+            if "DelvT" in columns
+            else acceleration * np.nan
+        )
     samples = imu_samples(
-        _stamp(rows), rate * of_rate * FLU, acceleration * of_acceleration * FLU, start + rows.itemsize
+        _stamp(rows),
+        rate * of_rate * FLU,
+        acceleration * of_acceleration * FLU,
+        start + rows.itemsize,
     )
     if "I" not in columns:
         return [(source, samples)]
-    return [(Source(source.kind, k), samples[rows["I"] == k]) for k in np.unique(rows["I"]).tolist()]
+    return [
+        (Source(source.kind, k), samples[rows["I"] == k])
+        for k in np.unique(rows["I"]).tolist()
+    ]
 
 
 def _vectors(rows: Rows, columns: Sequence[str]) -> Array:
@@ -319,7 +450,12 @@ def _start_utc(rows: Rows) -> int | None:
     if not new and not {"TimeMS", "Week", "T"} <= set(columns):
         return None
     rows = rows[rows["Status"] >= _FIX] if "Status" in columns else rows
-    week, ms = (rows[name].astype(np.int64) for name in (("GWk", "GMS") if new else ("Week", "TimeMS")))
-    stamp = rows["TimeUS"].astype(np.int64) if new else rows["T"].astype(np.int64) * 1000
+    week, ms = (
+        rows[name].astype(np.int64)
+        for name in (("GWk", "GMS") if new else ("Week", "TimeMS"))
+    )
+    stamp = (
+        rows["TimeUS"].astype(np.int64) if new else rows["T"].astype(np.int64) * 1000
+    )
     utc = (_GPS_EPOCH - _LEAP + _WEEK * week) * 1_000_000 + ms * 1000
     return possible_start(utc, stamp)

@@ -40,11 +40,15 @@ _FEWEST = 20  # samples by which the rate of a source can be judged
 _TOLERANCE = 0.95  # of that rate; clocks and loggers are not exact
 _MAX_INTERVAL_RATIO = 1.5
 """Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
-_MAX_STEP_BACK = 1_000_000  # us; a log goes on as long as its times step back by no more
+_MAX_STEP_BACK = (
+    1_000_000  # us; a log goes on as long as its times step back by no more
+)
 _BESIDE = 17  # samples whose median says where a log has come to: no few damaged times move it
 _COARSE_RATE = 0.5  # Hz; means may be logged no more seldom
 _MAX_TIME_STEP = 10_000_000  # us; a sample that far from those logged before and after it has a damaged time
-_TOGETHER = 1 << 10  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
+_TOGETHER = (
+    1 << 10
+)  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
 _FEWEST_IMUS = 2  # one has nothing to be compared with
 _MOST_COMPARED = 16  # instances of one kind, more than any autopilot has, that are looked at for copies
 _MOST_NAMES = 6  # messages that are named of a log without IMUs
@@ -61,13 +65,17 @@ class Source(NamedTuple):
 ImuSamples = NDArray[np.void]
 """(k,) samples of one IMU, in FLU: ``stamp``, us since the start of the autopilot, or since 1970; ``rate`` (3,), rad/s;
 ``acceleration`` (3,), m/s^2, NaN: not logged with the rate; ``end`` of its record in the file, bytes, 0: not known."""
-_SAMPLE = np.dtype([("stamp", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3), ("end", "i8")])
+_SAMPLE = np.dtype(
+    [("stamp", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3), ("end", "i8")]
+)
 
 Portion = tuple[list[tuple[Source, ImuSamples]], float]
 """Samples in one portion of a log, and the share of the log that is read up to its end, 0 to 1."""
 
 
-def imu_samples(stamp: Int, rate: Array, acceleration: Array | float = np.nan, end: Int | int = 0) -> ImuSamples:
+def imu_samples(
+    stamp: Int, rate: Array, acceleration: Array | float = np.nan, end: Int | int = 0
+) -> ImuSamples:
     """Return samples (k,) with these stamps (k,), rates and accelerations (k, 3), and ends (k,)."""
     samples = np.empty(len(stamp), _SAMPLE)
     samples["stamp"], samples["end"] = stamp, end
@@ -77,7 +85,9 @@ def imu_samples(stamp: Int, rate: Array, acceleration: Array | float = np.nan, e
 
 def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Concatenate samples: as bytes, since NumPy copies fields one by one, which takes 30 times as long."""
-    return np.concatenate([one.view(f"V{_SAMPLE.itemsize}") for one in parts]).view(_SAMPLE)
+    return np.concatenate([one.view(f"V{_SAMPLE.itemsize}") for one in parts]).view(
+        _SAMPLE
+    )
 
 
 @dataclass
@@ -90,8 +100,12 @@ class Track:
     fast_time: int = 0  # us between these and the ones before
     first: int = 0
     last: int = 0  # stamps of the first and the last, us
-    come: int | None = None  # stamp up to which the log has come, us; None: at its start.
-    recent: ImuSamples = field(default_factory=lambda: np.empty(0, _SAMPLE))  # the last samples
+    come: int | None = (
+        None  # stamp up to which the log has come, us; None: at its start.
+    )
+    recent: ImuSamples = field(
+        default_factory=lambda: np.empty(0, _SAMPLE)
+    )  # the last samples
 
     def add(self, stamp: Int) -> None:
         """Take in the stamps (k,) of further samples."""
@@ -134,7 +148,11 @@ class Track:
         """Samples per second: between gaps, or if there is little else than gaps, on average."""
         if self.steady:
             return self.fast * 1e6 / self.fast_time
-        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+        return (
+            (self.count - 1) * 1e6 / (self.last - self.first)
+            if self.last > self.first
+            else 0.0
+        )
 
     @property
     def fast_enough(self) -> bool:
@@ -163,11 +181,17 @@ class FlightLog(BagFile):
     """
 
     kinds: ClassVar[tuple[str, ...]]  # messages that samples of every IMU are logged in
-    settings: ClassVar[str]  # line of the documentation by which all IMUs are logged fast enough
-    one_imu: ClassVar[str]  # sentence for a log of a single IMU, with a place for what of it is logged
+    settings: ClassVar[
+        str
+    ]  # line of the documentation by which all IMUs are logged fast enough
+    one_imu: ClassVar[
+        str
+    ]  # sentence for a log of a single IMU, with a place for what of it is logged
     slowest: ClassVar[float] = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-    coarse: ClassVar[str] = ""  # kind of message with means of the rate, read where nothing better is there
+    coarse: ClassVar[str] = (
+        ""  # kind of message with means of the rate, read where nothing better is there
+    )
     counted_by: ClassVar[str] = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: ClassVar[str] = ""
@@ -184,17 +208,30 @@ class FlightLog(BagFile):
             self.close()
             raise
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
-        self._shift = 0 if dated else self.start_utc or 0  # added to stamps, us; 0: they are dates, or no date is known
-        self.texts = tuple(one._replace(stamp=self._log_time(one.stamp)) for one in self.said)
-        self.topics = tuple(Topic(_topic(one), IMU, count=self._tracks[one].count) for one in self._sources)
+        self._shift = (
+            0 if dated else self.start_utc or 0
+        )  # added to stamps, us; 0: they are dates, or no date is known
+        self.texts = tuple(
+            one._replace(stamp=self._log_time(one.stamp)) for one in self.said
+        )
+        self.topics = tuple(
+            Topic(_topic(one), IMU, count=self._tracks[one].count)
+            for one in self._sources
+        )
         self.start_time = self._log_time(self._starts[0])
 
     def begin(self) -> None:
         """Begin a walk: what one before it has found counts no more."""
-        self.unread: dict[str, str] = {}  # messages of IMUs that are there and cannot be read, by name, and why
+        self.unread: dict[
+            str, str
+        ] = {}  # messages of IMUs that are there and cannot be read, by name, and why
         self.counts: Counter[str] = Counter()  # records of every message, by name
-        self.start_utc: int | None = None  # UTC of the start of the autopilot, us since 1970; None: not known.
-        self.said: list[LogText] = []  # what the autopilot said up to the place that was read, us
+        self.start_utc: int | None = (
+            None  # UTC of the start of the autopilot, us since 1970; None: not known.
+        )
+        self.said: list[
+            LogText
+        ] = []  # what the autopilot said up to the place that was read, us
 
     @abstractmethod
     def portions(self) -> Iterator[Portion]:
@@ -211,13 +248,24 @@ class FlightLog(BagFile):
         if not sources:
             return
         # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
-        templates = np.stack([ImuTemplate(_topic(source).removeprefix("/")).bytes for source in sources])
+        templates = np.stack(
+            [ImuTemplate(_topic(source).removeprefix("/")).bytes for source in sources]
+        )
         number = np.array([topics.index(_topic(source)) for source in sources])
-        for (portion, progress), later in zip(self.portions(), [*self._starts[1:], NO_HORIZON], strict=False):
-            found = [(source, self._possible(one)) for source, one in portion if source in sources]
+        for (portion, progress), later in zip(
+            self.portions(), [*self._starts[1:], NO_HORIZON], strict=False
+        ):
+            found = [
+                (source, self._possible(one))
+                for source, one in portion
+                if source in sources
+            ]
             if not found:
                 continue
-            place = np.repeat([sources.index(source) for source, _ in found], [len(one) for _, one in found])
+            place = np.repeat(
+                [sources.index(source) for source, _ in found],
+                [len(one) for _, one in found],
+            )
             samples = _joined([one for _, one in found])
             stamp = (samples["stamp"] + self._shift) * 1000
             order, horizon = np.argsort(stamp, kind="stable"), self._log_time(later)
@@ -248,9 +296,13 @@ class FlightLog(BagFile):
             found = [(source, self._possible(samples)) for source, samples in portion]
             # The step may lie among the last samples of the portion before.
             ends = [track.recent["end"] for track in self._tracks.values()]
-            steps = [self._track(source).first_behind(samples) for source, samples in found]
+            steps = [
+                self._track(source).first_behind(samples) for source, samples in found
+            ]
             if first := min(filter(None, steps), default=0):
-                before = np.concatenate([[0], *ends, *(samples["end"] for _, samples in found)])
+                before = np.concatenate(
+                    [[0], *ends, *(samples["end"] for _, samples in found)]
+                )
                 self._end_at(int(before[before < first].max()))
                 return False
             for source, samples in found:
@@ -259,8 +311,15 @@ class FlightLog(BagFile):
             others = sorted(others, key=lambda one: one[0])[:_MOST_COMPARED]
             for (one, samples), (other, beside) in combinations(others, 2):
                 if one != other:
-                    self._shared[one, other] += len(np.intersect1d(samples["stamp"], beside["stamp"]))
-            starts.append(min([int(one["stamp"].min()) for _, one in found if len(one)], default=NO_HORIZON))
+                    self._shared[one, other] += len(
+                        np.intersect1d(samples["stamp"], beside["stamp"])
+                    )
+            starts.append(
+                min(
+                    [int(one["stamp"].min()) for _, one in found if len(one)],
+                    default=NO_HORIZON,
+                )
+            )
         self._starts: list[int] = np.minimum.accumulate(starts[::-1])[::-1].tolist()
         """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
         return True
@@ -281,7 +340,9 @@ class FlightLog(BagFile):
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
         stamp = samples["stamp"]
-        good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
+        good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | (
+            (stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000)
+        )
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
             # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
             good &= np.abs(stamp - _medians(stamp, 5)) <= _MAX_TIME_STEP
@@ -304,7 +365,11 @@ class FlightLog(BagFile):
         sensors = self._sensors()
 
         def merit(kind: str) -> tuple[int, int]:
-            usable = [track for source, track in sensors.items() if source.kind == kind and track.usable]
+            usable = [
+                track
+                for source, track in sensors.items()
+                if source.kind == kind and track.usable
+            ]
             return len(usable), sum(track.count for track in usable)
 
         kind = max(self.kinds, key=merit)
@@ -320,17 +385,33 @@ class FlightLog(BagFile):
         for source, track in sensors.items():
             if source.kind == kind and not track.usable:
                 few = f"has too few samples to judge its rate ({track.count})"
-                slow = f"is logged {track.figures}, expected at least {self.slowest:g} Hz"
-                self.note(f"{kind} {source.instance} {few if track.count < _FEWEST else slow}, and was left out")
-        return sorted(source for source, track in sensors.items() if source.kind == kind and track.usable)
+                slow = (
+                    f"is logged {track.figures}, expected at least {self.slowest:g} Hz"
+                )
+                self.note(
+                    f"{kind} {source.instance} {few if track.count < _FEWEST else slow}, and was left out"
+                )
+        return sorted(
+            source
+            for source, track in sensors.items()
+            if source.kind == kind and track.usable
+        )
 
     def _sensors(self) -> dict[Source, Track]:
         """Return the sources that are sensors of their own."""
         kinds = (*self.kinds, self.coarse)
-        tracks = {source: track for source, track in self._tracks.items() if source.kind in kinds and track.count}
+        tracks = {
+            source: track
+            for source, track in self._tracks.items()
+            if source.kind in kinds and track.count
+        }
         there = {source.instance for source in tracks if source.kind == self.counted_by}
         if there:
-            return {source: track for source, track in tracks.items() if source.instance in there}
+            return {
+                source: track
+                for source, track in tracks.items()
+                if source.instance in there
+            }
         for copy, source in _copies_of(tracks, self._shared).items():
             del tracks[copy]
             self.note(
@@ -342,17 +423,30 @@ class FlightLog(BagFile):
 
     def _refusal(self, sensors: Mapping[Source, Track]) -> str:
         """Say what the log has in place of IMUs that can be read, and which line of the documentation applies."""
-        kinds = {kind: [track for source, track in sensors.items() if source.kind == kind] for kind in self.kinds}
+        kinds = {
+            kind: [track for source, track in sensors.items() if source.kind == kind]
+            for kind in self.kinds
+        }
         there = [_logged(kind, tracks) for kind, tracks in kinds.items() if tracks]
-        unread = [f"{name}, which is not read ({why})" for name, why in sorted(self.unread.items())]
-        alone = [track for source, track in self._tracks.items() if source.kind == self.selected and track.count]
+        unread = [
+            f"{name}, which is not read ({why})"
+            for name, why in sorted(self.unread.items())
+        ]
+        alone = [
+            track
+            for source, track in self._tracks.items()
+            if source.kind == self.selected and track.count
+        ]
         if alone:
             there.append(f"{self.selected} of the one selected IMU {alone[0].figures}")
         if unread and not there:
             return f" has of IMUs only {', '.join(unread)}: {MESSAGES}"
         setting = f"{self.settings} ({SETTINGS})"
         if not there:
-            most = ", ".join(f"{count} {shown(name, 32)}" for name, count in self.counts.most_common(_MOST_NAMES))
+            most = ", ".join(
+                f"{count} {shown(name, 32)}"
+                for name, count in self.counts.most_common(_MOST_NAMES)
+            )
             return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}: {setting}"
         has = ", ".join((*there, *unread))
         if not unread and max(map(len, kinds.values())) < _FEWEST_IMUS:
@@ -365,7 +459,9 @@ def _logged(kind: str, tracks: Sequence[Track]) -> str:
     """Say how a kind of message is logged."""
     fastest = max(tracks, key=lambda track: (track.count >= _FEWEST, track.rate))
     few = f", {fastest.count} samples" if 1 < fastest.count < _FEWEST else ""
-    return f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
+    return (
+        f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
+    )
 
 
 def _topic(source: Source) -> str:
@@ -393,11 +489,15 @@ def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
 
 def _medians(stamp: Int, window: int) -> Int:
     """Return the median of so many stamps (k,) beside each; before the first and after the last they are mirrored."""
-    beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, window // 2, mode="reflect"), window)
+    beside = np.lib.stride_tricks.sliding_window_view(
+        np.pad(stamp, window // 2, mode="reflect"), window
+    )
     return np.sort(beside, axis=1)[:, window // 2]
 
 
-def _copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
+def _copies_of(
+    sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]
+) -> dict[Source, Source]:
     """Return which sources are copies of which others: those with the same times, since sensors have their own.
 
     A copy has the number of the sensor and that of all sensors in the sum. Where all have the same times, as in a
@@ -405,10 +505,14 @@ def _copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, So
     """
     same: set[Source] = set()
     for pair, count in shared.items():
-        if sensors.keys() >= set(pair) and 2 * count > min(sensors[source].count for source in pair):
+        if sensors.keys() >= set(pair) and 2 * count > min(
+            sensors[source].count for source in pair
+        ):
             same.update(pair)
     ordered, half = sorted(same), len(same) // 2
-    return {} if len(same) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
+    return (
+        {} if len(same) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
+    )
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:
@@ -416,7 +520,12 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
 
     ``utc`` (k,) us since 1970, ``stamp`` (k,) us since the start.
     """
-    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc >= EARLIEST // 1000) & (utc <= LATEST // 1000 - LOG_SPAN)
+    good = (
+        (stamp >= 0)
+        & (stamp <= LOG_SPAN)
+        & (utc >= EARLIEST // 1000)
+        & (utc <= LATEST // 1000 - LOG_SPAN)
+    )
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 
 

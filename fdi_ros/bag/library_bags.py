@@ -40,7 +40,15 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.core.sources import source_of_type
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, ROS1_INDEX_BYTES, STEPS, STEPS_PER_BYTE
+from fdi_ros.system.files import (
+    CHANNELS,
+    CHUNK_BYTES,
+    NAME,
+    PORTION_BYTES,
+    ROS1_INDEX_BYTES,
+    STEPS,
+    STEPS_PER_BYTE,
+)
 
 _TOGETHER = 4096  # messages handed on at once, at most
 _TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
@@ -49,9 +57,14 @@ _WRONG = (
     *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
 )
 """What rosbags and the unpacking libraries raise of a damaged bag."""
-_UNPACKERS = {bz2.decompress: bz2.BZ2Decompressor, lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor}
+_UNPACKERS = {
+    bz2.decompress: bz2.BZ2Decompressor,
+    lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+}
 """By the functions that rosbags takes, which have no bound."""
-Message = tuple[int, int, bytes]  # number of its topic in the file, time of recording, ns, and content
+Message = tuple[
+    int, int, bytes
+]  # number of its topic in the file, time of recording, ns, and content
 
 
 class LibraryBag(BagFile):
@@ -65,7 +78,11 @@ class LibraryBag(BagFile):
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        chosen = {number: topics.index(one.name) for number, one in self._numbered.items() if one.name in topics}
+        chosen = {
+            number: topics.index(one.name)
+            for number, one in self._numbered.items()
+            if one.name in topics
+        }
         whole, read = sum(self._numbered[number].count for number in chosen), 0
         found = self._messages(list(chosen)) if chosen else iter(())
         while messages := list(_together(found)):
@@ -103,7 +120,9 @@ class SqliteFile(LibraryBag):
         super().__init__(path, damage, most)
         # SQLite opens the file itself.
         self.file.close()
-        self._open = contextlib.ExitStack()  # what is to be closed: the database, then the folder of its copy
+        self._open = (
+            contextlib.ExitStack()
+        )  # what is to be closed: the database, then the folder of its copy
         self._steps = STEPS + STEPS_PER_BYTE * self.size
         try:
             self._base = self._opened()
@@ -117,11 +136,16 @@ class SqliteFile(LibraryBag):
             raise
         self.start_time = start if isinstance(start, int) else NO_HORIZON
         try:
-            counts = dict(self._query("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
+            counts = dict(
+                self._query("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id")
+            )
         except sqlite3.Error as error:
             self.note(f"it is damaged ({error}): its messages could not be counted")
         else:
-            self._numbered = {k: replace(one, count=counts.get(k, 0)) for k, one in self._numbered.items()}
+            self._numbered = {
+                k: replace(one, count=counts.get(k, 0))
+                for k, one in self._numbered.items()
+            }
         self.topics = tuple(self._numbered.values())
 
     def close(self) -> None:
@@ -131,11 +155,17 @@ class SqliteFile(LibraryBag):
     def _opened(self) -> sqlite3.Connection:
         log, journal = (Path(f"{self.path}{end}") for end in ("-wal", "-journal"))
         if journal.is_file() and journal.stat().st_size:
-            self.note("its last transaction was not finished, and was read as far as it goes")
+            self.note(
+                "its last transaction was not finished, and was read as far as it goes"
+            )
         waits = log.is_file() and log.stat().st_size > 0
-        place, how = (self._copied(log), "rw") if waits else (self.path, "ro&immutable=1")
+        place, how = (
+            (self._copied(log), "rw") if waits else (self.path, "ro&immutable=1")
+        )
         base = self._open.enter_context(
-            contextlib.closing(sqlite3.connect(f"{place.absolute().as_uri()}?mode={how}", uri=True))
+            contextlib.closing(
+                sqlite3.connect(f"{place.absolute().as_uri()}?mode={how}", uri=True)
+            )
         )
         base.text_factory = lambda data: data.decode("utf-8", "replace")
         base.set_progress_handler(self._tick, _TICK)
@@ -147,8 +177,13 @@ class SqliteFile(LibraryBag):
 
     def _copied(self, log: Path) -> Path:
         """Copy the file and its write-ahead log into a temporary folder, where SQLite may write as it likes."""
-        folder = Path(self._open.enter_context(tempfile.TemporaryDirectory(prefix="fdi_bag_")))
-        room, size = shutil.disk_usage(folder).free // 2, self.path.stat().st_size + log.stat().st_size
+        folder = Path(
+            self._open.enter_context(tempfile.TemporaryDirectory(prefix="fdi_bag_"))
+        )
+        room, size = (
+            shutil.disk_usage(folder).free // 2,
+            self.path.stat().st_size + log.stat().st_size,
+        )
         if size > room:
             raise BagError(
                 f"{self.path} has a write-ahead log and must be copied to be read: {size >> 20} MB, expected at most"
@@ -163,13 +198,17 @@ class SqliteFile(LibraryBag):
         self._steps -= _TICK
         return self._steps < 0
 
-    def _query(self, text: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
+    def _query(
+        self, text: str, values: Sequence[Any] = ()
+    ) -> Iterator[tuple[Any, ...]]:
         """Rows of a query; whatever goes wrong is an error of SQLite, or the user's wish to stop."""
         try:
             yield from self._base.execute(text, values)
         except sqlite3.OperationalError as error:
             if self._steps < 0:
-                raise sqlite3.OperationalError("reading takes more steps than a file of its size needs") from error
+                raise sqlite3.OperationalError(
+                    "reading takes more steps than a file of its size needs"
+                ) from error
             if "interrupt" in str(error):
                 # What the signal raised inside the handler ends the query and goes no further.
                 raise KeyboardInterrupt from error
@@ -180,10 +219,19 @@ class SqliteFile(LibraryBag):
     def _check_tables(self) -> None:
         """Refuse whatever is no plain table."""
         for table in ("topics", "messages"):
-            found = list(self._query("SELECT type, sql FROM sqlite_master WHERE name = ? LIMIT 2", (table,)))
+            found = list(
+                self._query(
+                    "SELECT type, sql FROM sqlite_master WHERE name = ? LIMIT 2",
+                    (table,),
+                )
+            )
             if not found:
                 raise sqlite3.DatabaseError(f"no such table: {table}")
-            if len(found) > 1 or found[0][0] != "table" or not str(found[0][1]).upper().startswith("CREATE TABLE"):
+            if (
+                len(found) > 1
+                or found[0][0] != "table"
+                or not str(found[0][1]).upper().startswith("CREATE TABLE")
+            ):
                 raise sqlite3.DatabaseError(f"{table} is no plain table")
             columns = list(self._query(f"PRAGMA table_xinfo({table})"))
             if any(column[6] for column in columns):
@@ -191,12 +239,19 @@ class SqliteFile(LibraryBag):
 
     def _topics(self) -> dict[int, Topic]:
         found: dict[int, Topic] = {}
-        for number, *about in self._query("SELECT id, name, type, serialization_format FROM topics"):
+        for number, *about in self._query(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
             name, kind, encoding = map(str, about)
-            if not isinstance(number, int) or max(map(len, (name, kind, encoding))) > NAME:
+            if (
+                not isinstance(number, int)
+                or max(map(len, (name, kind, encoding))) > NAME
+            ):
                 self.note("a topic description is damaged and was left out")
             elif len(found) == CHANNELS:
-                self.note(f"it has more than {CHANNELS} topics: the others were left out")
+                self.note(
+                    f"it has more than {CHANNELS} topics: the others were left out"
+                )
                 break
             else:
                 found[number] = Topic(name, kind, encoding)
@@ -217,12 +272,16 @@ class SqliteFile(LibraryBag):
                         continue
                     self._left -= len(data)
                     if self._left < 0:
-                        self.note("it comes to more bytes than it should: read up to there")
+                        self.note(
+                            "it comes to more bytes than it should: read up to there"
+                        )
                         return
                     yield number, time, data
                     last = max(last, time)
             except sqlite3.Error as error:
-                self.note(f"it is damaged ({error}): not all messages could be read in order of {order}")
+                self.note(
+                    f"it is damaged ({error}): not all messages could be read in order of {order}"
+                )
                 if self._steps >= 0:
                     continue
             return
@@ -232,9 +291,13 @@ class SqliteFile(LibraryBag):
         one = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
         (content,) = next(self._query(one, (row, CHUNK_BYTES)), (None,))
         if content is None:
-            self.note(f"messages of none or more than {CHUNK_BYTES} bytes were left out")
+            self.note(
+                f"messages of none or more than {CHUNK_BYTES} bytes were left out"
+            )
         # Each may be compressed by itself: no message begins like that.
-        if not isinstance(content, bytes) or not content.startswith(zstandard.FRAME_HEADER):
+        if not isinstance(content, bytes) or not content.startswith(
+            zstandard.FRAME_HEADER
+        ):
             return content
         try:
             return zstandard.ZstdDecompressor().stream_reader(content).read(CHUNK_BYTES)
@@ -251,7 +314,9 @@ class _Bounded(io.BufferedReader):
         """Read so many bytes."""
         self.left -= size or 0
         if self.left < 0 or (size or 0) > PORTION_BYTES:
-            raise ReaderError("its index, or a part of it, is larger than that of any recorder")
+            raise ReaderError(
+                "its index, or a part of it, is larger than that of any recorder"
+            )
         return super().read(size)
 
 
@@ -272,13 +337,16 @@ class Ros1File(LibraryBag):
         try:
             self._reader.open()
             self._numbered = {
-                one.id: Topic(one.topic, one.msgtype, "cdr", one.msgcount) for one in self._reader.connections
+                one.id: Topic(one.topic, one.msgtype, "cdr", one.msgcount)
+                for one in self._reader.connections
             }
             self.start_time = self._reader.start_time
         except _WRONG as error:
             self.file.close()
             if "not indexed" in str(error):
-                raise BagError(f"{path} has no index, its recording was cut off: run rosbag reindex") from error
+                raise BagError(
+                    f"{path} has no index, its recording was cut off: run rosbag reindex"
+                ) from error
             raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
         self.topics = tuple(self._numbered.values())
         bounded.left = most + self.size

@@ -46,7 +46,15 @@ from fdi_ros.bag.flight_log import (
     possible_start,
 )
 from fdi_ros.errors import BagError
-from fdi_ros.mavlink.protocol import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, understood
+from fdi_ros.mavlink.protocol import (
+    MESSAGES,
+    MOST_UNITS,
+    NO_AUTOPILOT,
+    RAW,
+    SCALED,
+    read,
+    understood,
+)
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system import require
@@ -88,12 +96,19 @@ class LibraryLog(FlightLog):
 
     def portions(self) -> Iterator[Portion]:
         """Return the samples, some of each source together."""
-        portions = max(map(_size, self._columns.values()), default=0) // self.together + 1
+        portions = (
+            max(map(_size, self._columns.values()), default=0) // self.together + 1
+        )
         for k in range(portions):
             found = []
             for source, columns in self._columns.items():
-                rows = slice(_size(columns) * k // portions, _size(columns) * (k + 1) // portions)
-                samples = self.samples(source.kind, {name: column[rows] for name, column in columns.items()})
+                rows = slice(
+                    _size(columns) * k // portions, _size(columns) * (k + 1) // portions
+                )
+                samples = self.samples(
+                    source.kind,
+                    {name: column[rows] for name, column in columns.items()},
+                )
                 if samples is not None:
                     found.append((source, samples))
             yield found, (k + 1) / portions
@@ -113,7 +128,15 @@ _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
-_WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+_WRONG = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 """What pyulog raises of a damaged file."""
 _MEAN_TIME = 100_000  # us over which PX4 takes the means of vehicle_imu_status
 _FIX = 3  # fix_type from which on the time is known: a fix in three dimensions
@@ -185,13 +208,28 @@ class Ulog(LibraryLog):
                 self.start_utc = _start_utc(one.data)
         found = {
             source: columns
-            for source, columns in {source: _joined(columns) for source, columns in parts.items()}.items()
-            if self.samples(source.kind, {name: column[:0] for name, column in columns.items()}) is not None
+            for source, columns in {
+                source: _joined(columns) for source, columns in parts.items()
+            }.items()
+            if self.samples(
+                source.kind, {name: column[:0] for name, column in columns.items()}
+            )
+            is not None
         }
         lacking = {source.kind for source in parts.keys() - found.keys()} - {_STATUS}
-        announced = log.message_formats.keys() - self.counts.keys() if log.file_corruption else set()
+        announced = (
+            log.message_formats.keys() - self.counts.keys()
+            if log.file_corruption
+            else set()
+        )
         self.unread = dict.fromkeys(lacking | (announced & set(_KINDS)), _LACKS)
-        return found | _simultaneous({source: columns for source, columns in found.items() if source.kind == _STATUS})
+        return found | _simultaneous(
+            {
+                source: columns
+                for source, columns in found.items()
+                if source.kind == _STATUS
+            }
+        )
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
         """Return the samples in messages of a kind; None: they lack a field, or have another form."""
@@ -202,8 +240,13 @@ class Ulog(LibraryLog):
                 stamp = _stamp(columns)
                 if kind == "vehicle_imu":
                     # Changes of angle and velocity over the time of each sample.
-                    rate = per_time(_array(columns, "delta_angle"), columns["delta_angle_dt"] * 1e-6)
-                    acceleration = per_time(_array(columns, "delta_velocity"), columns["delta_velocity_dt"] * 1e-6)
+                    rate = per_time(
+                        _array(columns, "delta_angle"), columns["delta_angle_dt"] * 1e-6
+                    )
+                    acceleration = per_time(
+                        _array(columns, "delta_velocity"),
+                        columns["delta_velocity_dt"] * 1e-6,
+                    )
                 elif kind == "sensor_gyro_fifo":
                     stamp, rate = _unpacked(stamp, columns)
                 elif kind == _STATUS:
@@ -212,10 +255,14 @@ class Ulog(LibraryLog):
                 elif kind == _SELECTED:
                     rate = _array(columns, "gyro_rad")
                 else:
-                    rate = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+                    rate = np.stack(
+                        [columns[axis].astype(np.float64) for axis in "xyz"], axis=1
+                    )
         except (KeyError, ValueError):
             return None
-        acceleration = np.full(rate.shape, np.nan) if acceleration is None else acceleration
+        acceleration = (
+            np.full(rate.shape, np.nan) if acceleration is None else acceleration
+        )
         if not rate.shape == acceleration.shape == (len(stamp), 3):
             return None
         return imu_samples(stamp, rate * FLU, acceleration * FLU)
@@ -237,18 +284,28 @@ def _parsed(file: _Bounded, path: str) -> Any:
     try:
         # pyulog prints what it thinks of a file.
         with contextlib.redirect_stdout(io.StringIO()):
-            formats = ULog(_Bounded(file.getvalue()), parse_header_only=True).message_formats
+            formats = ULog(
+                _Bounded(file.getvalue()), parse_header_only=True
+            ).message_formats
             known: dict[str, int] = {}
-            if any(count_fields(formats, name, known) > ULOG_FIELDS for name in formats):
-                raise BagError(f"{path} defines a message of more than {ULOG_FIELDS} fields")
+            if any(
+                count_fields(formats, name, known) > ULOG_FIELDS for name in formats
+            ):
+                raise BagError(
+                    f"{path} defines a message of more than {ULOG_FIELDS} fields"
+                )
             return ULog(file)
     except ULogIncompatibleFlagException as error:
-        raise BagError(f"{path} is a ULog of a later version, whose flags say that it must not be read") from error
+        raise BagError(
+            f"{path} is a ULog of a later version, whose flags say that it must not be read"
+        ) from error
     except (ULogException, *_WRONG) as error:
         raise BagError(f"{path} cannot be read by pyulog: {error}") from error
 
 
-def count_fields(formats: Mapping[str, Any], name: str, known: dict[str, int], depth: int = 0) -> int:
+def count_fields(
+    formats: Mapping[str, Any], name: str, known: dict[str, int], depth: int = 0
+) -> int:
     """Return the number of fields of a message with all that its formats nest, at most one more than is allowed."""
     if name not in known:
         if depth > _DEEPEST:
@@ -256,7 +313,8 @@ def count_fields(formats: Mapping[str, Any], name: str, known: dict[str, int], d
         # A format within itself has no end.
         known[name] = ULOG_FIELDS + 1
         total = sum(
-            max(1, length) * (count_fields(formats, kind, known, depth + 1) if kind in formats else 1)
+            max(1, length)
+            * (count_fields(formats, kind, known, depth + 1) if kind in formats else 1)
             for kind, length, _ in formats[name].fields
         )
         known[name] = min(total, ULOG_FIELDS + 1)
@@ -268,7 +326,9 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
 
     What is interpolated over a second of flight differs by more than any fault.
     """
-    stamps = {source: _stamp(columns) for source, columns in topics.items() if _size(columns)}
+    stamps = {
+        source: _stamp(columns) for source, columns in topics.items() if _size(columns)
+    }
     if len(stamps) < 2:
         return {}
     times = np.sort(min(stamps.values(), key=len))
@@ -278,7 +338,11 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
     return {
         source: {
             "timestamp": times[kept],
-            **{name: column[k[kept]] for name, column in topics[source].items() if name.startswith("mean_gyro")},
+            **{
+                name: column[k[kept]]
+                for name, column in topics[source].items()
+                if name.startswith("mean_gyro")
+            },
         }
         for source, k in nearest.items()
     }
@@ -290,7 +354,9 @@ def _nearest(stamp: Int, times: Int) -> Int:
     ordered = stamp[order]
     after = np.searchsorted(ordered, times).clip(0, len(stamp) - 1)
     before = (after - 1).clip(0)
-    return order[np.where(times - ordered[before] < ordered[after] - times, before, after)]
+    return order[
+        np.where(times - ordered[before] < ordered[after] - times, before, after)
+    ]
 
 
 def _array(columns: Columns, name: str) -> NDArray[Any]:
@@ -325,8 +391,14 @@ def _start_utc(columns: Columns) -> int | None:
     """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
     if not {"timestamp", "time_utc_usec"} <= columns.keys():
         return None
-    fixed = columns["fix_type"] >= _FIX if "fix_type" in columns else np.ones(_size(columns), dtype=bool)
-    utc, stamp = (columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp"))
+    fixed = (
+        columns["fix_type"] >= _FIX
+        if "fix_type" in columns
+        else np.ones(_size(columns), dtype=bool)
+    )
+    utc, stamp = (
+        columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp")
+    )
     return possible_start(utc, stamp)
 
 
@@ -341,7 +413,15 @@ _MAX_DELAY_SPREAD = 3_600_000_000
 """us; a message that came by so much more or less late than half of the others has a damaged time."""
 _LATEST = 1 << 53  # us; no time is later
 _ROW = struct.Struct("=3q6d")
-_COLUMNS = np.dtype([("stamp", "i8"), ("came", "i8"), ("end", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3)])
+_COLUMNS = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("came", "i8"),
+        ("end", "i8"),
+        ("rate", "f8", 3),
+        ("acceleration", "f8", 3),
+    ]
+)
 """Of each sample, with the time at which its message came, us since 1970."""
 
 
@@ -364,13 +444,20 @@ class Tlog(LibraryLog):
         """Read the messages of IMUs of the first autopilot that says that it is one."""
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
         texts: list[tuple[int, str]] = []
-        beats = (beat for _, _, beat in self._messages(data, (_HEARTBEAT,)) if beat.autopilot != NO_AUTOPILOT)
+        beats = (
+            beat
+            for _, _, beat in self._messages(data, (_HEARTBEAT,))
+            if beat.autopilot != NO_AUTOPILOT
+        )
         if (beat := next(beats, None)) is None:
             return {}
         for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
             if message.get_srcSystem() != beat.get_srcSystem():
                 continue
-            came, number = int.from_bytes(data[at : at + _TIME], "big"), message.get_msgId()
+            came, number = (
+                int.from_bytes(data[at : at + _TIME], "big"),
+                message.get_msgId(),
+            )
             if number == _STATUSTEXT:
                 texts.append((came, str(message.text)))
                 continue
@@ -388,16 +475,25 @@ class Tlog(LibraryLog):
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
         if raw in found and scaled not in found:
             found[scaled] = found.pop(raw)
-        tables = {source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()}
-        self.start_utc = _start_utc_by([table["came"] - table["stamp"] for table in tables.values()])
+        tables = {
+            source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()
+        }
+        self.start_utc = _start_utc_by(
+            [table["came"] - table["stamp"] for table in tables.values()]
+        )
         if self.start_utc is not None:
             for came, text in texts:
                 self.add_text(came - self.start_utc, "STATUSTEXT", text)
-        return {source: {name: table[name] for name in _COLUMNS.names or ()} for source, table in tables.items()}
+        return {
+            source: {name: table[name] for name in _COLUMNS.names or ()}
+            for source, table in tables.items()
+        }
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples:
         """Return the samples in messages of a kind."""
-        return imu_samples(columns["stamp"], columns["rate"], columns["acceleration"], columns["end"])
+        return imu_samples(
+            columns["stamp"], columns["rate"], columns["acceleration"], columns["end"]
+        )
 
     def portions(self) -> Iterator[Portion]:
         """Return the samples; at the end, say what was left out."""
@@ -405,7 +501,9 @@ class Tlog(LibraryLog):
         if self._lost:
             self.note(f"{self._lost} bytes belong to no whole record and were left out")
 
-    def _messages(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[tuple[int, int, Any]]:
+    def _messages(
+        self, data: bytes, numbers: tuple[int, ...]
+    ) -> Iterator[tuple[int, int, Any]]:
         """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts; count what is lost.
 
         Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
@@ -422,8 +520,15 @@ class Tlog(LibraryLog):
                 continue
             start = at + _TIME
             second = data[start] == 0xFD
-            number = int.from_bytes(data[start + 7 : start + 10], "little") if second else data[start + 5]
-            if number in numbers and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT:
+            number = (
+                int.from_bytes(data[start + 7 : start + 10], "little")
+                if second
+                else data[start + 5]
+            )
+            if (
+                number in numbers
+                and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT
+            ):
                 with contextlib.suppress(codec.MAVError):
                     yield at, end, parser.decode(bytearray(data[start:end]))
             at = end
@@ -446,5 +551,9 @@ def record_end(data: bytes, at: int) -> int:
 def _start_utc_by(starts: Sequence[Int]) -> int | None:
     """Return the UTC of the start of the autopilot by that of each message: of the one with the least delay."""
     ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
-    near = ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD] if len(ordered) else ordered
+    near = (
+        ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD]
+        if len(ordered)
+        else ordered
+    )
     return possible_start(near[:1], np.zeros_like(near[:1]))

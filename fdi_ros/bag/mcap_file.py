@@ -30,21 +30,33 @@ from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.model.samples import Bytes, Int
-from fdi_ros.system.files import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS
+from fdi_ros.system.files import (
+    CHANNELS,
+    CHUNK_BYTES,
+    DESCRIPTION_BYTES,
+    NAME,
+    RECORD_BYTES,
+    RECORDS,
+)
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
 _PREFIX = 9  # bytes of a record before its content: opcode, length of the content
 _HEAD = 22  # bytes of a message record before the message: channel, sequence, log time, publish time
 
 
-def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) -> tuple[bytes, str]:
+def decompress(
+    data: bytes, compression: str, size: int, crc: int, cut: bool
+) -> tuple[bytes, str]:
     """Decompress a chunk (``zstd``, ``lz4`` or empty) to ``size`` bytes; a ``crc`` of 0 is not checked.
 
     Of one that is known to be cut off, what comes out is returned. With the bytes: what is wrong with them, empty if
     nothing.
     """
     if max(size, len(data) if not compression else 0) > CHUNK_BYTES:
-        return b"", f"claims {size} bytes, expected at most {CHUNK_BYTES}, and was left out"
+        return (
+            b"",
+            f"claims {size} bytes, expected at most {CHUNK_BYTES}, and was left out",
+        )
     try:
         if compression == "zstd":
             data = zstandard.ZstdDecompressor().stream_reader(data).read(size)
@@ -52,7 +64,13 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
         elif compression:
             return b"", f"has the unknown compression {compression!r} and was left out"
-    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+    except (
+        zstandard.ZstdError,
+        RuntimeError,
+        ValueError,
+        EOFError,
+        MemoryError,
+    ) as error:
         return b"", f"cannot be decompressed ({error}) and was left out"
     if cut:
         return data, f"is cut off after {len(data)} of {size} bytes"
@@ -63,7 +81,9 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
     return data, ""
 
 
-def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, bytes]], int]:
+def walk(
+    data: bytes, outside: bool = False
+) -> tuple[Batch, list[tuple[int, bytes]], int]:
     """Find the records in a run of bytes; one that is incomplete ends the walk.
 
     Outside chunks a chunk, the statistics and the footer end it, too. Returned are the messages, with the numbers of
@@ -76,9 +96,16 @@ def walk(data: bytes, outside: bool = False) -> tuple[Batch, list[tuple[int, byt
     found = np.empty((5, count), np.int64)
     _, end = find_records(buffer, outside, found)
     sent = found[0] == MESSAGE
-    contents = [(kind, data[at : at + size]) for kind, _, _, at, size in found[:, ~sent].T.tolist()]
+    contents = [
+        (kind, data[at : at + size])
+        for kind, _, _, at, size in found[:, ~sent].T.tolist()
+    ]
     _, channel, log_time, offset, length = found if sent.all() else found[:, sent]
-    return Batch(buffer, channel, log_time, offset, length, NO_HORIZON, 1.0), contents, int(end)
+    return (
+        Batch(buffer, channel, log_time, offset, length, NO_HORIZON, 1.0),
+        contents,
+        int(end),
+    )
 
 
 @compiled
@@ -100,7 +127,11 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
         head = _HEAD if opcode == MESSAGE else 0
         if length >= head and opcode in (MESSAGE, SCHEMA, CHANNEL):
             if count < found.shape[1]:
-                found[0, count], found[3, count], found[4, count] = opcode, start + head, length - head
+                found[0, count], found[3, count], found[4, count] = (
+                    opcode,
+                    start + head,
+                    length - head,
+                )
                 if head:
                     found[1, count] = read_bits(data, start, 2, True)
                     found[2, count] = read_bits(data, start + 6, 8, True)
@@ -113,7 +144,9 @@ T = TypeVar("T")
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _RUN = 1 << 18  # messages outside chunks are read in runs of at most this many bytes
-_TOGETHER = 1 << 16  # pieces are handed on together until they hold so many bytes: each batch has its cost
+_TOGETHER = (
+    1 << 16
+)  # pieces are handed on together until they hold so many bytes: each batch has its cost
 
 
 class Piece(NamedTuple):
@@ -152,12 +185,19 @@ class McapFile(BagFile):
             # Without a summary everything is read once: the topics stand inside the chunks alone.
             counts: Counter[int] = Counter()
             for piece in self._pieces:
-                numbers, found = np.unique(self._messages(piece).topic, return_counts=True)
+                numbers, found = np.unique(
+                    self._messages(piece).topic, return_counts=True
+                )
                 counts.update(dict(zip(numbers.tolist(), found.tolist(), strict=True)))
             self._counts = dict(counts)
 
         self.topics = tuple(
-            Topic(one.topic, self._schemas.get(one.schema_id, ""), one.message_encoding, self._counts.get(number, 0))
+            Topic(
+                one.topic,
+                self._schemas.get(one.schema_id, ""),
+                one.message_encoding,
+                self._counts.get(number, 0),
+            )
             for number, one in self._channels.items()
         )
 
@@ -166,7 +206,9 @@ class McapFile(BagFile):
         read, whole, held, known = 0, sum(piece.size for piece in self._pieces), 0, -1
         waiting: list[Batch] = []
         following = [*(piece.start_time for piece in self._pieces[1:]), NO_HORIZON]
-        for k, (piece, horizon) in enumerate(zip(self._pieces, following, strict=False), 1):
+        for k, (piece, horizon) in enumerate(
+            zip(self._pieces, following, strict=False), 1
+        ):
             read += piece.size
             waiting.append(self._messages(piece))
             held += len(waiting[-1].buffer)
@@ -177,27 +219,39 @@ class McapFile(BagFile):
                 # Reading describes channels as it goes on.
                 known, number = len(self._channels), np.full(1 << 16, -1)
                 for channel in self._channels.values():
-                    number[channel.id] = topics.index(channel.topic) if channel.topic in topics else -1
-            batch = replace(found, topic=number[found.topic], horizon=horizon, progress=read / whole)
+                    number[channel.id] = (
+                        topics.index(channel.topic) if channel.topic in topics else -1
+                    )
+            batch = replace(
+                found, topic=number[found.topic], horizon=horizon, progress=read / whole
+            )
             yield batch if (batch.topic >= 0).all() else batch.at(batch.topic >= 0)
 
     def _scan(self) -> None:
         position, left = len(self.magic), RECORDS + self.size // RECORD_BYTES
         while position < self.size:
             head = self._read(position, _RECORD.size)
-            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, self.size)
+            opcode, length = (
+                _RECORD.unpack(head) if len(head) == _RECORD.size else (0, self.size)
+            )
             end = position + _RECORD.size + length
             left -= 1
             if opcode == FOOTER:
                 # Bytes of damage may look like a footer: what is behind it is not left out without a word.
                 if end + len(self.magic) != self.size:
-                    self.note(f"it has a footer at byte {position} of {self.size}: read up to there")
+                    self.note(
+                        f"it has a footer at byte {position} of {self.size}: read up to there"
+                    )
                 return
             if left < 0:
-                self.note(f"it has more records than its size explains: read up to byte {position}")
+                self.note(
+                    f"it has more records than its size explains: read up to byte {position}"
+                )
                 return
             if end > self.size:
-                self.note(f"it breaks off in the record at byte {position} of {self.size}: read up to there")
+                self.note(
+                    f"it breaks off in the record at byte {position} of {self.size}: read up to there"
+                )
             start = position + _RECORD.size
             if opcode == CHUNK:
                 self._scan_chunk(start, end)
@@ -205,7 +259,9 @@ class McapFile(BagFile):
                 end = self._scan_run(position, end)
             elif opcode in (SCHEMA, CHANNEL, STATISTICS) and end <= self.size:
                 # One that is too long is noted as damaged by its length.
-                self._describe(opcode, self._read(start, min(length, DESCRIPTION_BYTES + 1)))
+                self._describe(
+                    opcode, self._read(start, min(length, DESCRIPTION_BYTES + 1))
+                )
             if end > self.size:
                 return
             position = end
@@ -219,7 +275,17 @@ class McapFile(BagFile):
             data = offset + _CHUNK.size + length + 8
             if length <= 16 and data <= min(end, self.size) and start_time < NO_HORIZON:
                 size = min(end, self.size) - data
-                self._found.append(Piece(start_time, data, size, raw_size, crc, compression, end > self.size))
+                self._found.append(
+                    Piece(
+                        start_time,
+                        data,
+                        size,
+                        raw_size,
+                        crc,
+                        compression,
+                        end > self.size,
+                    )
+                )
                 return
         self.note(f"the chunk at byte {offset} has a damaged header and was left out")
 
@@ -228,9 +294,13 @@ class McapFile(BagFile):
         if end - position > CHUNK_BYTES:
             self.note(f"the message at byte {position} is too long and was left out")
             return end
-        found, topics, stop = walk(self._read(position, max(_RUN, end - position)), outside=True)
+        found, topics, stop = walk(
+            self._read(position, max(_RUN, end - position)), outside=True
+        )
         if len(found):
-            self._found.append(Piece(max(0, int(found.log_time.min())), position, stop, stop))
+            self._found.append(
+                Piece(max(0, int(found.log_time.min())), position, stop, stop)
+            )
         for opcode, content in topics:
             self._describe(opcode, content)
         return position + max(stop, 1)
@@ -242,19 +312,27 @@ class McapFile(BagFile):
     def _messages(self, piece: Piece) -> Batch:
         """Read a piece, topics as numbers of channels; what is wrong is noted, what cannot be read left out."""
         stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
-        data, wrong = decompress(stored, piece.compression, piece.raw_size, piece.crc, piece.cut)
+        data, wrong = decompress(
+            stored, piece.compression, piece.raw_size, piece.crc, piece.cut
+        )
         found, topics, end = walk(data)
         if wrong or end < len(data):
-            self.note(f"the chunk at byte {piece.offset} {wrong or f'is damaged after byte {end} of {len(data)}'}")
+            self.note(
+                f"the chunk at byte {piece.offset} {wrong or f'is damaged after byte {end} of {len(data)}'}"
+            )
         for opcode, content in topics:
             self._describe(opcode, content)
         return found
 
     def _describe(self, opcode: int, content: bytes) -> None:
         """Take in a description of a topic; the first of each number counts."""
-        what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(opcode, "summary")
+        what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(
+            opcode, "summary"
+        )
         if len(content) > DESCRIPTION_BYTES:
-            self.note(f"a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out")
+            self.note(
+                f"a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out"
+            )
             return
         stream = ReadDataStream(io.BytesIO(content))
         try:
@@ -274,8 +352,12 @@ class McapFile(BagFile):
         if number in known:
             return
         if len(name) > NAME:
-            self.note(f"the name {name[:NAME]!r} is longer than {NAME} and was left out")
+            self.note(
+                f"the name {name[:NAME]!r} is longer than {NAME} and was left out"
+            )
         elif len(known) == CHANNELS:
-            self.note(f"it describes more than {CHANNELS} topics: the others were left out")
+            self.note(
+                f"it describes more than {CHANNELS} topics: the others were left out"
+            )
         else:
             known[number] = what

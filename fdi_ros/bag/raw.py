@@ -63,10 +63,13 @@ class Batch:
         if len(parts) == 1:
             return parts[0]
         columns: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in ("buffer", *_COLUMNS)
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("buffer", *_COLUMNS)
         }
         sizes = [len(part.buffer) for part in parts]
-        columns["offset"] += np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
+        columns["offset"] += np.repeat(
+            np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts]
+        )
         return replace(parts[-1], **columns)
 
     def message(self, k: int) -> bytes:
@@ -118,8 +121,12 @@ class BagFile(ABC):
 
     magic: ClassVar[bytes]  # first bytes of a file
     refusal: ClassVar[str]  # what is said of a file that begins with others
-    topics: tuple[Topic, ...]  # one that several publishers wrote may come several times
-    start_time: int  # time of recording of the first message, ns; without messages `NO_HORIZON`
+    topics: tuple[
+        Topic, ...
+    ]  # one that several publishers wrote may come several times
+    start_time: (
+        int  # time of recording of the first message, ns; without messages `NO_HORIZON`
+    )
     texts: tuple[LogText, ...] = ()
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
@@ -157,7 +164,9 @@ class BagFile(ABC):
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
 """Of flight logs, tables and bags of ROS 1, in capitals too: each is a recording of its own, never part of a folder."""
-EXPECTED = "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
+EXPECTED = (
+    "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
+)
 LFS = b"version https://git-lfs."  # what a file begins with that git has put in the place of a large one
 MADE_BY_FDI = "fdi_ros"  # key in the custom data of the metadata.yaml of an output bag
 
@@ -168,7 +177,9 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     `BagError` if there is no recording.
     """
     if path.is_file():
-        if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
+        if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(
+            LOG_SUFFIXES
+        ):
             raise BagError(f"{path} is not a recording: expected {EXPECTED}")
         return (path,)
     if not path.is_dir():
@@ -181,13 +192,22 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
         damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
     # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
     paths = [path / name for name in there] or sorted(
-        (child for child in path.iterdir() if child.is_file() and child.name.endswith(SUFFIXES)),
-        key=lambda child: [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", child.name)],
+        (
+            child
+            for child in path.iterdir()
+            if child.is_file() and child.name.endswith(SUFFIXES)
+        ),
+        key=lambda child: [
+            int(part) if part.isdecimal() else part
+            for part in re.split(r"([0-9]+)", child.name)
+        ],
     )
     if not paths:
         raise BagError(f"{path} is a folder without .mcap or .db3 files")
     if len(paths) > FILES:
-        damage.add(f"{len(paths)} files, expected at most {FILES}: the others were left out")
+        damage.add(
+            f"{len(paths)} files, expected at most {FILES}: the others were left out"
+        )
     return tuple(paths[:FILES])
 
 
@@ -213,15 +233,27 @@ def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
 def _metadata(folder: Path, damage: Damage) -> dict[str, Any]:
     path = folder / "metadata.yaml"
     if not path.exists():
-        damage.add("there is no metadata.yaml: the recording was cut off, the files were read without it")
+        damage.add(
+            "there is no metadata.yaml: the recording was cut off, the files were read without it"
+        )
         return {}
     try:
         document = read_yaml(path, "file", BagError)
     except BagError as error:
-        damage.add(f"metadata.yaml is damaged: the files were taken in the order of their names ({shown(error)})")
+        damage.add(
+            f"metadata.yaml is damaged: the files were taken in the order of their names ({shown(error)})"
+        )
         return {}
-    about = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
-    if isinstance(about, dict) and isinstance(about.get("relative_file_paths") or [], list):
+    about = (
+        document.get("rosbag2_bagfile_information")
+        if isinstance(document, dict)
+        else None
+    )
+    if isinstance(about, dict) and isinstance(
+        about.get("relative_file_paths") or [], list
+    ):
         return about
-    damage.add("metadata.yaml is damaged: the files were taken in the order of their names")
+    damage.add(
+        "metadata.yaml is damaged: the files were taken in the order of their names"
+    )
     return {}

@@ -22,14 +22,27 @@ from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.library_bags import Ros1File, SqliteFile
 from fdi_ros.bag.library_logs import Tlog, Ulog
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.raw import MADE_BY_FDI, BagFile, Batch, Damage, LogText, Topic, find_files
+from fdi_ros.bag.raw import (
+    MADE_BY_FDI,
+    BagFile,
+    Batch,
+    Damage,
+    LogText,
+    Topic,
+    find_files,
+)
 from fdi_ros.config.config import is_topic
 from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import CHANNELS, LATEST, max_unpacked_bytes, open_regular
 from fdi_ros.system.text import shown
 
-FORMATS: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile, ".bag": Ros1File, ".bin": DataflashLog} | {
+FORMATS: dict[str, type[BagFile]] = {
+    ".mcap": McapFile,
+    ".db3": SqliteFile,
+    ".bag": Ros1File,
+    ".bin": DataflashLog,
+} | {
     ".csv": CsvLog,
     ".tlog": Tlog,
     ".ulg": Ulog,
@@ -54,7 +67,9 @@ class Recording:
         paths = find_files(self.path, self.damage)
         try:
             self._left = max_unpacked_bytes(sum(path.stat().st_size for path in paths))
-            refused = [error for path in paths if (error := self._open(path)) is not None]
+            refused = [
+                error for path in paths if (error := self._open(path)) is not None
+            ]
             if not self._files:
                 raise refused[0]
         except BaseException:
@@ -82,7 +97,9 @@ class Recording:
         for file in self._files:
             for topic in file.topics:
                 if len(merged) == CHANNELS and topic.name not in merged:
-                    self.damage.add(f"more than {CHANNELS} topics: the others were left out")
+                    self.damage.add(
+                        f"more than {CHANNELS} topics: the others were left out"
+                    )
                     break
                 before = merged.get(topic.name)
                 count = topic.count + (before.count if before else 0)
@@ -100,13 +117,22 @@ class Recording:
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
             if topic is None:
-                listed = ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in there.values()) or "none at all"
+                listed = (
+                    ", ".join(
+                        f"{shown(t.name)} ({shown(t.type)})" for t in there.values()
+                    )
+                    or "none at all"
+                )
                 raise BagError(f"{self.path} has no topic {name!r}, it has: {listed}")
             called = f"topic {name!r} in {self.path}"
             if topic.type != type_name:
-                raise BagError(f"{called} is {shown(topic.type) or 'untyped'}, expected {type_name}")
+                raise BagError(
+                    f"{called} is {shown(topic.type) or 'untyped'}, expected {type_name}"
+                )
             if topic.encoding != "cdr":
-                raise BagError(f"{called} is serialised as {shown(topic.encoding)!r}, expected 'cdr'")
+                raise BagError(
+                    f"{called} is serialised as {shown(topic.encoding)!r}, expected 'cdr'"
+                )
 
     def batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of topics, the files in the order of time."""
@@ -115,11 +141,18 @@ class Recording:
         for k, file in enumerate(self._files):
             for batch in file.batches(topics):
                 progress = (k + batch.progress) / len(self._files)
-                horizon = min([batch.horizon, *(later.start_time for later in self._files[k + 1 :])])
+                horizon = min(
+                    [
+                        batch.horizon,
+                        *(later.start_time for later in self._files[k + 1 :]),
+                    ]
+                )
                 batch = replace(batch, progress=progress, horizon=horizon)
                 possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
                 if not possible.all():
-                    self.damage.add("messages recorded before 1970 or after 2038, by their times, were left out")
+                    self.damage.add(
+                        "messages recorded before 1970 or after 2038, by their times, were left out"
+                    )
                     batch = batch.at(possible)
                 yield batch
 
@@ -148,30 +181,43 @@ class Recording:
                 for data in zstandard.ZstdDecompressor().read_to_iter(packed):
                     most -= out.write(data)
                     if most < 0:
-                        self.damage.add(f"{path.name} unpacks to more than it should: read as far as it may")
+                        self.damage.add(
+                            f"{path.name} unpacks to more than it should: read as far as it may"
+                        )
                         break
         except (OSError, zstandard.ZstdError) as error:
             if not plain.exists() or plain.stat().st_size == 0:
                 raise BagError(f"{path} cannot be unpacked: {error}") from error
-            self.damage.add(f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes")
+            self.damage.add(
+                f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes"
+            )
         self._left = max(0, self._left - plain.stat().st_size)
         return plain
 
 
-def convert(recording: Recording, path: Path, progress: Callable[[float], None]) -> dict[str, int]:
+def convert(
+    recording: Recording, path: Path, progress: Callable[[float], None]
+) -> dict[str, int]:
     """Write the messages of a recording that may be of gyros, byte for byte, with their times of recording.
 
     ``path``: folder to be made, which must not exist; ``progress`` is told the share done, 0 to 1. Returns the number
     of messages of each topic; `BagError` if the recording has none.
     """
     # Imported lazily: readers do not need it.
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.rosbag2 import (
+        CompressionFormat,
+        CompressionMode,
+        StoragePlugin,
+        Writer,
+    )
     from rosbags.typesys import Stores, get_typestore
 
     topics = [
         topic
         for topic in recording.topics
-        if source_of_type(topic.type) is not None and topic.encoding == "cdr" and is_topic(topic.name)
+        if source_of_type(topic.type) is not None
+        and topic.encoding == "cdr"
+        and is_topic(topic.name)
     ]
     if not topics:
         types = " or ".join(kind.type for kind in SOURCES.values())
@@ -182,10 +228,15 @@ def convert(recording: Recording, path: Path, progress: Callable[[float], None])
     # By this it may be replaced later: what anything else has recorded never is.
     writer.set_custom_data(MADE_BY_FDI, __version__)
     with writer:
-        connections = [writer.add_connection(topic.name, topic.type, typestore=store) for topic in topics]
+        connections = [
+            writer.add_connection(topic.name, topic.type, typestore=store)
+            for topic in topics
+        ]
         counts = [0] * len(topics)
         for batch in recording.batches([topic.name for topic in topics]):
-            for k, (topic, log_time) in enumerate(zip(batch.topic.tolist(), batch.log_time.tolist(), strict=True)):
+            for k, (topic, log_time) in enumerate(
+                zip(batch.topic.tolist(), batch.log_time.tolist(), strict=True)
+            ):
                 writer.write(connections[topic], log_time, batch.message(k))
                 counts[topic] += 1
             progress(batch.progress)

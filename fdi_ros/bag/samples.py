@@ -29,7 +29,9 @@ RATE_TOLERANCE = 0.2
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
 """Samples from which the rate of a recording is told, and steps between samples that this takes at least."""
 Rows = NDArray[Any]  #: decoded messages, by field
-Tap = Callable[[Batch, Int], None]  #: is shown each batch and the numbers of the messages in it that are used
+Tap = Callable[
+    [Batch, Int], None
+]  #: is shown each batch and the numbers of the messages in it that are used
 
 
 class Newest(NamedTuple):
@@ -64,7 +66,12 @@ class Samples:
         self.alignment = Alignment(*self.source.alignment)
         first = self.source.channels_of(0, build_geometry(config).n)
         self._width = first.stop - first.start  # values in a message
-        columns = [("topic", "i8"), ("log_time", "i8"), ("stamp", "i8"), ("values", "f8", (self._width,))]
+        columns = [
+            ("topic", "i8"),
+            ("log_time", "i8"),
+            ("stamp", "i8"),
+            ("values", "f8", (self._width,)),
+        ]
         self._row = np.dtype(columns)
         """Of a decoded message: index of the input topic, times, ns (the time of recording where it carries no stamp),
         rates, rad/s."""
@@ -72,12 +79,16 @@ class Samples:
         self._taps = taps
         self.period = period
         self._configured = config.sample_rate
-        self._first: list[Int] | None = []  # stamps of the first samples, ns; None: their rate was checked.
+        self._first: (
+            list[Int] | None
+        ) = []  # stamps of the first samples, ns; None: their rate was checked.
         self._last = -1
         self.origin: int | None = None
         """Stamp of the first message, ns: the times of faults, start and end count from here."""
         self.messages = 0  #: used so far
-        self.malformed = dict.fromkeys(self.topics, 0)  #: messages of each topic that do not hold what they should
+        self.malformed = dict.fromkeys(
+            self.topics, 0
+        )  #: messages of each topic that do not hold what they should
         self.disordered = 0  #: messages without a stamp recorded before one that was handed on already: left out
         self.progress = 0.0  #: share of the recording read so far
         self.newest = [Newest() for _ in self.topics]
@@ -93,7 +104,9 @@ class Samples:
             self._check_rate(block.stamp)
             yield block
         if self.messages == 0:
-            raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
+            raise BagError(
+                f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}"
+            )
         if self.source.stamped and len(rest := self.alignment.flush()):
             yield as_block(rest, len(self.topics))
         self._check_rate(None)
@@ -103,8 +116,12 @@ class Samples:
         if self._first is None:
             return
         self._first += [] if stamp is None else [stamp]
-        if self._first and (stamp is None or sum(map(len, self._first)) >= _RATE_SAMPLES):
-            check_sample_rate(self.recording.path, np.concatenate(self._first), self._configured)
+        if self._first and (
+            stamp is None or sum(map(len, self._first)) >= _RATE_SAMPLES
+        ):
+            check_sample_rate(
+                self.recording.path, np.concatenate(self._first), self._configured
+            )
             self._first = None
 
     def _portions(self) -> Iterator[Rows]:
@@ -113,7 +130,10 @@ class Samples:
         for messages in self._ordered():
             together = np.concatenate([together, messages])
             if self.period:
-                *whole, together = np.split(together, np.flatnonzero(np.diff(together["log_time"] // self.period)) + 1)
+                *whole, together = np.split(
+                    together,
+                    np.flatnonzero(np.diff(together["log_time"] // self.period)) + 1,
+                )
                 yield from whole
             elif len(together) >= _TOGETHER:
                 yield together
@@ -126,7 +146,11 @@ class Samples:
             of_topic = messages[messages["topic"] == k]
             if len(of_topic):
                 last = of_topic[-1]
-                self.newest[k] = Newest(before.received + len(of_topic), int(last["log_time"]), int(last["stamp"]))
+                self.newest[k] = Newest(
+                    before.received + len(of_topic),
+                    int(last["log_time"]),
+                    int(last["stamp"]),
+                )
 
     def _why(self) -> str:
         wrong = sum(self.malformed.values())
@@ -136,9 +160,13 @@ class Samples:
         return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
 
     def _block(self, messages: Rows) -> Block:
-        stamp, values = (np.ascontiguousarray(messages[name]) for name in ("stamp", "values"))
+        stamp, values = (
+            np.ascontiguousarray(messages[name]) for name in ("stamp", "values")
+        )
         if self.source.stamped:
-            return self.alignment.push_block(np.ascontiguousarray(messages["topic"]), stamp, values)
+            return self.alignment.push_block(
+                np.ascontiguousarray(messages["topic"]), stamp, values
+            )
         # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
         count = np.arange(len(messages))
         free = stamp - count
@@ -156,10 +184,18 @@ class Samples:
             if (np.diff(held["log_time"]) < 0).any():
                 held = held[np.argsort(held["log_time"], kind="stable")]
             all_ready = batch.horizon == NO_HORIZON or len(held) > _HELD
-            ready = len(held) if all_ready else int(np.searchsorted(held["log_time"], batch.horizon))
+            ready = (
+                len(held)
+                if all_ready
+                else int(np.searchsorted(held["log_time"], batch.horizon))
+            )
             messages, held = held[:ready], held[ready:]
             self.progress = batch.progress
-            if len(messages) and not self.source.stamped and messages["log_time"][0] < done:
+            if (
+                len(messages)
+                and not self.source.stamped
+                and messages["log_time"][0] < done
+            ):
                 late = messages["log_time"] < done
                 self.disordered += int(late.sum())
                 messages = messages[~late]
@@ -171,7 +207,9 @@ class Samples:
 
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages are counted and left out, and so is what lies outside the span."""
-        decoded = self.source.decode(batch.buffer, batch.offset, batch.length, self._width)
+        decoded = self.source.decode(
+            batch.buffer, batch.offset, batch.length, self._width
+        )
         stamp = decoded.stamp if self.source.stamped else batch.log_time
         keep = decoded.good
         for topic in batch.topic[~keep].tolist():
@@ -198,7 +236,10 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     steps = np.sort(np.diff(stamp)) * 1e-9
     if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
         return
-    usual, mean = 1.0 / np.median(steps), 1.0 / steps[: -max(1, len(steps) // 100)].mean()
+    usual, mean = (
+        1.0 / np.median(steps),
+        1.0 / steps[: -max(1, len(steps) // 100)].mean(),
+    )
     off = np.array([usual, mean]) / configured
     if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
         raise BagError(
@@ -207,7 +248,9 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
         )
 
 
-def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:
+def read_block(
+    bag: Path, config: Config, start: float = 0.0, end: float = math.inf
+) -> Block:
     """Read all samples of a part of a recording, aligned as in a replay; `BagError` as of `Recording` and `Samples`."""
     with Recording(bag) as recording:
         return joined(list(Samples(recording, config, start, end).blocks()))
@@ -215,7 +258,12 @@ def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.
 
 def joined(blocks: Sequence[Block]) -> Block:
     """Join consecutive blocks."""
-    received = [np.ones(b.z.shape, dtype=bool) if b.received is None else b.received for b in blocks]
+    received = [
+        np.ones(b.z.shape, dtype=bool) if b.received is None else b.received
+        for b in blocks
+    ]
     return Block(
-        np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]), np.concatenate(received)
+        np.concatenate([b.stamp for b in blocks]),
+        np.concatenate([b.z for b in blocks]),
+        np.concatenate(received),
     )

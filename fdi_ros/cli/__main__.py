@@ -43,7 +43,11 @@ def fdi() -> int:
     """Run the command line; return its exit code."""
     stop = Stop()
     # A shell has what it starts in the background ignore the keyboard.
-    heeded = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
+    heeded = [
+        one
+        for one in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(one) is not signal.SIG_IGN
+    ]
     for number in heeded:
         signal.signal(number, stop)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):

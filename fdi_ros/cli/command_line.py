@@ -32,7 +32,9 @@ from fdi_ros.system.text import LINE, shown
 
 # Verbs ----------------------------------------------------------------------------------------------------------------
 
-Options = Mapping[str, Any]  # what argparse is told of an argument, or of it beside what `SHARED` says
+Options = Mapping[
+    str, Any
+]  # what argparse is told of an argument, or of it beside what `SHARED` says
 
 
 class Verb(NamedTuple):
@@ -40,7 +42,9 @@ class Verb(NamedTuple):
 
     meaning: str
     examples: Sequence[str]  # the first is the one to begin with
-    arguments: Mapping[str, Options]  # by name, several names with spaces between; what is not said is as in `SHARED`
+    arguments: Mapping[
+        str, Options
+    ]  # by name, several names with spaces between; what is not said is as in `SHARED`
     run: str  # module of this folder and function, which returns the exit code
     libraries: Sequence[str] = ()  # that the verb needs and a live node does not
 
@@ -63,12 +67,22 @@ def shipped(kind: str) -> str:
 _CONFIG = "ROS 2 parameter file{}, a shipped one by its name alone; may be repeated, later ones win"
 DETECTOR_NAMES = ", ".join(reversed(DETECTORS))  # for a help, the one that flies first
 SHARED: Mapping[str, Options] = {
-    "bag": takes_path("rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file", metavar="BAG"),
-    "--config": takes_path(_CONFIG.format(""), type=resolve, action="append", required=True),
-    "--start": takes("from here, seconds from the start", type=float, default=0.0, metavar="S"),
+    "bag": takes_path(
+        "rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file",
+        metavar="BAG",
+    ),
+    "--config": takes_path(
+        _CONFIG.format(""), type=resolve, action="append", required=True
+    ),
+    "--start": takes(
+        "from here, seconds from the start", type=float, default=0.0, metavar="S"
+    ),
     "--end": takes("up to here", type=float, default=math.inf, metavar="S"),
     "--fault": {"action": "append", "default": [], "metavar": "'KEY=VALUE ...'"},
-    "--detector": takes(f"use this detector instead of the configured one: {DETECTOR_NAMES}", metavar="NAME"),
+    "--detector": takes(
+        f"use this detector instead of the configured one: {DETECTOR_NAMES}",
+        metavar="NAME",
+    ),
     "--csv": takes_path(),
     "--report": takes_path("write a page with tables and plots", metavar="FILE.html"),
     "--json": takes_path(
@@ -76,8 +90,13 @@ SHARED: Mapping[str, Options] = {
     ),
     "--force": takes("overwrite files that exist", action="store_true"),
     "--quiet": takes("print nothing but errors; no progress", action="store_true"),
-    "--degrees": takes("print angular rates in deg/s; what is read and written stays in rad/s", action="store_true"),
-    "--workers": takes("processes; default: as many as there are cores", type=int, metavar="N"),
+    "--degrees": takes(
+        "print angular rates in deg/s; what is read and written stays in rad/s",
+        action="store_true",
+    ),
+    "--workers": takes(
+        "processes; default: as many as there are cores", type=int, metavar="N"
+    ),
     "--scheduler": takes(
         "Dask scheduler to work instead: tls://host:port (certificates: Dask's configuration), or where nobody"
         " else reaches it tcp://host:port",
@@ -87,7 +106,11 @@ SHARED: Mapping[str, Options] = {
 """Arguments of several verbs."""
 PART: Mapping[str, Options] = {"--start": {}, "--end": {}}
 WORKERS: Mapping[str, Options] = {"--workers": {}, "--scheduler": {}}
-RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}  # what every verb takes that has results
+RESULTS: Mapping[str, Options] = {
+    "--json": {},
+    "--force": {},
+    "--quiet": {},
+}  # what every verb takes that has results
 _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
     **PART,
@@ -113,7 +136,9 @@ VERBS = {
         {
             "bag": {},
             **_SETTINGS,
-            "--report": takes("page of what was found; default: beside the parameter file"),
+            "--report": takes(
+                "page of what was found; default: beside the parameter file"
+            ),
             **RESULTS,
             "--degrees": {},
         },
@@ -131,13 +156,18 @@ VERBS = {
         {
             "bag": {},
             "--config": takes(
-                _CONFIG.format("; default: what fdi inspect writes, where units are mounted alike"),
+                _CONFIG.format(
+                    "; default: what fdi inspect writes, where units are mounted alike"
+                ),
                 required=False,
                 default=[],
             ),
-            "--fault": takes("inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated"),
+            "--fault": takes(
+                "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated"
+            ),
             "--scenario": takes_path(
-                f"inject the faults of a scenario file; shipped: {shipped('scenarios')}", type=resolve
+                f"inject the faults of a scenario file; shipped: {shipped('scenarios')}",
+                type=resolve,
             ),
             "--detector": {},
             **PART,
@@ -151,7 +181,9 @@ VERBS = {
             ),
             "--csv": takes("write a line for every sample"),
             "--report": takes("write a report to be looked at"),
-            "--output": takes_path("write a bag of what the node would have published", metavar="DIR"),
+            "--output": takes_path(
+                "write a bag of what the node would have published", metavar="DIR"
+            ),
             **RESULTS,
             "--force": takes("overwrite outputs that exist"),
             "--degrees": {},
@@ -162,7 +194,12 @@ VERBS = {
     "inspect": Verb(
         "say what is in a recording and print a starting config for it",
         ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
-        {"bag": {}, "--output --write": takes_path("write the config to a file, too"), **RESULTS, "--degrees": {}},
+        {
+            "bag": {},
+            "--output --write": takes_path("write the config to a file, too"),
+            **RESULTS,
+            "--degrees": {},
+        },
         "recording:run_inspect",
         (*BAGS, *PROGRESS),
     ),
@@ -171,7 +208,11 @@ VERBS = {
         ("fdi convert flight.bin --output flight_bag",),
         {
             "bag": {},
-            "--output": takes_path("rosbag2 folder to write, with one MCAP file", metavar="DIR", required=True),
+            "--output": takes_path(
+                "rosbag2 folder to write, with one MCAP file",
+                metavar="DIR",
+                required=True,
+            ),
             **RESULTS,
             "--force": takes("overwrite a bag made by fdi"),
         },
@@ -180,7 +221,9 @@ VERBS = {
     ),
     "calibrate": Verb(
         "fit axes, biases and noise to a recording and write a config",
-        ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
+        (
+            "fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",
+        ),
         {
             "bag": {},
             "--config": takes(_CONFIG.format(" to start from")),
@@ -194,10 +237,16 @@ VERBS = {
     ),
     "geometry": Verb(
         "say what a mounting can detect and isolate, before it flies",
-        ("fdi geometry two_triads.yaml", "fdi geometry my_gyros.yaml --degrees --report mounting.html"),
+        (
+            "fdi geometry two_triads.yaml",
+            "fdi geometry my_gyros.yaml --degrees --report mounting.html",
+        ),
         {
             "config": takes_path(
-                "ROS 2 parameter file; of several, later ones win", type=resolve, nargs="+", metavar="CONFIG"
+                "ROS 2 parameter file; of several, later ones win",
+                type=resolve,
+                nargs="+",
+                metavar="CONFIG",
             ),
             "--report": takes("write a page with tables and a picture"),
             **RESULTS,
@@ -209,8 +258,14 @@ VERBS = {
         "compare detectors over many simulated trials",
         ("fdi montecarlo power.yaml --trials 200 --report power.html",),
         {
-            "study": takes_path(f"what to run; shipped: {shipped('studies')}", type=resolve, metavar="STUDY.yaml"),
-            "--trials": takes("trials per cell, instead of the file's", type=int, metavar="N"),
+            "study": takes_path(
+                f"what to run; shipped: {shipped('studies')}",
+                type=resolve,
+                metavar="STUDY.yaml",
+            ),
+            "--trials": takes(
+                "trials per cell, instead of the file's", type=int, metavar="N"
+            ),
             "--seed": takes("seed, instead of the file's", type=int, metavar="S"),
             **WORKERS,
             "--report": takes("write curves and tables as one page"),
@@ -233,13 +288,31 @@ VERBS = {
                 "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases,"
                 " drifts, noise, scale factors, stuck, dropout"
             ),
-            "--times": takes("times per channel and fault; default 10", type=int, default=10, metavar="N"),
-            "--within": takes("watch a fault for so long; default 5", type=float, default=5.0, metavar="S"),
+            "--times": takes(
+                "times per channel and fault; default 10",
+                type=int,
+                default=10,
+                metavar="N",
+            ),
+            "--within": takes(
+                "watch a fault for so long; default 5",
+                type=float,
+                default=5.0,
+                metavar="S",
+            ),
             "--detector": {},
             "--compare": takes(
-                "other detectors (as of --detector) or parameter files beside it", nargs="+", default=[], metavar="NAME"
+                "other detectors (as of --detector) or parameter files beside it",
+                nargs="+",
+                default=[],
+                metavar="NAME",
             ),
-            "--seed": takes("of signs and random faults; default 1", type=int, default=1, metavar="S"),
+            "--seed": takes(
+                "of signs and random faults; default 1",
+                type=int,
+                default=1,
+                metavar="S",
+            ),
             "--workers": takes("processes; default 1", default=1),
             **PART,
             "--csv": takes("write a line for every fault"),
@@ -251,15 +324,24 @@ VERBS = {
     ),
     "fleet": Verb(
         "judge many recordings: tables of flights and episodes, and a page of what needs a person",
-        ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
+        (
+            "fdi fleet logs --output fleet",
+            "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet",
+        ),
         {
-            "paths": takes("recordings, and folders with recordings", nargs="+", metavar="PATH"),
+            "paths": takes(
+                "recordings, and folders with recordings", nargs="+", metavar="PATH"
+            ),
             "--config": takes(
-                _CONFIG.format("; default: of each recording what fdi inspect writes for it"),
+                _CONFIG.format(
+                    "; default: of each recording what fdi inspect writes for it"
+                ),
                 required=False,
                 default=[],
             ),
-            "--output": takes_path("folder for the tables and the page", metavar="DIR", required=True),
+            "--output": takes_path(
+                "folder for the tables and the page", metavar="DIR", required=True
+            ),
             "--calibrate": takes(
                 "each: calibrate each recording on itself, where it allows that; default none",
                 choices=("none", "each"),
@@ -267,7 +349,9 @@ VERBS = {
             ),
             **WORKERS,
             **RESULTS,
-            "--force": takes("begin anew where the folder holds a run with other settings"),
+            "--force": takes(
+                "begin anew where the folder holds a run with other settings"
+            ),
         },
         "replay:run_fleet",
         (*BAGS, *POOL, "pyarrow", "scipy"),
@@ -276,8 +360,14 @@ VERBS = {
         "show a running monitor: residuals, states, rates and events as they come",
         ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
         {
-            "--node": takes("the monitor; default: the only one running", default="", metavar="/NS/NAME"),
-            "--plain": takes("line by line, as where the output is no terminal", action="store_true"),
+            "--node": takes(
+                "the monitor; default: the only one running",
+                default="",
+                metavar="/NS/NAME",
+            ),
+            "--plain": takes(
+                "line by line, as where the output is no terminal", action="store_true"
+            ),
         },
         "command_line:run_watch",
     ),
@@ -285,7 +375,12 @@ VERBS = {
         "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
         ("fdi shipped", "fdi shipped two_imus.yaml"),
         {
-            "name": takes("only this file, such as two_imus.yaml", nargs="?", default="", metavar="NAME"),
+            "name": takes(
+                "only this file, such as two_imus.yaml",
+                nargs="?",
+                default="",
+                metavar="NAME",
+            ),
             "--node": takes(
                 "print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
                 action="append",
@@ -299,7 +394,12 @@ VERBS = {
     "compile": Verb(
         "compile now what else is compiled when it is first used, for images and CI",
         ("fdi compile", "fdi compile --detector sequential"),
-        {"--detector": takes(f"for these detectors; default: for all: {DETECTOR_NAMES}", nargs="+"), **RESULTS},
+        {
+            "--detector": takes(
+                f"for these detectors; default: for all: {DETECTOR_NAMES}", nargs="+"
+            ),
+            **RESULTS,
+        },
         "settings:run_compile",
     ),
 }
@@ -315,7 +415,9 @@ EXIT_CODES = (
 )
 
 
-def main(argv: Sequence[str] | None = None, stopped: Callable[[], bool] = lambda: False) -> int:
+def main(
+    argv: Sequence[str] | None = None, stopped: Callable[[], bool] = lambda: False
+) -> int:
     """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70.
 
     ``stopped``: whether a signal has come; what it broke off may have failed in any way.
@@ -353,10 +455,14 @@ def _run(argv: Sequence[str] | None) -> int:
             # What a terminal cannot show is escaped.
             stream.reconfigure(errors="backslashreplace")
     # That something has to be compiled is no error: with --quiet it is not logged.
-    logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
+    logging.getLogger("fdi_ros").setLevel(
+        logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET
+    )
     verb = VERBS[given.verb]
     require(f"fdi {given.verb}", verb.libraries)
-    run: Callable[[argparse.Namespace], int] = pkgutil.resolve_name(f"fdi_ros.cli.{verb.run}")
+    run: Callable[[argparse.Namespace], int] = pkgutil.resolve_name(
+        f"fdi_ros.cli.{verb.run}"
+    )
     if "quiet" not in given:
         # What has no results, `fdi watch`, does not wait for the compiler.
         return run(given)
@@ -424,7 +530,13 @@ class _Parser(argparse.ArgumentParser):
 class _PrintCompletion(argparse.Action):
     """Prints a completion script: made once, it costs nothing at each key, and the shell needs no Python for it."""
 
-    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option_string: Any = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: Any,
+        values: Any,
+        option_string: Any = None,
+    ) -> None:
         """Print it and end."""
         try:
             require("--print-completion", ("shtab",))
@@ -433,7 +545,9 @@ class _PrintCompletion(argparse.Action):
         import shtab
 
         if values not in shtab.SUPPORTED_SHELLS:
-            parser.error(f"--print-completion {values!r}, expected one of: {', '.join(shtab.SUPPORTED_SHELLS)}")
+            parser.error(
+                f"--print-completion {values!r}, expected one of: {', '.join(shtab.SUPPORTED_SHELLS)}"
+            )
         _complete(parser, shtab.FILE)
         print(shtab.complete(parser, shell=values))
         parser.exit()
@@ -447,7 +561,9 @@ def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
         if action.metavar == "NAME" and action.dest in ("detector", "compare"):
             action.choices = DETECTORS
         if isinstance(action, argparse._SubParsersAction):
-            action.help = None  # what is hidden from the help would be from the completion
+            action.help = (
+                None  # what is hidden from the help would be from the completion
+            )
             for verb in action.choices.values():
                 _complete(verb, files)
 
@@ -477,13 +593,27 @@ def _parser() -> argparse.ArgumentParser:
         help="print a completion script for bash, zsh, tcsh or fish; needs the extra 'completion'",
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
-    verbs = parser.add_subparsers(dest="verb", metavar="VERB", prog="fdi", help=argparse.SUPPRESS)
+    verbs = parser.add_subparsers(
+        dest="verb", metavar="VERB", prog="fdi", help=argparse.SUPPRESS
+    )
     for name, verb in VERBS.items():
-        description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
-        epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
-        added = verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
+        description = textwrap.fill(
+            f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100
+        )
+        epilog = "\n".join(
+            ["examples:", *(f"  {example}" for example in verb.examples)]
+        )
+        added = verbs.add_parser(
+            name,
+            help=verb.meaning,
+            description=description,
+            epilog=epilog,
+            formatter_class=raw,
+        )
         for names, own in verb.arguments.items():
-            action = added.add_argument(*names.split(), **{**SHARED.get(names, {}), **own})
+            action = added.add_argument(
+                *names.split(), **{**SHARED.get(names, {}), **own}
+            )
             if names == "--fault":
                 action.help = f"{action.help}; kinds: %(kinds)s"
                 vars(action)["kinds"] = _FaultKinds()
@@ -497,7 +627,9 @@ def _overview() -> str:
 
     def line(name: str) -> str:
         first, others = f"  {name:<{wide}}", " " * (wide + 2)
-        return textwrap.fill(VERBS[name].meaning, width, initial_indent=first, subsequent_indent=others)
+        return textwrap.fill(
+            VERBS[name].meaning, width, initial_indent=first, subsequent_indent=others
+        )
 
     lines = ["Gyro fault detection and isolation, offline.", "\nfirst:"]
     for name in FIRST:

@@ -25,7 +25,15 @@ from fdi_ros.bag.raw import Damage, find_files, is_made_by_fdi
 from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.layout import Severity
-from fdi_ros.system.files import STANDARD_OUTPUT, is_open_already, is_stream, open_regular, real_path, whole, write_json
+from fdi_ros.system.files import (
+    STANDARD_OUTPUT,
+    is_open_already,
+    is_stream,
+    open_regular,
+    real_path,
+    whole,
+    write_json,
+)
 from fdi_ros.system.text import LINE, shown, visible
 
 # Progress -------------------------------------------------------------------------------------------------------------
@@ -37,7 +45,9 @@ _TICK = 1.0  # how often the time is drawn anew, s
 
 
 @contextmanager
-def progress(stream: TextIO, quiet: bool, what: str = "", timed: bool = False) -> Iterator[Callable[[float], None]]:
+def progress(
+    stream: TextIO, quiet: bool, what: str = "", timed: bool = False
+) -> Iterator[Callable[[float], None]]:
     """Show how much is done: a bar on the last line of a terminal, wiped at the end; elsewhere a line now and then.
 
     Gives what is to be called with the share done, 0 to 1. The line begins with ``what``. ``timed``: no share is known,
@@ -48,9 +58,16 @@ def progress(stream: TextIO, quiet: bool, what: str = "", timed: bool = False) -
         return
     from tqdm import tqdm
 
-    shown, begun, compiled, ended = _TIMED_FORMAT if timed else _FORMAT, clock(), compiling_seconds(), threading.Event()
+    shown, begun, compiled, ended = (
+        _TIMED_FORMAT if timed else _FORMAT,
+        clock(),
+        compiling_seconds(),
+        threading.Event(),
+    )
     # None: tqdm asks the stream whether it is a terminal.
-    bar = tqdm(total=1.0, desc=what, file=stream, disable=None, bar_format=shown, leave=False)
+    bar = tqdm(
+        total=1.0, desc=what, file=stream, disable=None, bar_format=shown, leave=False
+    )
     done = 0.0
 
     def tick() -> None:
@@ -62,9 +79,15 @@ def progress(stream: TextIO, quiet: bool, what: str = "", timed: bool = False) -
                 bar.refresh()
                 continue
             spent, share = clock() - begun, done
-            words = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
+            words = (
+                f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left"
+                if share > 0
+                else "at work"
+            )
             with suppress(OSError, ValueError):
-                stream.write(f"fdi: {what}{': ' if what else ''}{words} after {spent:.0f} s\n")
+                stream.write(
+                    f"fdi: {what}{': ' if what else ''}{words} after {spent:.0f} s\n"
+                )
                 stream.flush()
 
     def show(share: float) -> None:
@@ -88,7 +111,9 @@ def progress(stream: TextIO, quiet: bool, what: str = "", timed: bool = False) -
 
 # Files and words ------------------------------------------------------------------------------------------------------
 
-_HEAD = 1 << 16  # bytes at the begin of a file in which the mark of a result is looked for
+_HEAD = (
+    1 << 16
+)  # bytes at the begin of a file in which the mark of a result is looked for
 
 
 class Kind(Enum):
@@ -101,7 +126,11 @@ class Kind(Enum):
     FOLDER = rb""  # an output bag: recognised by its metadata
 
 
-_KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}  # what is written where options of these names say
+_KINDS = {
+    "json": Kind.JSON,
+    "csv": Kind.CSV,
+    "report": Kind.PAGE,
+}  # what is written where options of these names say
 
 
 class Outputs:
@@ -121,20 +150,38 @@ class Outputs:
         output: Kind | None = Kind.PARAMETERS,
     ) -> None:
         self._arguments = arguments
-        self.targets: dict[str, Path] = {name: path for name in names if (path := getattr(arguments, name))}
+        self.targets: dict[str, Path] = {
+            name: path for name in names if (path := getattr(arguments, name))
+        }
         kinds = {**_KINDS, "output": output}
-        wanted = [(path, kind) for name, path in self.targets.items() if (kind := kinds[name]) is not None]
+        wanted = [
+            (path, kind)
+            for name, path in self.targets.items()
+            if (kind := kinds[name]) is not None
+        ]
         folders = [path for path, kind in wanted if kind is Kind.FOLDER]
         taken: set[Path] = set()
         for target, kind in wanted:
             # A device keeps none of what goes there apart; a file and standard output do.
-            if real_path(target) in taken and (target == STANDARD_OUTPUT or not is_stream(target)):
+            if real_path(target) in taken and (
+                target == STANDARD_OUTPUT or not is_stream(target)
+            ):
                 raise BagError(f"cannot write {target}: two outputs have this name")
             taken.add(real_path(target))
             for folder in folders:
-                if not is_stream(target) and real_path(folder) in real_path(target).parents:
-                    raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
-            check_target(target, kind, arguments.force, [source for source in sources if source is not None])
+                if (
+                    not is_stream(target)
+                    and real_path(folder) in real_path(target).parents
+                ):
+                    raise BagError(
+                        f"cannot write {target}: it lies in {folder}, which is written as a whole"
+                    )
+            check_target(
+                target,
+                kind,
+                arguments.force,
+                [source for source in sources if source is not None],
+            )
 
     def say(self, text: str, severity: Severity | None = None) -> None:
         """Print for people, unless they asked for quiet: to standard output, unless data goes there.
@@ -142,10 +189,20 @@ class Outputs:
         ``severity``: of the first line, where that is a verdict; a terminal shows it by its colour.
         """
         if not self._arguments.quiet:
-            stream = sys.stderr if any(map(is_open_already, self.targets.values())) else sys.stdout
+            stream = (
+                sys.stderr
+                if any(map(is_open_already, self.targets.values()))
+                else sys.stdout
+            )
             text = visible(text)
-            if severity is not None and stream.isatty() and not os.environ.get("NO_COLOR"):
-                colour = {Severity.GOOD: 32, Severity.UNKNOWN: 33, Severity.BAD: 31}[severity]
+            if (
+                severity is not None
+                and stream.isatty()
+                and not os.environ.get("NO_COLOR")
+            ):
+                colour = {Severity.GOOD: 32, Severity.UNKNOWN: 33, Severity.BAD: 31}[
+                    severity
+                ]
                 first, end, rest = text.partition("\n")
                 text = f"\x1b[1;{colour}m{first}\x1b[0m{end}{rest}"
             stream.write(text)
@@ -164,7 +221,9 @@ class Outputs:
         options, by name. Returns the exit code.
         """
         if html is not None:
-            others["report"] = lambda path: path.write_text(html(), encoding="utf-8", errors="replace")
+            others["report"] = lambda path: path.write_text(
+                html(), encoding="utf-8", errors="replace"
+            )
         with ExitStack() as stack:
             # They take their places at the end: where one cannot be written, there is none.
             for name, write in others.items():
@@ -189,20 +248,30 @@ def versions() -> str:
     return f"fdi_ros {__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
 
 
-def about(arguments: argparse.Namespace, config: str, more: Mapping[str, str]) -> dict[str, str]:
+def about(
+    arguments: argparse.Namespace, config: str, more: Mapping[str, str]
+) -> dict[str, str]:
     """Say for a page what was run: of which part of which recording, with which config, and more."""
     end = "the end" if math.isinf(arguments.end) else f"{arguments.end:g} s"
-    first = {"recording": str(arguments.bag), "part": f"{arguments.start:g} s to {end}", "config": config}
+    first = {
+        "recording": str(arguments.bag),
+        "part": f"{arguments.start:g} s to {end}",
+        "config": config,
+    }
     return {**first, **more, "versions": versions()}
 
 
 def check_part(arguments: argparse.Namespace) -> None:
     """Refuse a part of a recording that is none: `ConfigError` if the end is not after the start."""
     if not 0 <= arguments.start < arguments.end:
-        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
+        raise ConfigError(
+            f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end"
+        )
 
 
-def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()) -> None:
+def check_target(
+    path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()
+) -> None:
     """Refuse to write where something is that should stay (`BagError`), before any work is done.
 
     A former result of this kind may be overwritten with ``force``; what is read (``sources``) never is.
@@ -212,11 +281,18 @@ def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = 
             raise BagError(f"cannot write {path}: a recording is a folder")
         return
     if not path.absolute().parent.is_dir():
-        raise BagError(f"cannot write {path}: there is no folder {path.absolute().parent}")
+        raise BagError(
+            f"cannot write {path}: there is no folder {path.absolute().parent}"
+        )
     real = real_path(path)
     for source in sources:
-        if any(part in (real, *real.parents) or real in part.parents for part in _parts(source)):
-            raise BagError(f"cannot write {path}: it belongs to {source}, which is read")
+        if any(
+            part in (real, *real.parents) or real in part.parents
+            for part in _parts(source)
+        ):
+            raise BagError(
+                f"cannot write {path}: it belongs to {source}, which is read"
+            )
     if not (path.exists() or path.is_symlink()):
         return
     if not force:
@@ -243,14 +319,23 @@ def _what_stays(path: Path, kind: Kind) -> str:
             return "no folder"
         children = {child.name: child.is_file() for child in path.iterdir()}
         with suppress(BagError):
-            complete = children.keys() == {"metadata.yaml", *(file.name for file in find_files(path, Damage()))}
+            complete = children.keys() == {
+                "metadata.yaml",
+                *(file.name for file in find_files(path, Damage())),
+            }
             if complete and is_made_by_fdi(path) and all(children.values()):
                 return ""
-        return "a folder that holds more than a recording made by fdi" if children else ""
+        return (
+            "a folder that holds more than a recording made by fdi" if children else ""
+        )
     if path.is_dir():
         return "a folder"
     if not path.is_file():
         return "no file" if path.exists() else ""
     with open_regular(path) as file:
         begin = file.read(_HEAD)
-    return "no result of fdi of this kind" if begin and not re.match(kind.value, begin) else ""
+    return (
+        "no result of fdi of this kind"
+        if begin and not re.match(kind.value, begin)
+        else ""
+    )

@@ -17,7 +17,13 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.inspect import TopicReport, inspect, recording_figures, recording_text, topics_text
+from fdi_ros.setup.inspect import (
+    TopicReport,
+    inspect,
+    recording_figures,
+    recording_text,
+    topics_text,
+)
 from fdi_ros.setup.starting_config import (
     candidates,
     findings_figures,
@@ -35,14 +41,22 @@ if TYPE_CHECKING:
 
 def run_inspect(arguments: Namespace) -> int:
     """Print what it is fit for, a table of the topics, and a config to start from."""
-    outputs, unit = Outputs(arguments, ("json", "output"), [arguments.bag]), unit_of(arguments.degrees)
+    outputs, unit = (
+        Outputs(arguments, ("json", "output"), [arguments.bag]),
+        unit_of(arguments.degrees),
+    )
     reports, damage = inspect(arguments.bag)
     config, refused = _starting_config(reports, arguments.bag)
     found = verdict_of(recording_findings(reports, refused, unit))
     text = f"{found.words}\n{recording_text(reports, arguments.bag)}"
-    text += topics_text(reports, damage, unit) + ("" if config is None else f"\n{config}")
+    text += topics_text(reports, damage, unit) + (
+        "" if config is None else f"\n{config}"
+    )
     figures = recording_figures(reports, arguments.bag, damage)
-    figures |= {**findings_figures(list(recording_findings(reports, refused))), "config": config}
+    figures |= {
+        **findings_figures(list(recording_findings(reports, refused))),
+        "config": config,
+    }
     if config is None:
         outputs.targets.pop("output", None)
 
@@ -51,11 +65,15 @@ def run_inspect(arguments: Namespace) -> int:
 
     code = outputs.finish(text, figures, None, found.severity, output=write)
     if config is None and arguments.output is not None:
-        raise ConfigError(f"{arguments.output} is not written: {shown(arguments.bag.name)} {found.words}")
+        raise ConfigError(
+            f"{arguments.output} is not written: {shown(arguments.bag.name)} {found.words}"
+        )
     return code
 
 
-def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
+def _starting_config(
+    reports: Sequence[TopicReport], bag: Path
+) -> tuple[str | None, str]:
     """Return a config to start from, or none, and why the node would refuse it."""
     if needs(reports):
         return None, ""
@@ -75,9 +93,20 @@ def run_setup(arguments: Namespace) -> int:
     check_part(arguments)
     arguments.report = arguments.report or arguments.output.with_suffix(".html")
     outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
-    with progress(sys.stderr, arguments.quiet, "looking into the recording", timed=True):
-        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
-    origin = shown(f"made by fdi setup from {arguments.bag.name}; {arguments.report.name} says how.", LINE)
+    with progress(
+        sys.stderr, arguments.quiet, "looking into the recording", timed=True
+    ):
+        found = set_up(
+            arguments.bag,
+            arguments.start,
+            arguments.end,
+            arguments.reference,
+            arguments.proof,
+        )
+    origin = shown(
+        f"made by fdi setup from {arguments.bag.name}; {arguments.report.name} says how.",
+        LINE,
+    )
     return _finish(arguments, outputs, found, f"# {origin}\n{found.text}")
 
 
@@ -88,19 +117,42 @@ def run_calibrate(arguments: Namespace) -> int:
 
     config = Config.from_file(arguments.config)
     check_part(arguments)
-    outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag, *arguments.config])
-    with progress(sys.stderr, arguments.quiet, "fitting axes, biases and noise", timed=True):
-        found = recalibrate(arguments.bag, config, arguments.start, arguments.end, arguments.reference, arguments.proof)
+    outputs = Outputs(
+        arguments, ("output", "report", "json"), [arguments.bag, *arguments.config]
+    )
+    with progress(
+        sys.stderr, arguments.quiet, "fitting axes, biases and noise", timed=True
+    ):
+        found = recalibrate(
+            arguments.bag,
+            config,
+            arguments.start,
+            arguments.end,
+            arguments.reference,
+            arguments.proof,
+        )
     settings, origin = _calibrated(arguments, found)
-    text = with_parameters(arguments.config, settings, origin, found.remarks, REPLACED if settings else ())
-    return _finish(arguments, outputs, found, text, f"set: {', '.join(settings) or 'nothing'}\n")
+    text = with_parameters(
+        arguments.config, settings, origin, found.remarks, REPLACED if settings else ()
+    )
+    return _finish(
+        arguments, outputs, found, text, f"set: {', '.join(settings) or 'nothing'}\n"
+    )
 
 
-def _calibrated(arguments: Namespace, found: SetupResult) -> tuple[dict[str, object], str]:
+def _calibrated(
+    arguments: Namespace, found: SetupResult
+) -> tuple[dict[str, object], str]:
     """Return the settings that a calibration changes, and what its parameter file says of where they come from."""
-    bag, configs = shown(arguments.bag.name), ", ".join(shown(file.name) for file in arguments.config)
+    bag, configs = (
+        shown(arguments.bag.name),
+        ", ".join(shown(file.name) for file in arguments.config),
+    )
     if found.kept:
-        return {}, f"made by fdi calibrate: all is as in {configs}; what {bag} gives is no better"
+        return (
+            {},
+            f"made by fdi calibrate: all is as in {configs}; what {bag} gives is no better",
+        )
     result = found.calibration
     assert result is not None
     end = min(arguments.end, arguments.start + result.duration)
@@ -111,9 +163,20 @@ def _calibrated(arguments: Namespace, found: SetupResult) -> tuple[dict[str, obj
     )
 
 
-def _finish(arguments: Namespace, outputs: Outputs, found: SetupResult, config: str, more: str = "") -> int:
+def _finish(
+    arguments: Namespace,
+    outputs: Outputs,
+    found: SetupResult,
+    config: str,
+    more: str = "",
+) -> int:
     """Write config, page and figures, and say what was found."""
-    from fdi_ros.setup.report import setup_figures, setup_findings, setup_page, setup_text
+    from fdi_ros.setup.report import (
+        setup_figures,
+        setup_findings,
+        setup_page,
+        setup_text,
+    )
 
     def write(path: Path) -> None:
         path.write_text(config, encoding="utf-8")
@@ -121,18 +184,31 @@ def _finish(arguments: Namespace, outputs: Outputs, found: SetupResult, config: 
         Pipeline(Config.from_file(path))
 
     said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
-    text, figures = setup_text(found, *said) + more, setup_figures(found, str(arguments.bag))
+    text, figures = (
+        setup_text(found, *said) + more,
+        setup_figures(found, str(arguments.bag)),
+    )
     severity = verdict_of(setup_findings(found)).severity
-    return outputs.finish(text, figures, lambda: setup_page(found, *said), severity, output=write)
+    return outputs.finish(
+        text, figures, lambda: setup_page(found, *said), severity, output=write
+    )
 
 
 def run_convert(arguments: Namespace) -> int:
     """Convert to an MCAP bag of the gyro topics, and say how much was written."""
-    outputs = Outputs(arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER)
+    outputs = Outputs(
+        arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER
+    )
     with Recording(arguments.bag) as recording:
-        with progress(sys.stderr, arguments.quiet) as show, whole(arguments.output) as path:
+        with (
+            progress(sys.stderr, arguments.quiet) as show,
+            whole(arguments.output) as path,
+        ):
             counts = convert(recording, path, show)
         damage = recording.damage.report()
     lines = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]
     lines += [f"note: {line}\n" for line in damage]
-    return outputs.finish("".join(lines), {"bag": str(arguments.output), "messages": counts, "damage": list(damage)})
+    return outputs.finish(
+        "".join(lines),
+        {"bag": str(arguments.output), "messages": counts, "damage": list(damage)},
+    )

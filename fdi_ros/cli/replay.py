@@ -13,7 +13,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.cli.outputs import Kind, Outputs, about, check_part, check_target, config_words, progress, versions
+from fdi_ros.cli.outputs import (
+    Kind,
+    Outputs,
+    about,
+    check_part,
+    check_target,
+    config_words,
+    progress,
+    versions,
+)
 from fdi_ros.cli.settings import compile_for_workers
 from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
@@ -27,7 +36,13 @@ from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary, as_json
-from fdi_ros.replay.words import failures, parse_check, sample_rate_notes, summary_text, verdict
+from fdi_ros.replay.words import (
+    failures,
+    parse_check,
+    sample_rate_notes,
+    summary_text,
+    verdict,
+)
 from fdi_ros.report.layout import unit_of
 from fdi_ros.setup.starting_config import assumed_config, refuse_degrees
 from fdi_ros.system import resolve
@@ -40,30 +55,66 @@ if TYPE_CHECKING:
 
 def run_replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
-    config, assumed = (Config.from_file(arguments.config), "") if arguments.config else assumed_config(arguments.bag)
-    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
+    config, assumed = (
+        (Config.from_file(arguments.config), "")
+        if arguments.config
+        else assumed_config(arguments.bag)
+    )
+    config = (
+        config.replaced({"detector.name": arguments.detector})
+        if arguments.detector
+        else config
+    )
     faults = [parse_fault(text) for text in arguments.fault]
     faults += [] if arguments.scenario is None else load_scenario(arguments.scenario)
     check_part(arguments)
     geometry = build_geometry(config)
-    required = [] if arguments.check is None else parse_check(arguments.check, len(faults), geometry.channel_names)
+    required = (
+        []
+        if arguments.check is None
+        else parse_check(arguments.check, len(faults), geometry.channel_names)
+    )
     sources = [arguments.bag, *arguments.config, arguments.scenario]
-    outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
+    outputs = Outputs(
+        arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER
+    )
     refuse_degrees(arguments.bag, config)
     unit = unit_of(arguments.degrees)
-    report = Report(geometry, config.sample_rate, unit) if arguments.report is not None else None
+    report = (
+        Report(geometry, config.sample_rate, unit)
+        if arguments.report is not None
+        else None
+    )
     with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
-        sinks = [*_sinks(arguments, config, geometry, stack), *([report] if report else [])]
+        sinks = [
+            *_sinks(arguments, config, geometry, stack),
+            *([report] if report else []),
+        ]
         part = (arguments.start, arguments.end)
-        summary = replay(arguments.bag, config, faults, *part, sinks=sinks, progress=show)
+        summary = replay(
+            arguments.bag, config, faults, *part, sinks=sinks, progress=show
+        )
         found = verdict(summary, unit)
-        figures = {**as_json(summary), "verdict": {"severity": found.severity.value, "words": verdict(summary).words}}
+        figures = {
+            **as_json(summary),
+            "verdict": {
+                "severity": found.severity.value,
+                "words": verdict(summary).words,
+            },
+        }
         unmet = failures(required, summary)
         if arguments.check is not None:
-            figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
+            figures["check"] = {
+                "required": [one.text for one in required],
+                "unmet": unmet,
+            }
         if report:
-            page = report.html(summary, _about_replay(arguments, config, faults, assumed))
-            stack.enter_context(whole(arguments.report)).write_text(page, encoding="utf-8")
+            page = report.html(
+                summary, _about_replay(arguments, config, faults, assumed)
+            )
+            stack.enter_context(whole(arguments.report)).write_text(
+                page, encoding="utf-8"
+            )
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
@@ -78,10 +129,14 @@ def run_replay(arguments: Namespace) -> int:
     return 0 if faults else code
 
 
-def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
+def _say_check(
+    arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]
+) -> int:
     """Say what came of the check; return the exit code."""
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
-    for line in sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ():
+    for line in (
+        sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ()
+    ):
         print(f"fdi: warning: {line}", file=sys.stderr)
     for line in unmet:
         print(f"fdi: check not met: {line}", file=sys.stderr)
@@ -90,12 +145,19 @@ def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: 
     return 1 if unmet else 0
 
 
-def _sinks(arguments: Namespace, config: Config, geometry: Geometry, stack: ExitStack) -> list[Sink]:
+def _sinks(
+    arguments: Namespace, config: Config, geometry: Geometry, stack: ExitStack
+) -> list[Sink]:
     """Open the outputs that grow with the stream."""
     sinks: list[Sink] = []
     if arguments.csv is not None:
         path = stack.enter_context(whole(arguments.csv))
-        sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
+        sinks.append(
+            CsvFile(
+                stack.enter_context(path.open("w", newline="", encoding="utf-8")),
+                geometry.channel_names,
+            )
+        )
     if arguments.output is not None:
         path = stack.enter_context(whole(arguments.output))
         sinks.append(stack.enter_context(OutputBag(path, config, geometry.n)))
@@ -109,16 +171,22 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about_replay(arguments: Namespace, config: Config, faults: Sequence[Fault], assumed: str) -> dict[str, str]:
+def _about_replay(
+    arguments: Namespace, config: Config, faults: Sequence[Fault], assumed: str
+) -> dict[str, str]:
     """Say what was run, for the report."""
-    changed = "; ".join(f"{name}: {_written(value)}" for name, value in config.changed.items())
+    changed = "; ".join(
+        f"{name}: {_written(value)}" for name, value in config.changed.items()
+    )
     more = {
         "detector": config.detector.name,
         "faults": "; ".join(map(str, faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in faults) or "none needed",
         "settings other than the default": changed,
     }
-    return about(arguments, config_words(arguments) or f"none; assumed: {assumed}", more)
+    return about(
+        arguments, config_words(arguments) or f"none; assumed: {assumed}", more
+    )
 
 
 # Faults of many sizes -------------------------------------------------------------------------------------------------
@@ -129,17 +197,29 @@ MOST_TIMES = 1000
 def run_sweep(arguments: Namespace) -> int:
     """Sweep, print the tables, write what was asked for."""
     from fdi_ros.replay.sweep import sweep
-    from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
+    from fdi_ros.replay.sweep_report import (
+        sweep_figures,
+        sweep_page,
+        sweep_text,
+        write_csv,
+    )
 
     plan = _plan(arguments)
     check_part(arguments)
     configs = _configs(arguments)
     compared = filter(Path.exists, map(resolve, arguments.compare))
-    outputs = Outputs(arguments, ("json", "csv", "report"), [arguments.bag, *arguments.config, *compared])
+    outputs = Outputs(
+        arguments,
+        ("json", "csv", "report"),
+        [arguments.bag, *arguments.config, *compared],
+    )
     subjects = _subjects(arguments, configs)
     with progress(sys.stderr, arguments.quiet, "faults") as show:
         results = sweep(subjects, plan, arguments.workers, show)
-    text, figures = sweep_text(results, plan, arguments.bag.name), sweep_figures(results, plan, str(arguments.bag))
+    text, figures = (
+        sweep_text(results, plan, arguments.bag.name),
+        sweep_figures(results, plan, str(arguments.bag)),
+    )
     tried = {
         "compared with": ", ".join(arguments.compare) or "nothing",
         "faults": "; ".join(swept.words for swept in plan.faults),
@@ -151,14 +231,21 @@ def run_sweep(arguments: Namespace) -> int:
         with path.open("w", newline="", encoding="utf-8") as file:
             write_csv(file, results, plan)
 
-    return outputs.finish(text, figures, lambda: sweep_page(results, plan, arguments.bag.name, head), csv=write)
+    return outputs.finish(
+        text,
+        figures,
+        lambda: sweep_page(results, plan, arguments.bag.name, head),
+        csv=write,
+    )
 
 
 def _plan(arguments: Namespace) -> Plan:
     from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, parse_swept
     from fdi_ros.system.jobs import worker_count
 
-    swept = tuple(one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text))
+    swept = tuple(
+        one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text)
+    )
     if not 1 <= arguments.times <= MOST_TIMES:
         raise ConfigError(f"--times is {arguments.times}, expected 1 to {MOST_TIMES}")
     if not (math.isfinite(arguments.within) and arguments.within > 0):
@@ -166,15 +253,27 @@ def _plan(arguments: Namespace) -> Plan:
     worker_count(arguments.workers)
     if arguments.seed < 0:
         raise ConfigError(f"--seed is {arguments.seed}, expected 0 or more")
-    return Plan(tuple(dict.fromkeys(swept)), arguments.times, arguments.within, arguments.seed)
+    return Plan(
+        tuple(dict.fromkeys(swept)), arguments.times, arguments.within, arguments.seed
+    )
 
 
 def _configs(arguments: Namespace) -> dict[str, Config]:
     """Return the configs to be tried by name: the one given, and those to compare it with."""
     config = Config.from_file(arguments.config)
-    config = config.replaced({"detector.name": arguments.detector}) if arguments.detector else config
-    by_detector = arguments.compare and all(other in DETECTORS for other in arguments.compare)
-    found = {config.detector.name if by_detector else ", ".join(file.name for file in arguments.config): config}
+    config = (
+        config.replaced({"detector.name": arguments.detector})
+        if arguments.detector
+        else config
+    )
+    by_detector = arguments.compare and all(
+        other in DETECTORS for other in arguments.compare
+    )
+    found = {
+        config.detector.name
+        if by_detector
+        else ", ".join(file.name for file in arguments.config): config
+    }
     names = build_geometry(config).channel_names
     for other in arguments.compare:
         if other in DETECTORS:
@@ -182,10 +281,14 @@ def _configs(arguments: Namespace) -> dict[str, Config]:
             continue
         file = resolve(other)
         if not file.exists():
-            raise ConfigError(f"--compare {other}: no such file, and no detector; there are: {', '.join(DETECTORS)}")
+            raise ConfigError(
+                f"--compare {other}: no such file, and no detector; there are: {', '.join(DETECTORS)}"
+            )
         found[other] = Config.from_file(file)
         if build_geometry(found[other]).channel_names != names:
-            raise ConfigError(f"--compare {other}: its channels are not those of --config: {', '.join(names)}")
+            raise ConfigError(
+                f"--compare {other}: its channels are not those of --config: {', '.join(names)}"
+            )
     return found
 
 
@@ -197,12 +300,23 @@ def _subjects(arguments: Namespace, configs: dict[str, Config]) -> list[Subject]
     read: dict[object, Block] = {}
     for config in configs.values():
         if (key := _alignment(config)) not in read:
-            read[key] = read_block(arguments.bag, config, arguments.start, arguments.end)
-    return [Subject(name, config, read[_alignment(config)]) for name, config in configs.items()]
+            read[key] = read_block(
+                arguments.bag, config, arguments.start, arguments.end
+            )
+    return [
+        Subject(name, config, read[_alignment(config)])
+        for name, config in configs.items()
+    ]
 
 
 def _alignment(config: Config) -> object:
-    return config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout
+    return (
+        config.input,
+        config.topics,
+        config.imus.delays,
+        config.imus.max_skew,
+        config.imus.timeout,
+    )
 
 
 # Many recordings ------------------------------------------------------------------------------------------------------
@@ -218,20 +332,31 @@ def run_fleet(arguments: Namespace) -> int:
 
     workers = worker_count(arguments.workers)
     names = ", ".join(shown(file.name) for file in arguments.config)
-    parameters = with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
+    parameters = (
+        with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
+    )
     paths, unread = find_recordings(arguments.paths)
-    outputs = Outputs(arguments, ("output", "json"), [*paths, *arguments.config], output=None)
+    outputs = Outputs(
+        arguments, ("output", "json"), [*paths, *arguments.config], output=None
+    )
     folder = arguments.output.absolute()
     if folder.exists():
         check_target(folder / PAGE, Kind.PAGE, force=True)
-    tables = Tables(folder, {"config": parameters, "calibrate": arguments.calibrate}, arguments.force)
+    tables = Tables(
+        folder,
+        {"config": parameters, "calibrate": arguments.calibrate},
+        arguments.force,
+    )
     compile_for_workers(arguments)
     try:
         with progress(sys.stderr, arguments.quiet, "flights") as show:
             given = parameters, arguments.calibrate == "each", tables
             judge_all(paths, *given, workers, arguments.scheduler, show)
     except KeyboardInterrupt:
-        print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
+        print(
+            "fdi: stopped; what was judged is kept, the same command goes on from there",
+            file=sys.stderr,
+        )
         raise
     except (FdiError, OSError):
         tables.give_up()
@@ -239,16 +364,26 @@ def run_fleet(arguments: Namespace) -> int:
     fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
     head = {
         "recordings": f"{len(paths)}, from {', '.join(map(str, arguments.paths))}",
-        "config": config_words(arguments) or "what fdi inspect writes for each recording",
+        "config": config_words(arguments)
+        or "what fdi inspect writes for each recording",
         "calibrated": arguments.calibrate,
         "versions": versions(),
     }
     write_text(folder / PAGE, fleet.html(head))
     others = len(tables.flights) - len(paths)
-    more = [f"The tables have {others} more, of other runs: not counted here."] if others else []
+    more = (
+        [f"The tables have {others} more, of other runs: not counted here."]
+        if others
+        else []
+    )
     more += [f"Not searched: {shown(line)}." for line in unread]
-    text, figures = fleet.text() + "".join(f"{line}\n" for line in more), fleet.figures() | {"not_searched": unread}
+    text, figures = (
+        fleet.text() + "".join(f"{line}\n" for line in more),
+        fleet.figures() | {"not_searched": unread},
+    )
     code = outputs.finish(text, figures, severity=fleet.verdict.severity)
     if not fleet.judged:
-        raise BagError(f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why")
+        raise BagError(
+            f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why"
+        )
     return code

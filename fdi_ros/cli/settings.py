@@ -23,7 +23,14 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.cli.outputs import Outputs, config_words, progress
-from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
+from fdi_ros.compiling.compiled import (
+    INTERPRETED,
+    LOG,
+    allocate,
+    compilations,
+    folder,
+    missing,
+)
 from fdi_ros.compiling.notice import share_logged
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS, detector_class
@@ -36,12 +43,19 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_detector, warm_path
 from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
+from fdi_ros.setup.mounting import (
+    assess,
+    mounting_figures,
+    mounting_page,
+    mounting_text,
+)
 from fdi_ros.system import BAGS, shipped_files, there
 from fdi_ros.system.files import plain
 
 MADE = "diagnostics.yaml"  # the file that can be made for nodes
-_NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # full name of a node
+_NODE_NAME = re.compile(
+    r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII
+)  # full name of a node
 _ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
 """In the file, a regular expression of statuses of any monitor."""
 
@@ -61,13 +75,17 @@ def run_montecarlo(arguments: Namespace) -> int:
     from fdi_ros.experiments.report import headline, report
 
     if arguments.scheduler is not None and arguments.workers is not None:
-        raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
+        raise StudyError(
+            "--workers is for local processes, --scheduler for a cluster: give one"
+        )
     outputs = Outputs(arguments, ("report", "json"), [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     compile_for_workers(arguments)
     with progress(sys.stderr, arguments.quiet, study.name) as show:
         result = run_study(study, arguments.workers, arguments.scheduler, show)
-    return outputs.finish(f"{headline(result)}\n", plain(result), lambda: report(result))
+    return outputs.finish(
+        f"{headline(result)}\n", plain(result), lambda: report(result)
+    )
 
 
 def run_shipped(arguments: Namespace) -> int:
@@ -76,7 +94,9 @@ def run_shipped(arguments: Namespace) -> int:
     `ConfigError` if no shipped file has that name, or it is not made for nodes.
     """
     if arguments.node and arguments.name != MADE:
-        raise ConfigError(f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}")
+        raise ConfigError(
+            f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}"
+        )
     files = shipped_files()
     if not files:
         raise ConfigError("fdi_ros was installed without its config folder")
@@ -85,11 +105,17 @@ def run_shipped(arguments: Namespace) -> int:
         files = [path for path in files if path.name == arguments.name]
         if not files:
             close = difflib.get_close_matches(arguments.name, names, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"expected one of: {', '.join(names)}"
+            hint = (
+                f"did you mean {close[0]!r}?"
+                if close
+                else f"expected one of: {', '.join(names)}"
+            )
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
     outputs = Outputs(arguments, ("json",), files)
     if not arguments.node:
-        return outputs.finish("".join(f"{path}\n" for path in files), {"files": list(map(str, files))})
+        return outputs.finish(
+            "".join(f"{path}\n" for path in files), {"files": list(map(str, files))}
+        )
     text = made_for(arguments.node, files[0].read_text())
     return outputs.finish(text, {"text": text})
 
@@ -102,13 +128,23 @@ def made_for(nodes: Sequence[str], text: str) -> str:
     """
     for name in nodes:
         if not _NODE_NAME.fullmatch(name):
-            raise ConfigError(f"--node {name!r} is no full name of a node, such as /drone/fdi_node")
+            raise ConfigError(
+                f"--node {name!r} is no full name of a node, such as /drone/fdi_node"
+            )
     names = [name.lstrip("/") for name in nodes]
     if len(set(names)) < len(names):
         raise ConfigError(f"--node names a node twice: {', '.join(nodes)}")
-    text = _ANY_NODE.sub(lambda what: json.dumps([f"{name}: {what[1]}" for name in names]), text)
-    text = text.replace("all monitors called fdi_node, in any namespaces", " and ".join(nodes), 1)
-    text = text.replace(f"shipped {MADE}", " ".join([f"shipped {MADE}", *(f"--node {name}" for name in nodes)]), 1)
+    text = _ANY_NODE.sub(
+        lambda what: json.dumps([f"{name}: {what[1]}" for name in names]), text
+    )
+    text = text.replace(
+        "all monitors called fdi_node, in any namespaces", " and ".join(nodes), 1
+    )
+    text = text.replace(
+        f"shipped {MADE}",
+        " ".join([f"shipped {MADE}", *(f"--node {name}" for name in nodes)]),
+        1,
+    )
     # The first is that of the monitors, each of which has one such status; without names nobody knows how many.
     timeout = "          timeout: 3.0\n"
     return text.replace(timeout, f"{timeout}          num_items: {len(names)}\n", 1)
@@ -128,8 +164,17 @@ def run_compile(arguments: Namespace) -> int:
     begun = time.perf_counter()
     new = compile_now(names)
     took = time.perf_counter() - begun
-    what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
-    figures = {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())}
+    what = (
+        f"compiled in {took:.1f} s, kept in"
+        if new
+        else "nothing to do: all is there, in"
+    )
+    figures = {
+        "detectors": names,
+        "compiled": new,
+        "seconds": took,
+        "folder": str(folder()),
+    }
     return outputs.finish(f"{what} {folder()}\n", figures)
 
 
@@ -145,11 +190,18 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
     Return how many functions had to be compiled.
     """
     # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
-    parts: list[tuple[Any, ...]] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
+    parts: list[tuple[Any, ...]] = [
+        (warm_path,),
+        *((warm_detector, name) for name in reversed(names)),
+        (warm_verbs,),
+    ]
     # Spawned: forking a process that has threads can hang.
     spawned = multiprocessing.get_context("spawn")
     logged = share_logged() if missing() else nullcontext()
-    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=spawned) as pool, logged:
+    with (
+        ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=spawned) as pool,
+        logged,
+    ):
         return sum(pool.map(_quietly, parts))
 
 
@@ -172,4 +224,6 @@ def warm_verbs() -> None:
         find_records(np.frombuffer(b"\0", dtype=np.uint8), sizes, True, found)
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
-    Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))
+    Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(
+        np.zeros((1, 4))
+    )

@@ -50,7 +50,15 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from fdi_ros.system.files import OTHERS, DistrustError, check_ancestor, check_trusted, close_to_others, lock, replacing
+from fdi_ros.system.files import (
+    OTHERS,
+    DistrustError,
+    check_ancestor,
+    check_trusted,
+    close_to_others,
+    lock,
+    replacing,
+)
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -91,7 +99,9 @@ def record(kind: type[T]) -> type[T]:
     taken = hints.keys() & set(dir(np.record))
     if taken:
         # In plain Python a record is an np.record: a field may not hide behind an attribute of it.
-        raise TypeError(f"{kind.__name__} has fields named like attributes of np.record: {', '.join(sorted(taken))}")
+        raise TypeError(
+            f"{kind.__name__} has fields named like attributes of np.record: {', '.join(sorted(taken))}"
+        )
     layout = [_field(name, hint) for name, hint in hints.items()]
     kind.dtype = np.dtype(layout, align=True)  # type: ignore[attr-defined]
     return kind
@@ -118,7 +128,9 @@ def allocate(kind: type, count: int = 1) -> NDArray[Any]:
 # Compiling ------------------------------------------------------------------------------------------------------------
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[\w.]*))", re.MULTILINE)
+_IMPORT = re.compile(
+    r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[\w.]*))", re.MULTILINE
+)
 _NAME = "fdi_ros"
 _dispatchers: list[Any] = []
 _callbacks: list[Callback] = []
@@ -130,7 +142,9 @@ class Part(CompilerBase):  # type: ignore[misc,unused-ignore]
 
     def define_pipelines(self) -> list[Any]:
         """Return Numba's own pipeline, with a library that code does not run from."""
-        self.state.library = _Library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library = _Library(
+            self.state.targetctx.codegen(), self.state.func_id.func_qualname
+        )
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 
 
@@ -165,7 +179,9 @@ def compiled(function: F) -> F:
     if INTERPRETED:
         return _quiet(function)
     with _kept(function):
-        dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+        dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(
+            function
+        )
     dispatcher._cache._cache_file.__class__ = _Kept
     _call_as_part(dispatcher)
     _dispatchers.append(dispatcher)
@@ -174,9 +190,12 @@ def compiled(function: F) -> F:
 
 def _call_as_part(dispatcher: Any) -> None:
     """Have compiled code link a function in as a `Part`, once for all whole numbers instead of for each constant."""
-    part = numba.njit(pipeline_class=Part, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)(
-        dispatcher.py_func
-    )
+    part = numba.njit(
+        pipeline_class=Part,
+        error_model="numpy",
+        no_cfunc_wrapper=True,
+        no_cpython_wrapper=True,
+    )(dispatcher.py_func)
 
     def find(arguments: Any, named: Any) -> Any:
         found = part.get_call_template(
@@ -192,7 +211,9 @@ def _call_as_part(dispatcher: Any) -> None:
 class Callback:
     """A compiled function over records, reached through its address: its callers need not be compiled anew for it."""
 
-    def __init__(self, function: Callable[..., None], records: tuple[type, ...]) -> None:
+    def __init__(
+        self, function: Callable[..., None], records: tuple[type, ...]
+    ) -> None:
         self.function, self.records = function, records
         self.compiled: Any = None  # once the address was asked for
         _callbacks.append(self)
@@ -210,7 +231,12 @@ class Callback:
             types = tuple(numba.from_dtype(kind.dtype) for kind in self.records)  # type: ignore[attr-defined]
             # As `numba.cfunc` does, which would load what is kept before it is known whose it is.
             with _kept(self.function):
-                compiled: Any = CFunc(self.function, (types, numba.types.void), {}, {"error_model": "numpy"})
+                compiled: Any = CFunc(
+                    self.function,
+                    (types, numba.types.void),
+                    {},
+                    {"error_model": "numpy"},
+                )
                 compiled.enable_caching()
                 compiled._cache._cache_file.__class__ = _Kept
                 compiled.compile()
@@ -220,7 +246,9 @@ class Callback:
 
 def callback(*records: type) -> Callable[[Callable[..., None]], Callback]:
     """Make a function over records one that `call` reaches through its address."""
-    return lambda function: Callback(_quiet(function) if INTERPRETED else function, records)
+    return lambda function: Callback(
+        _quiet(function) if INTERPRETED else function, records
+    )
 
 
 def as_input(values: Any, kind: Any) -> NDArray[Any]:
@@ -242,18 +270,29 @@ def reported(what: str) -> Iterator[None]:
     begun, before = time.perf_counter(), compilations()
     yield
     if compilations() > before:
-        LOG.warning("compiled %s in %.1f s, once on this machine", what, time.perf_counter() - begun)
+        LOG.warning(
+            "compiled %s in %.1f s, once on this machine",
+            what,
+            time.perf_counter() - begun,
+        )
 
 
 def compilations() -> int:
     """Return how many compilations this process has made so far; what was only loaded does not count."""
-    misses = sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers)
-    return misses + sum(one.compiled is not None and one.compiled.cache_hits == 0 for one in _callbacks)
+    misses = sum(
+        sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers
+    )
+    return misses + sum(
+        one.compiled is not None and one.compiled.cache_hits == 0 for one in _callbacks
+    )
 
 
 def missing() -> int:
     """Count the functions of the modules imported so far that have no compiled result on disk, nor within another's."""
-    return sum(not (_index_path(one).exists() or _part_path(one).exists()) for one in _dispatchers)
+    return sum(
+        not (_index_path(one).exists() or _part_path(one).exists())
+        for one in _dispatchers
+    )
 
 
 def _index_path(dispatcher: Any) -> Path:
@@ -273,10 +312,19 @@ _by_address: dict[int, NDArray[Any]] = {}
 if INTERPRETED:
 
     def call(
-        address: int, constants: int, row: int, size: int, state: int, state_size: int, sample: Any, verdict: Any
+        address: int,
+        constants: int,
+        row: int,
+        size: int,
+        state: int,
+        state_size: int,
+        sample: Any,
+        verdict: Any,
     ) -> None:
         """Call a `Callback`; see the compiled form."""
-        _callbacks[address](_by_address[constants][row], _by_address[state][row], sample, verdict)
+        _callbacks[address](
+            _by_address[constants][row], _by_address[state][row], sample, verdict
+        )
 
 else:
 
@@ -298,10 +346,22 @@ else:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             pointer = cgutils.voidptr_t
             where, first, row, size, second, state_size, sample, verdict = arguments
-            function = builder.inttoptr(where, ir.FunctionType(ir.VoidType(), [pointer] * 4).as_pointer())
-            rows = [builder.add(first, builder.mul(row, size)), builder.add(second, builder.mul(row, state_size))]
+            function = builder.inttoptr(
+                where, ir.FunctionType(ir.VoidType(), [pointer] * 4).as_pointer()
+            )
+            rows = [
+                builder.add(first, builder.mul(row, size)),
+                builder.add(second, builder.mul(row, state_size)),
+            ]
             records = [builder.inttoptr(at, pointer) for at in rows]
-            builder.call(function, [*records, builder.bitcast(sample, pointer), builder.bitcast(verdict, pointer)])
+            builder.call(
+                function,
+                [
+                    *records,
+                    builder.bitcast(sample, pointer),
+                    builder.bitcast(verdict, pointer),
+                ],
+            )
             return context.get_dummy_value()
 
         return signature, generate
@@ -349,13 +409,19 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
                 while _parts:
                     _parts.pop().touch(0o644)
         except OSError as error:
-            LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
+            LOG.warning(
+                "compiled code cannot be kept in %s: %s",
+                self._cache_path,
+                error.strerror,
+            )
 
     def _load_index(self) -> Any:
         return self._read(self._index_path, super()._load_index) or {}
 
     def _load_data(self, name: str) -> Any:
-        found = self._read(self._data_path(name), functools.partial(super()._load_data, name))
+        found = self._read(
+            self._data_path(name), functools.partial(super()._load_data, name)
+        )
         if found is None:
             # What Numba takes for: it is not there.
             raise FileNotFoundError(name)
@@ -367,23 +433,34 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
             check_trusted(path)
             return load()
         except DistrustError as error:
-            LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
+            LOG.warning(
+                "compiled code in %s is not used: %s", error.filename, error.strerror
+            )
         except FileNotFoundError:
             pass
         except Exception as error:  # A file that was cut off, or is no pickle at all, may raise anything.
-            LOG.warning("compiled code in %s is damaged, and compiled anew: %s", path, type(error).__name__)
+            LOG.warning(
+                "compiled code in %s is damaged, and compiled anew: %s",
+                path,
+                type(error).__name__,
+            )
         return None
 
     def _close(self) -> None:
         """Check that nobody else can write the folder of the function, nor any between it and that of all results."""
         inside, top = Path(self._cache_path), folder()
-        for one in (inside, *(parent for parent in inside.parents if parent.is_relative_to(top))):
+        for one in (
+            inside,
+            *(parent for parent in inside.parents if parent.is_relative_to(top)),
+        ):
             close_to_others(one)
 
     @contextlib.contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
         with super()._open_for_write(filepath) as file:
-            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS)
+            os.fchmod(
+                file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS
+            )
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -398,14 +475,19 @@ def folder() -> Path:
     roots = [Path(numba.config.CACHE_DIR) / _NAME] if numba.config.CACHE_DIR else []
     roots.append(in_package)
     with contextlib.suppress(RuntimeError):
-        roots.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _NAME)
+        roots.append(
+            Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _NAME
+        )
     for root in roots:
         if _usable(root, version):
             _take_over(in_package / version, root / version)
             return root / version
     found = _temporary() / version
     _take_over(in_package / version, found)
-    LOG.warning("compiled code is kept in %s: neither the package's folder nor a home can be written", found)
+    LOG.warning(
+        "compiled code is kept in %s: neither the package's folder nor a home can be written",
+        found,
+    )
     return found
 
 
@@ -434,7 +516,9 @@ def _usable(root: Path, version: str) -> bool:
         with tempfile.TemporaryFile(dir=path):
             return True
     except DistrustError as error:
-        LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
+        LOG.warning(
+            "compiled code in %s is not used: %s", error.filename, error.strerror
+        )
     except OSError:
         pass
     return False
@@ -449,7 +533,12 @@ def _take_over(prepared: Path, target: Path) -> None:
         copy = target / inside
         if not copy.exists():
             with contextlib.suppress(OSError):
-                for one in (prepared.parent, prepared, *(prepared / folder for folder in inside.parents), source):
+                for one in (
+                    prepared.parent,
+                    prepared,
+                    *(prepared / folder for folder in inside.parents),
+                    source,
+                ):
                     check_trusted(one)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 close_to_others(copy.parent)
@@ -472,4 +561,7 @@ def _digest(source: Path) -> str:
 def _source_of(module: str) -> Path | None:
     path = _PACKAGE.joinpath(*module.split(".")[1:])
     files = (path.with_suffix(".py"), path / "__init__.py")
-    return next((one for one in files if one.is_file() and one != _PACKAGE / "__init__.py"), None)
+    return next(
+        (one for one in files if one.is_file() and one != _PACKAGE / "__init__.py"),
+        None,
+    )

@@ -38,8 +38,12 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
         self.depth = 0
         self.seconds = 0.0
         self.begun = 0.0
-        self.collected = gc.get_threshold()  # when garbage is collected while nothing is compiled
-        self.hooks: list[Callable[[bool], None]] = []  # called when the compiler begins, and when it has ended
+        self.collected = (
+            gc.get_threshold()
+        )  # when garbage is collected while nothing is compiled
+        self.hooks: list[
+            Callable[[bool], None]
+        ] = []  # called when the compiler begins, and when it has ended
 
     def on_start(self, event: Any) -> None:
         self.depth += 1
@@ -81,7 +85,9 @@ def is_compiling() -> bool:
 
 def compiling_seconds() -> float:
     """Return for how long this process has compiled so far, s."""
-    return _watch.seconds + (time.perf_counter() - _watch.begun if is_compiling() else 0.0)
+    return _watch.seconds + (
+        time.perf_counter() - _watch.begun if is_compiling() else 0.0
+    )
 
 
 def clock() -> float:
@@ -103,7 +109,12 @@ def share_logged() -> Iterator[None]:
             most = max(most, left)
             if most and (left != before or is_compiling()):
                 share, spent = 1 - left / most, time.monotonic() - begun
-                LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), spent)
+                LOG.warning(
+                    "compiling %3.0f %% |%-20s| %.0f s",
+                    100 * share,
+                    "#" * round(20 * share),
+                    spent,
+                )
             before = left
 
     thread = threading.Thread(target=tick, daemon=True)

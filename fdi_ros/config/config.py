@@ -53,7 +53,9 @@ class Config:
     body_frame: str = setting("base_link", "frame_id of the fused rate")
     hardware_id: str = setting("gyros", "hardware_id in the diagnostics")
     sample_rate: float = setting(100.0, "nominal rate of the samples", "Hz", 0.1, 1e5)
-    excluded_channels: tuple[str, ...] = setting((), "channels taken out by the operator", runtime=True)
+    excluded_channels: tuple[str, ...] = setting(
+        (), "channels taken out by the operator", runtime=True
+    )
     publish_under_doubt: bool = setting(
         True,
         "fused rate also where channels under doubt cannot be left out (their doubt is in its covariance), or none",
@@ -80,7 +82,9 @@ class Config:
             if name not in PARAMETERS:
                 raise ConfigError(unknown_parameter(name))
             section, _, key = name.rpartition(".")
-            sections.setdefault(section, {})[key] = check(PARAMETERS[name], value, name, ConfigError)
+            sections.setdefault(section, {})[key] = check(
+                PARAMETERS[name], value, name, ConfigError
+            )
         top = sections.pop("", {})
         nested = {name: _SECTIONS[name](**values) for name, values in sections.items()}
         config = cls(**top, **nested)
@@ -88,20 +92,30 @@ class Config:
         return config
 
     @classmethod
-    def from_file(cls, path: str | Path | Sequence[str | Path], overrides: Mapping[str, Any] | None = None) -> Config:
+    def from_file(
+        cls,
+        path: str | Path | Sequence[str | Path],
+        overrides: Mapping[str, Any] | None = None,
+    ) -> Config:
         """Read a ROS 2 parameter file; of several, later ones win, as with ``--params-file`` of ROS.
 
         ``overrides``: ``{"section.field": value}``, which win over all of them. `ConfigError` if a file is missing, is
         no parameter file, or holds a bad parameter.
         """
         files = [path] if isinstance(path, (str, Path)) else path
-        given = {name: value for file in files for name, value in read_parameter_file(file).items()}
+        given = {
+            name: value
+            for file in files
+            for name, value in read_parameter_file(file).items()
+        }
         return cls.from_parameters({**given, **(overrides or {})})
 
     @classmethod
     def of(cls, settings: Config | str | PathLike[str]) -> Config:
         """Return settings as they are, or those of a parameter file."""
-        return settings if isinstance(settings, Config) else cls.from_file(Path(settings))
+        return (
+            settings if isinstance(settings, Config) else cls.from_file(Path(settings))
+        )
 
     def parameters(self) -> dict[str, Value]:
         """All settings as ``{"section.field": value}``."""
@@ -118,15 +132,26 @@ class Config:
     @property
     def changed(self) -> dict[str, Value]:
         """What is set to other than its default, as ``{"section.field": value}``."""
-        return {name: value for name, value in self.parameters().items() if value != PARAMETERS[name].default}
+        return {
+            name: value
+            for name, value in self.parameters().items()
+            if value != PARAMETERS[name].default
+        }
 
     def __repr__(self) -> str:
         """Say what is set to other than its default."""
         return f"Config({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
 
     def _repr_html_(self) -> str:
-        rows = [(name, value, PARAMETERS[name].default, PARAMETERS[name].unit) for name, value in self.changed.items()]
-        return html_table("settings other than the default", ("parameter", "value", "default", "unit"), rows)
+        rows = [
+            (name, value, PARAMETERS[name].default, PARAMETERS[name].unit)
+            for name, value in self.changed.items()
+        ]
+        return html_table(
+            "settings other than the default",
+            ("parameter", "value", "default", "unit"),
+            rows,
+        )
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -143,7 +168,9 @@ class Config:
     @property
     def imu_names(self) -> tuple[str, ...]:
         """Names of the triads."""
-        return self.imus.names or tuple(f"imu_{k + 1}" for k in range(len(self.imus.topics)))
+        return self.imus.names or tuple(
+            f"imu_{k + 1}" for k in range(len(self.imus.topics))
+        )
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -152,7 +179,9 @@ class Config:
 
 
 _SECTIONS: dict[str, Callable[..., Any]] = {
-    f.name: f.default_factory for f in fields(Config) if f.default_factory is not MISSING
+    f.name: f.default_factory
+    for f in fields(Config)
+    if f.default_factory is not MISSING
 }
 """Dataclass of each section."""
 PARAMETERS: dict[str, Field] = {
@@ -166,9 +195,13 @@ PARAMETERS: dict[str, Field] = {
 def unknown_parameter(name: str) -> str:
     """Say that there is no such parameter, and which one may be meant."""
     # What is much longer than any parameter is like none of them, and costs long to compare.
-    close = difflib.get_close_matches(name, PARAMETERS, n=1) if len(name) <= NAME else []
+    close = (
+        difflib.get_close_matches(name, PARAMETERS, n=1) if len(name) <= NAME else []
+    )
     return f"unknown parameter {shown(name)!r}" + (
-        f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
+        f", did you mean {close[0]!r}?"
+        if close
+        else f", expected one of: {', '.join(PARAMETERS)}"
     )
 
 
@@ -180,7 +213,9 @@ def check_lengths(config: Config, per: str, count: int) -> None:
         if declared.per == per and len(values[name]) not in lengths:
             each = "one" if declared.each == 1 else declared.each
             expected = f"{' or '.join(map(str, lengths))} ({each} per {per})"
-            raise ConfigError(f"{name} has {len(values[name])} values, expected {expected}")
+            raise ConfigError(
+                f"{name} has {len(values[name])} values, expected {expected}"
+            )
 
 
 MIN_LEARNED = 10  #: samples that a bias is learned from at a start at rest
@@ -203,7 +238,9 @@ def _check_consistency(config: Config) -> None:
     _check_topics(config)
     _check_names(config)
     if len(config.geometry.axes) % 3:
-        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel")
+        raise ConfigError(
+            f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel"
+        )
     learned = config.bias.startup_bias_duration * config.sample_rate
     if 0 < learned < MIN_LEARNED:
         raise ConfigError(
@@ -221,8 +258,13 @@ def _check_consistency(config: Config) -> None:
             f"decision.confirm_alarms is {config.decision.confirm_alarms},"
             f" expected at most decision.confirm_window {config.decision.confirm_window}"
         )
-    if config.detector.false_alarms_per_hour == 0 and config.detector.false_alarm_probability == 0:
-        raise ConfigError("detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one")
+    if (
+        config.detector.false_alarms_per_hour == 0
+        and config.detector.false_alarm_probability == 0
+    ):
+        raise ConfigError(
+            "detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one"
+        )
 
 
 def _check_names(config: Config) -> None:
@@ -232,27 +274,40 @@ def _check_names(config: Config) -> None:
     for parameter, names in named.items():
         for name in names:
             if len(name) > NAME or not name.isprintable():
-                raise ConfigError(f"{parameter}: {name!r} is no name: expected at most {NAME} printable characters")
+                raise ConfigError(
+                    f"{parameter}: {name!r} is no name: expected at most {NAME} printable characters"
+                )
 
 
 def _check_topics(config: Config) -> None:
     if config.imus.delays and not config.has_units:
-        raise ConfigError(f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all")
+        raise ConfigError(
+            f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all"
+        )
     for topic in config.topics:
         if not is_topic(topic):
-            raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
+            raise ConfigError(
+                f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first"
+            )
     if config.has_units:
         count = len(config.imus.topics)
         if not 2 <= count <= 4:
             raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
         if len(set(config.imus.topics)) != count:
-            raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
+            raise ConfigError(
+                f"imus.topics repeats a topic: {', '.join(config.imus.topics)}"
+            )
         check_lengths(config, "triad", count)
 
 
 # Parameter files ----------------------------------------------------------------------------------------------------
 
-ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", *ALL_NODES, *MONITOR)
+ROS_PARAMETERS = (
+    "use_sim_time",
+    "start_type_description_service",
+    *ALL_NODES,
+    *MONITOR,
+)
 """Parameters of the node itself: they may stand in the file, and are no settings of the pipeline."""
 
 
@@ -272,19 +327,27 @@ def parameters_in(document: Any, called: str, ros: bool = False) -> dict[str, An
     `ConfigError` if it is no parameter file.
     """
     if not isinstance(document, dict):
-        raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")
+        raise ConfigError(
+            f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters"
+        )
     # Of what two give, the last wins.
     monitors = sorted(filter(is_monitor, document), key=lambda node: node != "/**")
     if not monitors:
         names = ", ".join(map(str, document))
-        raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
+        raise ConfigError(
+            f"{called} has no parameters for /** or fdi_node, only for: {names}"
+        )
     flat: dict[str, Any] = {}
     for node in monitors:
         body = document[node]
-        if not isinstance(body, dict) or not isinstance(body.get("ros__parameters"), dict):
+        if not isinstance(body, dict) or not isinstance(
+            body.get("ros__parameters"), dict
+        ):
             raise ConfigError(f"{called}: {node} has no ros__parameters")
         _flatten(body["ros__parameters"], "", flat)
-    return {name: value for name, value in flat.items() if is_ros_parameter(name) == ros}
+    return {
+        name: value for name, value in flat.items() if is_ros_parameter(name) == ros
+    }
 
 
 def is_monitor(node: object) -> bool:
@@ -312,7 +375,21 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, flat: dict[str, Any]) -> None
 WIDTH = 110  # columns of a file; a value without a comment beside it may be longer
 _PLAIN = re.compile(r"[A-Za-z_/~][A-Za-z0-9_/~.*-]*")
 """Texts that need no quotes, unless they are one of these words: the parser of ROS takes more of them than PyYAML."""
-_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "~"}
+_WORDS = {
+    "y",
+    "n",
+    "yes",
+    "no",
+    "on",
+    "off",
+    "true",
+    "false",
+    "null",
+    "nan",
+    "inf",
+    "infinity",
+    "~",
+}
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
@@ -321,7 +398,9 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
     def text(self, text: str) -> yaml.Node:
         """Return the node of a text."""
         plain = _PLAIN.fullmatch(text) and text.lower() not in _WORDS
-        return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
+        return self.represent_scalar(
+            "tag:yaml.org,2002:str", text, style=None if plain else '"'
+        )
 
 
 _Dumper.add_representer(str, _Dumper.text)
@@ -350,9 +429,13 @@ def parameter_file(
         before, section = section, name.rpartition(".")[0]
         if section != before:
             lines += ["", f"    {section}:"]
-        lines += _entry(name, parameters[name], (remarks or {}).get(name, ""), 6 if section else 4)
+        lines += _entry(
+            name, parameters[name], (remarks or {}).get(name, ""), 6 if section else 4
+        )
     top = [*(f"# {line}" for line in origin.splitlines()), f"{node}:"]
-    return "\n".join([*top, f"  ros__parameters:{'' if lines else ' {}'}", *lines]) + "\n"
+    return (
+        "\n".join([*top, f"  ros__parameters:{'' if lines else ' {}'}", *lines]) + "\n"
+    )
 
 
 def with_parameters(
@@ -377,7 +460,10 @@ def with_parameters(
         given |= parameters_in(document, f"config {file}")
         ros |= parameters_in(document, f"config {file}", ros=True)
         monitors |= set(filter(is_monitor, document))
-        _update(others, {node: body for node, body in document.items() if not is_monitor(node)})
+        _update(
+            others,
+            {node: body for node, body in document.items() if not is_monitor(node)},
+        )
     # As checked: of a number that is written as a text the number.
     values = Config.from_parameters(given).parameters()
     kept = {name: values[name] for name in given if name not in without}
@@ -400,15 +486,25 @@ def _update(tree: dict[Any, Any], new: Mapping[Any, Any]) -> None:
 def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
     """Lines of one parameter; a comment that does not fit beside it stands above it."""
     declared, margin = PARAMETERS[name], " " * indent
-    meaning = f"{declared.unit}: {declared.description}" if declared.unit else declared.description
-    comment = f"# {meaning}. {remark[0].upper()}{remark[1:]}" if remark else f"# {meaning}"
+    meaning = (
+        f"{declared.unit}: {declared.description}"
+        if declared.unit
+        else declared.description
+    )
+    comment = (
+        f"# {meaning}. {remark[0].upper()}{remark[1:]}" if remark else f"# {meaning}"
+    )
     rows = list(_value(value))
     line = f"{margin}{name.rpartition('.')[2]}: {rows[0] if len(rows) == 1 else ''}".rstrip()
     if len(rows) == 1 and len(line) + 1 + len(comment) <= WIDTH:
         yield f"{line} {comment}"
         return
     yield from textwrap.wrap(
-        comment, WIDTH, initial_indent=margin, subsequent_indent=f"{margin}# ", break_long_words=False
+        comment,
+        WIDTH,
+        initial_indent=margin,
+        subsequent_indent=f"{margin}# ",
+        break_long_words=False,
     )
     yield line
     yield from (f"{margin}  {row}" for row in rows if len(rows) > 1)
@@ -416,7 +512,11 @@ def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
 
 def _value(value: Any) -> Iterator[str]:
     """Write a value; a long list has three on a line: an axis, a unit, or a row of a rotation."""
-    if not isinstance(value, (list, tuple)) or len(_flow(value)) <= WIDTH // 2 or len(value) % 3:
+    if (
+        not isinstance(value, (list, tuple))
+        or len(_flow(value)) <= WIDTH // 2
+        or len(value) % 3
+    ):
         yield _flow(value)
         return
     for k in range(0, len(value), 3):
@@ -430,4 +530,13 @@ def _flow(value: Any) -> str:
 
 
 def _yaml(value: Any, **options: Any) -> str:
-    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=1 << 30, **options))
+    return str(
+        yaml.dump(
+            value,
+            Dumper=_Dumper,
+            sort_keys=False,
+            allow_unicode=True,
+            width=1 << 30,
+            **options,
+        )
+    )

@@ -32,7 +32,9 @@ class Field:
     choices: tuple[str, ...] = ()  # of a text; empty: any text
     unit: str = ""
     description: str = ""
-    runtime: bool = False  # of a parameter: whether it may be changed while the node runs
+    runtime: bool = (
+        False  # of a parameter: whether it may be changed while the node runs
+    )
     per: str = ""  # of a list: channel or triad, for each of which it has `each` values; empty: it may be of any length
     each: int = 1
     other_lengths: tuple[int, ...] = ()  # lengths that such a list may have besides
@@ -44,21 +46,44 @@ class Field:
 
 
 def setting(
-    default: Any, description: str, unit: str = "", low: float = -math.inf, high: float = math.inf, **about: Any
+    default: Any,
+    description: str,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    **about: Any,
 ) -> Any:
     """Declare a field of a dataclass; parameters as of `Field`."""
-    metadata = {"description": description, "unit": unit, "low": low, "high": high, **about}
+    metadata = {
+        "description": description,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        **about,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_KINDS = {"float | None": "float", "str": "text", "tuple[float, ...]": "numbers", "tuple[str, ...]": "texts"}
+_KINDS = {
+    "float | None": "float",
+    "str": "text",
+    "tuple[float, ...]": "numbers",
+    "tuple[str, ...]": "texts",
+}
 """Kinds by annotations as they are written, where these are other words."""
 
 
 def fields_of(owner: Any) -> dict[str, Field]:
     """Fields of a dataclass that are declared with `setting`, by name."""
-    declared = [(str(field.type), field) for field in dataclasses.fields(owner) if "description" in field.metadata]
-    return {field.name: Field(_KINDS.get(kind, kind), field.default, **field.metadata) for kind, field in declared}
+    declared = [
+        (str(field.type), field)
+        for field in dataclasses.fields(owner)
+        if "description" in field.metadata
+    ]
+    return {
+        field.name: Field(_KINDS.get(kind, kind), field.default, **field.metadata)
+        for kind, field in declared
+    }
 
 
 def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
@@ -69,8 +94,14 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
     """
     if field.kind in ("numbers", "texts"):
         # ROS hands an empty array over as an empty byte array: it has no type of its own.
-        items = list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else [value]
-        one = dataclasses.replace(field, kind="float" if field.kind == "numbers" else "text")
+        items = (
+            list(value)
+            if isinstance(value, (list, tuple)) or hasattr(value, "tolist")
+            else [value]
+        )
+        one = dataclasses.replace(
+            field, kind="float" if field.kind == "numbers" else "text"
+        )
         return tuple(check(one, item, name, error) for item in items)
     if field.kind in ("int", "float"):
         return _check_number(field, value, name, error)
@@ -81,7 +112,12 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
     return value
 
 
-_EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}
+_EXPECTED = {
+    "bool": "true or false",
+    "text": "a text",
+    "float": "a number",
+    "int": "a whole number",
+}
 
 
 def _check_number(field: Field, value: Any, name: str, error: type[FdiError]) -> float:
@@ -91,7 +127,9 @@ def _check_number(field: Field, value: Any, name: str, error: type[FdiError]) ->
     except (TypeError, ValueError, OverflowError):
         raise error(f"{name} is {value!r}, expected {_EXPECTED[field.kind]}") from None
     if not field.low <= number <= field.high:
-        raise error(f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}")
+        raise error(
+            f"{name} is {number:g}{unit}, expected {field.low:g} to {field.high:g}{unit}"
+        )
     if field.kind == "int" and not number.is_integer():
         raise error(f"{name} is {number:g}{unit}, expected a whole number")
     return int(number) if field.kind == "int" else number
@@ -126,7 +164,10 @@ class Input(NamedTuple):
     source: str  # class in `fdi_ros.core.sources` that reads it
 
 
-INPUTS = {"channels": Input("channels", "ChannelsSource"), "imus": Input("imus", "ImuSource")}
+INPUTS = {
+    "channels": Input("channels", "ChannelsSource"),
+    "imus": Input("imus", "ImuSource"),
+}
 """Kinds of input by the value of the parameter ``input``."""
 
 
@@ -134,8 +175,13 @@ INPUTS = {"channels": Input("channels", "ChannelsSource"), "imus": Input("imus",
 class ChannelsConfig:
     """Input as one std_msgs/Float64MultiArray of all channels."""
 
-    topic: str = setting("gyro_channels", "topic of the channels, one std_msgs/Float64MultiArray a sample")
-    names: tuple[str, ...] = setting((), "name of each channel; empty: g1, g2, ... or imu_1.x, ...")
+    topic: str = setting(
+        "gyro_channels",
+        "topic of the channels, one std_msgs/Float64MultiArray a sample",
+    )
+    names: tuple[str, ...] = setting(
+        (), "name of each channel; empty: g1, g2, ... or imu_1.x, ..."
+    )
     units: tuple[str, ...] = _per_channel(
         (),
         "name of the unit (chip, housing) that each channel belongs to and that may fail as a whole; empty: the triads"
@@ -149,15 +195,34 @@ class ImusConfig:
     """Input as one sensor_msgs/Imu topic per triad."""
 
     topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
-    names: tuple[str, ...] = _per_triad((), "name of each triad; empty: imu_1, imu_2, ...")
+    names: tuple[str, ...] = _per_triad(
+        (), "name of each triad; empty: imu_1, imu_2, ..."
+    )
     mounts: tuple[float, ...] = _per_triad(
-        (), "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001, each=9
+        (),
+        "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity",
+        "",
+        -1.001,
+        1.001,
+        each=9,
     )
     delays: tuple[float, ...] = _per_triad(
-        (), "delay of each triad: measured that much before its stamp; empty: none", "s", -0.1, 0.1
+        (),
+        "delay of each triad: measured that much before its stamp; empty: none",
+        "s",
+        -0.1,
+        0.1,
     )
-    max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
-    timeout: float = setting(0.1, "a unit silent for so long is not waited for; its input is STALE", "s", 0.001, 10.0)
+    max_skew: float = setting(
+        0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0
+    )
+    timeout: float = setting(
+        0.1,
+        "a unit silent for so long is not waited for; its input is STALE",
+        "s",
+        0.001,
+        10.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -169,7 +234,9 @@ class GeometryConfig:
         "mounting; auto: axes if given, else the triads' mounts, else two_triad_cone",
         choices=("auto", "two_triad_cone", "dodecahedron", "cone", "axes", "triads"),
     )
-    axes: tuple[float, ...] = setting((), "sensitivity axes, 3 numbers per channel, norm 0.5 to 2", "", -2.0, 2.0)
+    axes: tuple[float, ...] = setting(
+        (), "sensitivity axes, 3 numbers per channel, norm 0.5 to 2", "", -2.0, 2.0
+    )
     cone_channels: int = setting(6, "number of channels of the cone preset", "", 4, 12)
 
 
@@ -178,10 +245,18 @@ class NoiseConfig:
     """Error of a healthy channel; one value, or one per channel."""
 
     noise_std: tuple[float, ...] = _per_channel(
-        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", LEAST_NOISE, 10.0
+        (0.0025,),
+        "standard deviation of the additive error in one sample",
+        "rad/s",
+        LEAST_NOISE,
+        10.0,
     )
-    scale_std: tuple[float, ...] = _per_channel((0.0,), "standard deviation of the scale factor", "", 0.0, 1.0)
-    timing_std: tuple[float, ...] = _per_channel((0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0)
+    scale_std: tuple[float, ...] = _per_channel(
+        (0.0,), "standard deviation of the scale factor", "", 0.0, 1.0
+    )
+    timing_std: tuple[float, ...] = _per_channel(
+        (0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0
+    )
     bound: tuple[float, ...] = _per_channel(
         (),
         "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std",
@@ -189,10 +264,18 @@ class NoiseConfig:
         lengths=(0, 1),
     )
     bias_walk: tuple[float, ...] = _per_channel(
-        (5e-5,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0
+        (5e-5,),
+        "random walk of the bias of a channel in flight",
+        "rad/s/sqrt(s)",
+        0.0,
+        1.0,
     )
     acceleration_window: float = setting(
-        0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0
+        0.01,
+        "span over which the angular acceleration is taken, at least one sample",
+        "s",
+        0.0,
+        1.0,
     )
 
 
@@ -200,18 +283,36 @@ class NoiseConfig:
 class BiasConfig:
     """Bias subtracted before the channels are compared."""
 
-    fixed: tuple[float, ...] = _per_channel((), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, lengths=(0,))
+    fixed: tuple[float, ...] = _per_channel(
+        (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, lengths=(0,)
+    )
     turn_on_std: float = setting(
-        0.02, "standard deviation of a bias from one start to the next, where it is not learned", "rad/s", 0.0, 1.0
+        0.02,
+        "standard deviation of a bias from one start to the next, where it is not learned",
+        "rad/s",
+        0.0,
+        1.0,
     )
     max_drift: float = setting(
-        0.1, "a bias is followed in flight up to this far; beyond, the channel has drifted", "rad/s", 0.0, 10.0
+        0.1,
+        "a bias is followed in flight up to this far; beyond, the channel has drifted",
+        "rad/s",
+        0.0,
+        10.0,
     )
     startup_bias_duration: float = setting(
-        0.0, "average each channel over this long at rest at the start and subtract it; 0: off", "s", 0.0, 600.0
+        0.0,
+        "average each channel over this long at rest at the start and subtract it; 0: off",
+        "s",
+        0.0,
+        600.0,
     )
     max_rest_rate: float = setting(
-        0.1, "not at rest if the mean of a channel over that time exceeds this", "rad/s", 1e-6, 10.0
+        0.1,
+        "not at rest if the mean of a channel over that time exceeds this",
+        "rad/s",
+        1e-6,
+        10.0,
     )
 
 
@@ -221,13 +322,25 @@ class DetectorConfig:
 
     name: str = _live("sequential", "name of the detector")
     false_alarms_per_hour: float = _live(
-        0.001, "alarms on healthy channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6
+        0.001,
+        "alarms on healthy channels per hour of samples; 0: use the probability",
+        "1/h",
+        0.0,
+        3.6e6,
     )
     false_alarm_probability: float = _live(
-        0.0, "alarms on healthy channels per sample; 0: use the rate per hour", "", 0.0, 0.5
+        0.0,
+        "alarms on healthy channels per sample; 0: use the rate per hour",
+        "",
+        0.0,
+        0.5,
     )
     confidence: float = _live(
-        0.999, "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out", "", 0.5, 0.999999
+        0.999,
+        "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out",
+        "",
+        0.5,
+        0.999999,
     )
     tolerance: str = _live(
         "calibrated",
@@ -235,13 +348,35 @@ class DetectorConfig:
         choices=("paper", "calibrated"),
     )
     construction: str = _live("svd", "projector: construction", choices=("svd", "qr"))
-    norm: str = _live("l2", "projector: norm of the error estimate", choices=("l2", "l1"))
-    criterion: str = _live("determinant", "determinant: criterion", choices=("determinant", "condition_number"))
+    norm: str = _live(
+        "l2", "projector: norm of the error estimate", choices=("l2", "l1")
+    )
+    criterion: str = _live(
+        "determinant",
+        "determinant: criterion",
+        choices=("determinant", "condition_number"),
+    )
     max_faults: int = _live(2, "guaranteed: faulty channels at most", "", 0, 2)
-    threshold: float = _live(10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6)
-    shift: float = _live(0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0)
+    threshold: float = _live(
+        10.0,
+        "guaranteed: declared beyond this many bounds of certain error",
+        "",
+        1e-6,
+        1e6,
+    )
+    shift: float = _live(
+        0.5,
+        "cusum: shift of a normalised residual to be found fastest",
+        "sigma",
+        0.05,
+        3.0,
+    )
     run_length: float = _live(
-        0.0, "sequential, cusum: samples to a false alarm; 0: the other rates", "samples", 0.0, 1e15
+        0.0,
+        "sequential, cusum: samples to a false alarm; 0: the other rates",
+        "samples",
+        0.0,
+        1e15,
     )
 
 
@@ -250,19 +385,39 @@ class HealthConfig:
     """Checks of each channel by itself."""
 
     max_rate: tuple[float, ...] = _per_channel(
-        (34.9,), "a value beyond this is out of range (saturated); one, or one per channel", "rad/s", 1e-3, 1e4
+        (34.9,),
+        "a value beyond this is out of range (saturated); one, or one per channel",
+        "rad/s",
+        1e-3,
+        1e4,
     )
     range_recovery_time: float = setting(
-        0.1, "after a value out of range, alarms do not count towards a declaration for this long", "s", 0.0, 10.0
+        0.1,
+        "after a value out of range, alarms do not count towards a declaration for this long",
+        "s",
+        0.0,
+        10.0,
     )
-    non_finite_time: float = setting(0.1, "faulty when nothing but NaN or infinity for this long", "s", 0.0, 60.0)
+    non_finite_time: float = setting(
+        0.1, "faulty when nothing but NaN or infinity for this long", "s", 0.0, 60.0
+    )
     stuck_time: float = setting(
-        0.2, "faulty when the value repeats for this long against motion that the others see; 0: off", "s", 0.0, 60.0
+        0.2,
+        "faulty when the value repeats for this long against motion that the others see; 0: off",
+        "s",
+        0.0,
+        60.0,
     )
     stuck_time_at_rest: float = setting(
-        10.0, "stale when the value repeats for this long without motion; 0: off", "s", 0.0, 86400.0
+        10.0,
+        "stale when the value repeats for this long without motion; 0: off",
+        "s",
+        0.0,
+        86400.0,
     )
-    stale_timeout: float = setting(0.1, "stale when a channel gives nothing for this long", "s", 0.001, 60.0)
+    stale_timeout: float = setting(
+        0.1, "stale when a channel gives nothing for this long", "s", 0.001, 60.0
+    )
 
 
 @dataclass(frozen=True)
@@ -274,10 +429,22 @@ class DecisionConfig:
         "evidence: an alarm declares at once; votes: confirm_alarms of confirm_window; auto: what the detector is for",
         choices=("auto", "evidence", "votes"),
     )
-    confirm_alarms: int = setting(4, "alarms on the same suspects that confirm a fault", "samples", 1, 1000)
-    confirm_window: int = setting(8, "the last samples among which those alarms count", "samples", 1, 1000)
-    latch: bool = setting(True, "a declared fault stays until reset; false: returns after clean_time")
-    clean_time: float = setting(5.0, "time without disagreement after which a channel returns", "s", 0.01, 3600.0)
+    confirm_alarms: int = setting(
+        4, "alarms on the same suspects that confirm a fault", "samples", 1, 1000
+    )
+    confirm_window: int = setting(
+        8, "the last samples among which those alarms count", "samples", 1, 1000
+    )
+    latch: bool = setting(
+        True, "a declared fault stays until reset; false: returns after clean_time"
+    )
+    clean_time: float = setting(
+        5.0,
+        "time without disagreement after which a channel returns",
+        "s",
+        0.01,
+        3600.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -285,20 +452,40 @@ class IntegrityConfig:
     """Protection level of the fused rate."""
 
     risk: float = setting(
-        1e-7, "allowed probability at one sample of an unnoticed error above the level; 0: no level", "", 0.0, 0.1
+        1e-7,
+        "allowed probability at one sample of an unnoticed error above the level; 0: no level",
+        "",
+        0.0,
+        0.1,
     )
     fault_rate: tuple[float, ...] = _per_channel(
         (1e-4,), "faults of a channel; one, or one per channel", "1/h", 0.0, 1.0
     )
-    exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
-    max_rate: float = setting(2.0, "body rate for which the level after one more loss is foretold", "rad/s", 0.0, 100.0)
-    max_acceleration: float = setting(20.0, "angular acceleration of that", "rad/s^2", 0.0, 1e4)
+    exposure: float = setting(
+        1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3
+    )
+    max_rate: float = setting(
+        2.0,
+        "body rate for which the level after one more loss is foretold",
+        "rad/s",
+        0.0,
+        100.0,
+    )
+    max_acceleration: float = setting(
+        20.0, "angular acceleration of that", "rad/s^2", 0.0, 1e4
+    )
 
 
 # Parameters of the nodes that are no settings of the monitor ---------------------------------------------------------
 
 
-def _of_node(default: Any, description: str, low: float = -math.inf, high: float = math.inf, **about: Any) -> Field:
+def _of_node(
+    default: Any,
+    description: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    **about: Any,
+) -> Field:
     """Declare a parameter, whose type is that of its default; the rest as of `Field`."""
     kind = "text" if isinstance(default, str) else type(default).__name__
     return Field(kind, default, low, high, description=description, **about)
@@ -306,14 +493,22 @@ def _of_node(default: Any, description: str, low: float = -math.inf, high: float
 
 ALL_NODES = {
     "executor": _of_node(
-        "auto", "executor; auto: events, or single where it does not work", choices=("auto", "events", "single")
+        "auto",
+        "executor; auto: events, or single where it does not work",
+        choices=("auto", "events", "single"),
     )
 }
 """Parameters that every node has."""
 MONITOR = {
-    "autostart": _of_node(True, "configure and activate at the start; false: wait for a lifecycle manager"),
-    "state_file": _of_node("", "file that keeps biases and declarations over a restart; empty: none"),
-    "state_max_age": _of_node(3600.0, "a kept state older than this is not taken over", unit="s"),
+    "autostart": _of_node(
+        True, "configure and activate at the start; false: wait for a lifecycle manager"
+    ),
+    "state_file": _of_node(
+        "", "file that keeps biases and declarations over a restart; empty: none"
+    ),
+    "state_max_age": _of_node(
+        3600.0, "a kept state older than this is not taken over", unit="s"
+    ),
 }
 INJECTOR = {
     "enabled": _of_node(False, "inject; false: pass all on as it is", runtime=True),
@@ -323,34 +518,66 @@ INJECTOR = {
         " times count from when the injector is switched on",
         runtime=True,
     ),
-    "scenario": _of_node("", "scenario file with faults, besides those in 'faults'", runtime=True),
-    "suffix": _of_node("_faulty", "added to the name of each input topic for that of the output"),
+    "scenario": _of_node(
+        "", "scenario file with faults, besides those in 'faults'", runtime=True
+    ),
+    "suffix": _of_node(
+        "_faulty", "added to the name of each input topic for that of the output"
+    ),
 }
 PLAYER = {
     "bag": _of_node("", "rosbag2 folder, .mcap or .db3 file"),
     "rate": _of_node(1.0, "speed; 2.0: twice as fast as recorded", 1e-3, 1e3),
     "loop": _of_node(False, "begin anew at the end of the recording"),
     "clock": _of_node(True, "publish /clock, the time of recording"),
-    "wait": _of_node(10.0, "wait at most this long for a subscriber to every topic", unit="s"),
+    "wait": _of_node(
+        10.0, "wait at most this long for a subscriber to every topic", unit="s"
+    ),
 }
 MAVLINK = {
     "url": _of_node(
-        "udpin:0.0.0.0:14540", "the link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+        "udpin:0.0.0.0:14540",
+        "the link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD",
     ),
-    "system_id": _of_node(0, "system id of the autopilot; 0: the first that gives gyros, until it is lost", 0, 255),
+    "system_id": _of_node(
+        0,
+        "system id of the autopilot; 0: the first that gives gyros, until it is lost",
+        0,
+        255,
+    ),
     "component_id": _of_node(191, "own component id; 191: onboard computer", 1, 255),
     "messages": _of_node(
         "auto",
         "messages to be used; auto: all are asked for, and those that show the most units are kept",
         choices=("auto", "highres", "raw", "scaled"),
     ),
-    "rate": _of_node(0.0, "rate to ask for, 1 or more; 0: sample_rate", 0.0, 1e3, unit="Hz"),
+    "rate": _of_node(
+        0.0, "rate to ask for, 1 or more; 0: sample_rate", 0.0, 1e3, unit="Hz"
+    ),
     "monitor": _of_node("fdi_node", "name of the monitor whose declarations are sent"),
     "statustext": _of_node(True, "send declarations as STATUSTEXT"),
-    "named_values": _of_node(False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"),
-    "signing_key": _of_node("", "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"),
-    "failover": _of_node("off", "take an IMU that is declared faulty out of use", choices=("off", "ardupilot")),
-    "failover_limit": _of_node(1, "at most so many IMUs are out of use by failover at a time", 1, 3),
-    "failover_file": _of_node("", "holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"),
+    "named_values": _of_node(
+        False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"
+    ),
+    "signing_key": _of_node(
+        "",
+        "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off",
+    ),
+    "failover": _of_node(
+        "off",
+        "take an IMU that is declared faulty out of use",
+        choices=("off", "ardupilot"),
+    ),
+    "failover_limit": _of_node(
+        1, "at most so many IMUs are out of use by failover at a time", 1, 3
+    ),
+    "failover_file": _of_node(
+        "", "holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"
+    ),
 }
-NODES = {"fdi_node": MONITOR, "injector_node": INJECTOR, "player_node": PLAYER, "mavlink_node": MAVLINK}
+NODES = {
+    "fdi_node": MONITOR,
+    "injector_node": INJECTOR,
+    "player_node": PLAYER,
+    "mavlink_node": MAVLINK,
+}

@@ -58,8 +58,12 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
 MAX_BRIDGE = 0.25  # longest span that is interpolated, over the timeout: a unit that lost four messages is hardly there
-MAX_STEPS = 2.5  # and in usual message intervals: one lost message is bridged, two are not
-MAX_STAMP = 1 << 61  # ns: beyond all that an Imu can carry, and no sum or difference of two overflows
+MAX_STEPS = (
+    2.5  # and in usual message intervals: one lost message is bridged, two are not
+)
+MAX_STAMP = (
+    1 << 61
+)  # ns: beyond all that an Imu can carry, and no sum or difference of two overflows
 _UNKNOWN = 1 << 62  # step before the first message of a time base, ns
 _NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
 _IDLE, _FORMING, _RESTARTING = range(3)
@@ -80,12 +84,16 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
     unit.counters.received += 1
     if not aligner.begun:
         aligner.begun, aligner.common = True, stamp
-    goes_on = 0 < stamp - unit.before <= aligner.timeout and not _is_silent(aligner, unit)
+    goes_on = 0 < stamp - unit.before <= aligner.timeout and not _is_silent(
+        aligner, unit
+    )
     unit.leapt |= unit.end > 0 and unit.before - stamp > aligner.timeout
     _pass_time(aligner, j, stamp)
     lag = aligner.common - stamp
     if (unit.end > 0 and stamp <= unit.newest) or _is_outside(aligner, j, stamp):
-        unit.parted |= goes_on and unit.end > 0 and lag > aligner.timeout and not unit.leapt
+        unit.parted |= (
+            goes_on and unit.end > 0 and lag > aligner.timeout and not unit.leapt
+        )
         if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
         return
@@ -183,7 +191,9 @@ def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
     step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
     message = unit.messages[unit.end % RING]
     message.stamp, message.step = stamp, step
-    message.bridges = step <= aligner.bridge and step <= MAX_STEPS * max(unit.usual[0], unit.usual[1])
+    message.bridges = step <= aligner.bridge and step <= MAX_STEPS * max(
+        unit.usual[0], unit.usual[1]
+    )
     for a in range(3):
         message.rate[a] = rate[a]
     unit.usual[0], unit.usual[1] = unit.usual[1], step
@@ -215,7 +225,9 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
         elif is_live(aligner, i):
             here += 1
     # The first stamp of all makes a base: most of the units may have another one from the beginning.
-    return here < there and new if here else there > 1 or stamp - unit.off_first >= timeout
+    return (
+        here < there and new if here else there > 1 or stamp - unit.off_first >= timeout
+    )
 
 
 @compiled
@@ -343,7 +355,9 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
         unit.counters.interpolated += 1
         share = (stamp - before.stamp) / message.step
         for a in range(3):
-            sample.z[3 * j + a] = before.rate[a] + share * (message.rate[a] - before.rate[a])
+            sample.z[3 * j + a] = before.rate[a] + share * (
+                message.rate[a] - before.rate[a]
+            )
     else:
         unit.counters.missing += 1
         received = False
@@ -381,7 +395,12 @@ def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
 
 @compiled
 def align_messages(
-    rows: NDArray[Any], unit: Int, stamp: Int, rate: Array, start: int, samples: NDArray[Any]
+    rows: NDArray[Any],
+    unit: Int,
+    stamp: Int,
+    rate: Array,
+    start: int,
+    samples: NDArray[Any],
 ) -> tuple[int, int]:
     """Enter messages (M,) in order of arrival from number `start` on, as long as there is room for samples (S,).
 
@@ -410,19 +429,38 @@ class Alignment:
     empty: not at all.
     """
 
-    def __init__(self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> None:
-        if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= 10**13 and 1 <= timeout <= 10**13):
-            raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
+    def __init__(
+        self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()
+    ) -> None:
+        if not (
+            1 <= units <= MAX_UNITS
+            and 0 <= max_skew <= 10**13
+            and 1 <= timeout <= 10**13
+        ):
+            raise ConfigError(
+                f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns"
+            )
         if len(delays) not in (0, units):
-            raise ConfigError(f"cannot align {units} triads with {len(delays)} delays, expected one each, or none")
+            raise ConfigError(
+                f"cannot align {units} triads with {len(delays)} delays, expected one each, or none"
+            )
         self.units, self.rows = units, allocate(Aligner)  # the record, (1,)
         row = self.rows[0]
-        row["n"], row["max_skew"], row["timeout"], row["bridge"] = units, max_skew, timeout, int(MAX_BRIDGE * timeout)
+        row["n"], row["max_skew"], row["timeout"], row["bridge"] = (
+            units,
+            max_skew,
+            timeout,
+            int(MAX_BRIDGE * timeout),
+        )
         row["units"]["delay"][: len(delays)] = [round(1e9 * delay) for delay in delays]
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
         """Take one message and return the samples that it completes, mostly none or one, (S,) `Sample`."""
-        return self._aligned(np.array([unit]), np.array([stamp]), np.array([rate], dtype=np.float64).reshape(1, 3))
+        return self._aligned(
+            np.array([unit]),
+            np.array([stamp]),
+            np.array([rate], dtype=np.float64).reshape(1, 3),
+        )
 
     def push_block(self, unit: Int, stamp: Int, rate: Array) -> Block:
         """Take recorded messages, (M,), (M,) ns, (M, 3) rad/s, in order of arrival."""
@@ -431,7 +469,9 @@ class Alignment:
     def flush(self) -> NDArray[Any]:
         """Return what is left at the end of a recording, without waiting for any unit, (S,) `Sample`."""
         self.rows["phase"], self.rows["force"] = _FORMING, _ALL
-        return self._aligned(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+        return self._aligned(
+            np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3))
+        )
 
     def is_live(self, unit: int) -> bool:
         """Whether a unit is waited for."""
@@ -446,7 +486,9 @@ class Alignment:
     def counters(self) -> tuple[dict[str, int], ...]:
         """What was counted, by name, for each unit."""
         rows = self.rows["units"]["counters"][0, : self.units]
-        return tuple({name: int(row[name]) for name in Counters.__annotations__} for row in rows)
+        return tuple(
+            {name: int(row[name]) for name in Counters.__annotations__} for row in rows
+        )
 
     @property
     def lag(self) -> list[int]:
@@ -471,7 +513,11 @@ class Alignment:
 def as_block(samples: NDArray[Any], units: int) -> Block:
     """Block of samples, (S,) `Sample`."""
     received = samples["received"][:, : 3 * units].astype(np.bool_)
-    return Block(samples["stamp"].copy(), samples["z"][:, : 3 * units].copy(), None if received.all() else received)
+    return Block(
+        samples["stamp"].copy(),
+        samples["z"][:, : 3 * units].copy(),
+        None if received.all() else received,
+    )
 
 
 # Samples to one instant -----------------------------------------------------------------------------------------------
@@ -479,7 +525,13 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
 
 @compiled
 def restamp(
-    line: DelayBuffer, settings: PathSettings, late: Units, sample: Sample, received: int, plain: int, out: Array
+    line: DelayBuffer,
+    settings: PathSettings,
+    late: Units,
+    sample: Sample,
+    received: int,
+    plain: int,
+    out: Array,
 ) -> int:
     """Keep a sample, and give the values of the instant that it now stands for, into ``out`` (n,); NaN: none.
 
@@ -487,11 +539,18 @@ def restamp(
     much the stamps of each unit are late, s. Returned are the bits of the channels that have a value, of the instant
     that the largest delay lies before the stamp.
     """
-    n, units, members, stamp = settings.n, settings.units, settings.members, sample.stamp
+    n, units, members, stamp = (
+        settings.n,
+        settings.units,
+        settings.members,
+        sample.stamp,
+    )
     row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:
         step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
-        line.step = step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
+        line.step = (
+            step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
+        )
     row.stamp, row.received, row.plain = stamp, received, plain
     line.count += 1
     top = 0.0
@@ -525,17 +584,32 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
     if k + 1 >= line.count or before.stamp > stamp or span > MAX_STEPS * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
-    first, last = line.rows[(k - 1) % RESTAMP_SAMPLES], line.rows[(k + 2) % RESTAMP_SAMPLES]
+    first, last = (
+        line.rows[(k - 1) % RESTAMP_SAMPLES],
+        line.rows[(k + 2) % RESTAMP_SAMPLES],
+    )
     curved = 0
-    if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * MAX_STEPS * line.step:
+    if (
+        found
+        and k - 1 >= oldest
+        and k + 2 < line.count
+        and last.stamp - first.stamp <= 2.0 * MAX_STEPS * line.step
+    ):
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
         curved = found & first.received & last.received & outer
     # Places of the outer two where the inner ones are 0 and 1.
-    a, b = (first.stamp - before.stamp) / max(span, 1), (last.stamp - before.stamp) / max(span, 1)
+    a, b = (
+        (first.stamp - before.stamp) / max(span, 1),
+        (last.stamp - before.stamp) / max(span, 1),
+    )
     inside = share * (1.0 - share)
     for i in range(n):
         if members >> i & 1:
-            out[i] = before.values[i] + share * (after.values[i] - before.values[i]) if found >> i & 1 else math.nan
+            out[i] = (
+                before.values[i] + share * (after.values[i] - before.values[i])
+                if found >> i & 1
+                else math.nan
+            )
             if curved >> i & 1:
                 # What is left over of the outer two, over s (1 - s), is a line through two values.
                 rise = after.values[i] - before.values[i]

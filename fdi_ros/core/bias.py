@@ -62,7 +62,9 @@ def prepare_limits(bias: Any) -> None:
         bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, 3, k - 3 + PRIOR)
         if k > 3:
             freedom = BIAS_PORTIONS - 1
-            bias["sway_ratio"][k - 1] = f_quantile(FALSE_SWAY, 3 * freedom, (k - 3) * freedom)
+            bias["sway_ratio"][k - 1] = f_quantile(
+                FALSE_SWAY, 3 * freedom, (k - 3) * freedom
+            )
 
 
 @functools.cache
@@ -71,14 +73,18 @@ def f_quantile(probability: float, above: int, below: int) -> float:
     # F = (below / above) / tan^2(angle), with the density cos^(above - 1) sin^(below - 1).
     edges = np.linspace(0.0, np.pi / 2, 8001)
     middle = 0.5 * (edges[1:] + edges[:-1])
-    density = (above - 1) * np.log(np.cos(middle)) + (below - 1) * np.log(np.sin(middle))
+    density = (above - 1) * np.log(np.cos(middle)) + (below - 1) * np.log(
+        np.sin(middle)
+    )
     share = np.concatenate([[0.0], np.cumsum(np.exp(density - density.max()))])
     angle = float(np.interp(probability * share[-1], share, edges))
     return below / above / math.tan(angle) ** 2
 
 
 @compiled
-def update_bias(core: Core, subsets: NDArray[Any], stamp: int, good: int, lost: int) -> bool:
+def update_bias(
+    core: Core, subsets: NDArray[Any], stamp: int, good: int, lost: int
+) -> bool:
     """Take one sample into the average; return whether it was used: False if with it the bias is learned.
 
     ``good``: bits of the channels that are finite and in range. ``lost``: of those declared faulty or taken out, which
@@ -92,11 +98,15 @@ def update_bias(core: Core, subsets: NDArray[Any], stamp: int, good: int, lost: 
     if not average.started:
         begin(average, n, stamp)
     average.rows += 1
-    portion = average.portions[(stamp - average.start) * BIAS_PORTIONS // average.duration]
+    portion = average.portions[
+        (stamp - average.start) * BIAS_PORTIONS // average.duration
+    ]
     for i in range(n):
         if good >> i & 1:
             average.count[i] += 1
-            add_value(average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
+            add_value(
+                average.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE)
+            )
     return True
 
 
@@ -124,7 +134,9 @@ def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None
     if group.count == GROUP:
         group.count = 0
         middle = (group.total - group.low - group.high) / (GROUP - 2)
-        squares = (group.squares - group.low * group.low - group.high * group.high) / (GROUP - 2)
+        squares = (group.squares - group.low * group.low - group.high * group.high) / (
+            GROUP - 2
+        )
         portion.count[i] += 1
         portion.total[i] += middle
         portion.squares[i] += max(squares - middle * middle, 0.0)
@@ -167,7 +179,9 @@ def average_channel(average: Bias, i: int) -> bool:
     for b in range(BIAS_PORTIONS):
         portion = average.portions[b]
         if portion.count[i] > 0:
-            average.ordered[filled] = portion.squares[i] / portion.count[i] / MIDDLE_SQUARE
+            average.ordered[filled] = (
+                portion.squares[i] / portion.count[i] / MIDDLE_SQUARE
+            )
             filled += 1
     average.scatter[i] = math.sqrt(middle_mean(average.ordered, filled) + between)
     return True
@@ -189,9 +203,16 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
     heard = at_rest = resting = restless = 0
     for i in range(n):
         enough = average_channel(average, i)
-        if enough and average.count[i] * LEAST_GIVEN > average.rows and not lost >> i & 1:
+        if (
+            enough
+            and average.count[i] * LEAST_GIVEN > average.rows
+            and not lost >> i & 1
+        ):
             heard |= 1 << i
-            if abs(average.average[i]) <= average.max_rate and average.scatter[i] <= average.max_std[i]:
+            if (
+                abs(average.average[i]) <= average.max_rate
+                and average.scatter[i] <= average.max_std[i]
+            ):
                 at_rest |= 1 << i
                 resting += 1
             else:
@@ -231,12 +252,18 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
     turn, explained, other = split(core, mask)
     size = (PRIOR * USUAL * USUAL + other) / (k - 3 + PRIOR)
     average.common_rate = turn
-    average.max_common_rate = turn * math.sqrt(average.turn_ratio[k - 1] * size * 3 / max(explained, 1e-30))
+    average.max_common_rate = turn * math.sqrt(
+        average.turn_ratio[k - 1] * size * 3 / max(explained, 1e-30)
+    )
     explained, other, count = split_portions(core, mask)
     if k > 3 and count > 1:
         average.sway = math.sqrt(explained / (3 * (count - 1)))
-        average.max_sway = math.sqrt(average.sway_ratio[k - 1] * other / ((k - 3) * (count - 1)) + noise)
-    return average.common_rate > average.max_common_rate or average.sway > average.max_sway
+        average.max_sway = math.sqrt(
+            average.sway_ratio[k - 1] * other / ((k - 3) * (count - 1)) + noise
+        )
+    return (
+        average.common_rate > average.max_common_rate or average.sway > average.max_sway
+    )
 
 
 @compiled
@@ -250,7 +277,11 @@ def split(core: Core, mask: int) -> tuple[float, float, float]:
             along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
             explained += along * along
             other += (part[i] - along) * (part[i] - along)
-    return math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]), explained, other
+    return (
+        math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]),
+        explained,
+        other,
+    )
 
 
 @compiled
@@ -271,7 +302,9 @@ def split_portions(core: Core, mask: int) -> tuple[float, float, int]:
         if is_filled(portion, n, mask):
             for i in range(n):
                 if mask >> i & 1:
-                    average.part[i] = portion.total[i] / portion.count[i] - average.middle[i] / count
+                    average.part[i] = (
+                        portion.total[i] / portion.count[i] - average.middle[i] / count
+                    )
             _, one, two = split(core, mask)
             explained += one
             other += two

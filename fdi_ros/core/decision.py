@@ -26,7 +26,15 @@ from fdi_ros.core.health import (
     intermittent_channels,
     update_stuck,
 )
-from fdi_ros.core.records import Core, Current, Decision, Evidence, PathSettings, SampleInput, Subset
+from fdi_ros.core.records import (
+    Core,
+    Current,
+    Decision,
+    Evidence,
+    PathSettings,
+    SampleInput,
+    Subset,
+)
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.model.samples import MAX_RATE
 
@@ -36,7 +44,12 @@ SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit: by 
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
-    settings, health, now, evidence = core.settings, core.health, core.now, core.now.evidence
+    settings, health, now, evidence = (
+        core.settings,
+        core.health,
+        core.now,
+        core.now.evidence,
+    )
     evidence.judged = not math.isnan(now.verdict.statistic)
     evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
     if settings.estimates:
@@ -47,17 +60,24 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     for i in range(settings.n):
         if health.condition[i] == NON_FINITE_LASTING:
             evidence.broken |= 1 << i
-        if settings.stuck_time and evidence.stamp - health.run_stamp[i] >= settings.stuck_time:
+        if (
+            settings.stuck_time
+            and evidence.stamp - health.run_stamp[i] >= settings.stuck_time
+        ):
             evidence.repeats |= 1 << i
         if not now.verdict.suspects[i]:
             clear |= 1 << i
         evidence.error[i] = now.corrected[i] - now.along[i]
         if may_return and now.plain >> i & 1:
             # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
-            variance = 2 * variance_of(settings.sensors, i, now.along[i], core.acceleration.value)
+            variance = 2 * variance_of(
+                settings.sensors, i, now.along[i], core.acceleration.value
+            )
             if abs(evidence.error[i]) <= settings.return_limit * math.sqrt(variance):
                 evidence.agrees |= 1 << i
-    evidence.intermittent = intermittent_channels(health.gone, health.leaves, settings.n, INTERMITTENT_SHARE)
+    evidence.intermittent = intermittent_channels(
+        health.gone, health.leaves, settings.n, INTERMITTENT_SHARE
+    )
     clear &= now.usable
     return update_stuck(core, subsets[clear], clear, evidence.stamp)
 
@@ -65,7 +85,12 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
 @compiled
 def fill_suspects(core: Core, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
-    settings, now, evidence, verdict = core.settings, core.now, core.now.evidence, core.now.verdict
+    settings, now, evidence, verdict = (
+        core.settings,
+        core.now,
+        core.now.evidence,
+        core.now.verdict,
+    )
     n, evidence.certain, evidence.undecided = settings.n, 0, 0
     evidence.outliers = bits_of(verdict.outliers, n) | now.repeated | evidence.flickers
     if settings.by_evidence and verdict.alarm and not evidence.held:
@@ -83,7 +108,10 @@ def fill_suspects(core: Core, stuck: int) -> None:
     for i in range(n):
         if verdict.error[i] != 0:
             core.last_error[i] = verdict.error[i]
-    evidence.suspected, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
+    evidence.suspected, evidence.isolated = (
+        bits_of(verdict.suspects, n),
+        verdict.isolated,
+    )
     if settings.by_evidence:
         evidence.suspected, evidence.isolated = stuck, stuck & (stuck - 1) == 0
 
@@ -128,7 +156,11 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     suspected = evidence.suspected & ~decision.faulty
     counted = 0 if evidence.held else suspected
     doubtful = suspected | evidence.outliers & ~decision.faulty
-    push(decision, settings, (doubtful, counted, counted if evidence.isolated else 0, evidence.checked))
+    push(
+        decision,
+        settings,
+        (doubtful, counted, counted if evidence.isolated else 0, evidence.checked),
+    )
     decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
     # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
@@ -141,14 +173,21 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
         decision.voted |= undecided
         if evidence.stamp - decision.last_doubt >= settings.clean_time:
             decision.voted = 0
-        wanted = (decision.voted | evidence.undecided) if evidence.judged else decision.ambiguous
+        wanted = (
+            (decision.voted | evidence.undecided)
+            if evidence.judged
+            else decision.ambiguous
+        )
     else:
         wanted = decision.ambiguous | undecided
     follow_declared(settings, decision, evidence)
     returns, clears = 0, False
     if not settings.latch:
         returns = update_returns(settings, decision, evidence.stamp)
-        clears = decision.ambiguous != 0 and evidence.stamp - decision.last_doubt >= settings.clean_time
+        clears = (
+            decision.ambiguous != 0
+            and evidence.stamp - decision.last_doubt >= settings.clean_time
+        )
     # A set of which a member is now known to be faulty is explained by it.
     if clears or decision.ambiguous & (faulty | broken):
         decision.voted = wanted = 0
@@ -181,7 +220,9 @@ def reason_for(evidence: Evidence, i: int) -> int:
 
 
 @compiled
-def push(decision: Decision, settings: PathSettings, sets: tuple[int, int, int, int]) -> None:
+def push(
+    decision: Decision, settings: PathSettings, sets: tuple[int, int, int, int]
+) -> None:
     """Move the window on by one sample with these sets, by kind."""
     decision.at = (decision.at + 1) % settings.window
     if sets[COUNTED]:
@@ -229,7 +270,9 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
 
 
 @compiled
-def follow_declared(settings: PathSettings, decision: Decision, evidence: Evidence) -> None:
+def follow_declared(
+    settings: PathSettings, decision: Decision, evidence: Evidence
+) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
     for i in range(settings.n):
         # That of one that is not declared counts from its declaration, not from that of another.
@@ -248,13 +291,25 @@ def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> in
     """Bits of the declared channels that have agreed for the clean time, and in the mean of one or two of these."""
     returns = 0
     for i in range(settings.n):
-        if decision.faulty >> i & 1 and stamp - decision.last_bad[i] >= settings.clean_time:
+        if (
+            decision.faulty >> i & 1
+            and stamp - decision.last_bad[i] >= settings.clean_time
+        ):
             total = abs(decision.error_sum[i] + decision.earlier_sum[i])
-            if total <= settings.mean_limit[i] * (decision.error_count[i] + decision.earlier_count[i]):
+            if total <= settings.mean_limit[i] * (
+                decision.error_count[i] + decision.earlier_count[i]
+            ):
                 returns |= 1 << i
             elif stamp - decision.renewed[i] >= settings.clean_time:
-                decision.earlier_sum[i], decision.earlier_count[i] = decision.error_sum[i], decision.error_count[i]
-                decision.error_sum[i], decision.error_count[i], decision.renewed[i] = 0.0, 0, stamp
+                decision.earlier_sum[i], decision.earlier_count[i] = (
+                    decision.error_sum[i],
+                    decision.error_count[i],
+                )
+                decision.error_sum[i], decision.error_count[i], decision.renewed[i] = (
+                    0.0,
+                    0,
+                    stamp,
+                )
     return returns
 
 
@@ -295,7 +350,9 @@ class ChannelState(IntEnum):
 
     OK = 0  # delivers, is checked against the others and agrees
     SUSPECT = 1  # left out of the fused rate for now: under suspicion, not confirmed
-    AMBIGUOUS = 2  # one of a named set of channels is faulty; the evidence cannot tell which
+    AMBIGUOUS = (
+        2  # one of a named set of channels is faulty; the evidence cannot tell which
+    )
     FAULTY = 3  # declared faulty and left out
     STALE = 4  # gives nothing, or nothing new
     UNCHECKED = 5  # delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run
@@ -326,13 +383,32 @@ class Reason(str, Enum):
 REASONS = tuple(Reason)
 
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED, EXCLUDED = map(int, ChannelState)
-_NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_FEW = range(8)
-_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _COPY = range(8, len(REASONS))
+_NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_FEW = (
+    range(8)
+)
+_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _COPY = (
+    range(8, len(REASONS))
+)
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
 """State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
-_OF_CONDITION = (_DISAGREES, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _FROZEN, _NO_DATA, _NON_FINITE)
+_OF_CONDITION = (
+    _DISAGREES,
+    _DISAGREES,
+    _NON_FINITE,
+    _OUT_OF_RANGE,
+    _FROZEN,
+    _NO_DATA,
+    _NON_FINITE,
+)
 """Why, by `Condition`."""
-_OF_DECISION = (_NONE, _DISAGREES, _STUCK, _NON_FINITE, _DRIFTED, _INTERMITTENT)  # by why a channel was declared
+_OF_DECISION = (
+    _NONE,
+    _DISAGREES,
+    _STUCK,
+    _NON_FINITE,
+    _DRIFTED,
+    _INTERMITTENT,
+)  # by why a channel was declared
 
 
 @compiled
@@ -409,7 +485,14 @@ def why_unchecked(core: Core, subset: Subset, i: int) -> int:
 
 
 @compiled
-def write_events(core: Core, subset: Subset, row: int, learning: bool, events: NDArray[Any], count: int) -> int:
+def write_events(
+    core: Core,
+    subset: Subset,
+    row: int,
+    learning: bool,
+    events: NDArray[Any],
+    count: int,
+) -> int:
     """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
     last = core.last
     core.group = core.decision.ambiguous
@@ -422,12 +505,21 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
                 error = core.now.verdict.error[i]
                 if error == 0:
                     # Of a drift that was declared before a restart the bias is known, too.
-                    error = core.sample.estimate.bias[i] if reason == _DRIFTED else last.residual[i]
+                    error = (
+                        core.sample.estimate.bias[i]
+                        if reason == _DRIFTED
+                        else last.residual[i]
+                    )
                 if not math.isfinite(error):
                     # It gives nothing in this very sample.
                     error = 0.0
             event = events[count]
-            event.row, event.stamp, event.channel, event.error = row, last.stamp, i, error
+            event.row, event.stamp, event.channel, event.error = (
+                row,
+                last.stamp,
+                i,
+                error,
+            )
             event.before, event.after, event.reason = core.state[i], after, reason
             event.group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
             core.state[i], core.since[i], core.error[i] = after, last.stamp, error

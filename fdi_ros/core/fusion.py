@@ -24,7 +24,17 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.health import is_at_rest
-from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Parity, PathSettings, Subset
+from fdi_ros.core.records import (
+    Acceleration,
+    Core,
+    Current,
+    Estimate,
+    Health,
+    OutputRow,
+    Parity,
+    PathSettings,
+    Subset,
+)
 from fdi_ros.core.subsets import (
     apply_gain,
     covariance_of,
@@ -72,7 +82,12 @@ def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
 @compiled
 def cover(core: Core, out: int, chi: float) -> None:
     """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not."""
-    n, now, parity, prior = core.settings.n, core.now, core.now.parity, core.settings.prior
+    n, now, parity, prior = (
+        core.settings.n,
+        core.now,
+        core.now.parity,
+        core.settings.prior,
+    )
     mask, count, free = now.fused | out, 0, -1.0
     fill_parity(parity, core.settings.sensors, mask, now.uncertainty)
     for i in range(n):
@@ -83,23 +98,38 @@ def cover(core: Core, out: int, chi: float) -> None:
             if mask >> j & 1:
                 now.rival[i] += parity.information[i, j] * now.corrected[j]
     # Each channel of a set takes a degree of freedom out of chi.
-    base = 0.5 * (chi - chi_of(parity, n, mask, now.corrected)) + free - math.log(core.settings.risk / (count * count))
+    base = (
+        0.5 * (chi - chi_of(parity, n, mask, now.corrected))
+        + free
+        - math.log(core.settings.risk / (count * count))
+    )
     for i in range(n):
         a, u = parity.information[i, i], now.rival[i]
         # Else no residual shows the channel; or two look alike, and one is enough.
         if now.fused >> i & 1 and a * now.uncertainty[i] > APART:
-            cover_one(core, i, i, (u / a, 0.0), (1.0 / a, 0.0, 0.0), base + 0.5 * u * u / a)
+            cover_one(
+                core, i, i, (u / a, 0.0), (1.0 / a, 0.0, 0.0), base + 0.5 * u * u / a
+            )
         for j in range(i):
             b, c, v = parity.information[j, j], parity.information[i, j], now.rival[j]
             if now.fused >> i & now.fused >> j & 1 and a * b - c * c > APART * a * b:
                 det = a * b - c * c
                 f = (b * u - c * v) / det, (a * v - c * u) / det
-                odds = base + 0.5 * (f[0] * u + f[1] * v) + math.log(prior[i] + prior[j])
+                odds = (
+                    base + 0.5 * (f[0] * u + f[1] * v) + math.log(prior[i] + prior[j])
+                )
                 cover_one(core, i, j, f, (b / det, a / det, -c / det), odds)
 
 
 @compiled
-def cover_one(core: Core, i: int, j: int, f: tuple[float, float], p: tuple[float, float, float], odds: float) -> None:
+def cover_one(
+    core: Core,
+    i: int,
+    j: int,
+    f: tuple[float, float],
+    p: tuple[float, float, float],
+    odds: float,
+) -> None:
     """Raise the level where channels i, j have errors f of covariance p (ii, jj, ij), of log odds over their risk."""
     now, last = core.now, core.last
     for a in range(3 if odds > 0.0 else 0):
@@ -108,7 +138,9 @@ def cover_one(core: Core, i: int, j: int, f: tuple[float, float], p: tuple[float
             if now.parity.gain[a, k] != 0.0:
                 rate += now.parity.gain[a, k] * now.corrected[k]
         off = abs(last.rate[a] - rate + g * f[0] + h * f[1])
-        variance = now.parity.inverse[a, a] + g * g * p[0] + h * h * p[1] + 2.0 * g * h * p[2]
+        variance = (
+            now.parity.inverse[a, a] + g * g * p[0] + h * h * p[1] + 2.0 * g * h * p[2]
+        )
         last.level[a] = max(last.level[a], off + math.sqrt(2.0 * odds * variance))
 
 
@@ -132,13 +164,17 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     update_residuals(settings, now, last)
     update_lag(core)
     if last.valid:
-        covariance_of(now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance)
+        covariance_of(
+            now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance
+        )
         if doubtful & now.usable:
             add_doubt(core, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
         # Whichever unit is in time, the others are early or late: the instant lies anywhere between.
         for a in range(3):
-            now.others_rate[a] = core.sample.estimate.spread * core.acceleration.value[a]
+            now.others_rate[a] = (
+                core.sample.estimate.spread * core.acceleration.value[a]
+            )
         add_square(last.covariance, now.others_rate, 1.0 / 12.0)
         update_common_error(core)
     else:
@@ -152,11 +188,19 @@ def update_lag(core: Core) -> None:
     true = core.now.evidence.stamp - round(1e9 * core.sample.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
-        core.now.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]
+        core.now.lagging[a] = (
+            1e-9 * (core.last.instant - true) * core.acceleration.value[a]
+        )
 
 
 @compiled
-def choose_fused(settings: PathSettings, health: Health, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
+def choose_fused(
+    settings: PathSettings,
+    health: Health,
+    now: Current,
+    subsets: NDArray[Any],
+    doubtful: int,
+) -> int:
     """Channels that are to be fused."""
     usable = now.usable
     # Methods that judge each sample by itself need no caution.
@@ -193,7 +237,11 @@ def update_residuals(settings: PathSettings, now: Current, last: OutputRow) -> N
 
 @compiled
 def update_gain(
-    settings: PathSettings, estimate: Estimate, acceleration: Acceleration, now: Current, subset: Subset
+    settings: PathSettings,
+    estimate: Estimate,
+    acceleration: Acceleration,
+    now: Current,
+    subset: Subset,
 ) -> None:
     """Variance of every channel, and the gain of the channels fused."""
     n, sensors = settings.n, settings.sensors
@@ -227,7 +275,10 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     for i in range(core.settings.n):
         if doubtful & core.now.fused & (1 << i):
             doubt = core.last_error[i]
-            if doubt == 0.0 and subsets[core.now.fused].sensitivity[i] > MIN_SENSITIVITY:
+            if (
+                doubt == 0.0
+                and subsets[core.now.fused].sensitivity[i] > MIN_SENSITIVITY
+            ):
                 # No verdict has estimated it: its difference from the others now.
                 doubt = core.now.tested[i] / subsets[core.now.fused].sensitivity[i]
             for a in range(3):
@@ -236,7 +287,13 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 
 @compiled
-def add_units(settings: PathSettings, now: Current, last: OutputRow, subsets: NDArray[Any], doubtful: int) -> None:
+def add_units(
+    settings: PathSettings,
+    now: Current,
+    last: OutputRow,
+    subsets: NDArray[Any],
+    doubtful: int,
+) -> None:
     """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
     doubted = whole = 0
     for u in range(settings.units):
@@ -272,7 +329,11 @@ def update_common_error(core: Core) -> None:
     """
     if not core.settings.estimates:
         return
-    n, axes, taken = core.settings.n, core.settings.sensors.axes, core.now.parity.weighted
+    n, axes, taken = (
+        core.settings.n,
+        core.settings.sensors.axes,
+        core.now.parity.weighted,
+    )
     for i in range(n):
         for a in range(3):
             total = 0.0
@@ -290,9 +351,16 @@ def update_common_error(core: Core) -> None:
     b = core.now.common
     for i in range(n):
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
-        square = x * x * b[0] + y * y * b[3] + z * z * b[5] + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
+        square = (
+            x * x * b[0]
+            + y * y * b[3]
+            + z * z * b[5]
+            + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
+        )
         mixed = x * taken[i, 0] + y * taken[i, 1] + z * taken[i, 2]
-        core.remaining[i] = math.sqrt(max(core.sample.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0))
+        core.remaining[i] = math.sqrt(
+            max(core.sample.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0)
+        )
 
 
 @compiled
@@ -309,12 +377,16 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
     n, sensors = core.settings.n, core.settings.sensors
     fill_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
     fill_level(subset, n, now.fused, now.growth, last.level)
-    if not passes or not passes_test(subset, sensors.axes, sensors.noise_std, n, now.fused, now.growth, now.tested):
+    if not passes or not passes_test(
+        subset, sensors.axes, sensors.noise_std, n, now.fused, now.growth, now.tested
+    ):
         for a in range(3):
             last.level[a] = math.inf
     elif core.settings.estimates:
         for a in range(3):
-            common = math.sqrt(max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
+            common = math.sqrt(
+                max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0)
+            )
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:

@@ -36,7 +36,9 @@ from fdi_ros.core.subsets import fill_rate
 from fdi_ros.model.geometry import MIN_SENSITIVITY, ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
-FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(int, Condition)
+FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(
+    int, Condition
+)
 NOT_BAD = -(1 << 62)  # instead of the stamp at which a run of non-finite values began
 
 
@@ -52,8 +54,14 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
     health.begun += 1
     follow_presence(health, n, stamp, received)
     for i in range(n):
-        condition = receive(settings, health, i, stamp, sample.z[i]) if received[i] else MISSING
-        if condition == FINE and settings.frozen_time and stamp - health.run_stamp[i] >= settings.frozen_time:
+        condition = (
+            receive(settings, health, i, stamp, sample.z[i]) if received[i] else MISSING
+        )
+        if (
+            condition == FINE
+            and settings.frozen_time
+            and stamp - health.run_stamp[i] >= settings.frozen_time
+        ):
             condition = FROZEN
         if stamp - health.received_stamp[i] > settings.stale_time:
             condition = SILENT
@@ -64,7 +72,9 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
 
 
 @compiled
-def receive(settings: PathSettings, health: Health, i: int, stamp: int, z: float) -> int:
+def receive(
+    settings: PathSettings, health: Health, i: int, stamp: int, z: float
+) -> int:
     """Remember a value that was received of channel i; return what is wrong with it by itself."""
     # Across a hole it is unknown what the value was: a run begins anew.
     step = stamp - health.received_stamp[i]
@@ -81,7 +91,11 @@ def receive(settings: PathSettings, health: Health, i: int, stamp: int, z: float
         return OUT_OF_RANGE if abs(z) >= settings.max_rate[i] else FINE
     if health.bad_stamp[i] == NOT_BAD or hole:
         health.bad_stamp[i] = stamp
-    return NON_FINITE_LASTING if stamp - health.bad_stamp[i] >= settings.non_finite_time else NON_FINITE
+    return (
+        NON_FINITE_LASTING
+        if stamp - health.bad_stamp[i] >= settings.non_finite_time
+        else NON_FINITE
+    )
 
 
 # Values that come and go ----------------------------------------------------------------------------------------------
@@ -89,7 +103,9 @@ def receive(settings: PathSettings, health: Health, i: int, stamp: int, z: float
 SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0
 """ns and values over which the share that is not finite is averaged, the longer: 50 tell 15 % from 25 %."""
 DOUBTED_SHARE = 0.15  # from which a channel is left out of the rate: drivers drop up to 10 % of single values
-INTERMITTENT_SHARE = 0.25  # from which it is faulty: 2.5 standard deviations of the average above that
+INTERMITTENT_SHARE = (
+    0.25  # from which it is faulty: 2.5 standard deviations of the average above that
+)
 RETURNING = 3  # a value that is not finite, and the next two, are left out of the rate: they are no better
 LEAST_LEAVES = 4.0  # times that a channel went away lately where it comes and goes: a hole or two are none of it
 
@@ -110,14 +126,18 @@ COMPLETE_SHARE, COMPLETE_TIME = 0.02, 4 * SHARE_TIME
 
 
 @compiled
-def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uint8]) -> None:
+def follow_presence(
+    health: Health, n: int, stamp: int, received: NDArray[np.uint8]
+) -> None:
     """Follow the share of samples that nothing was received for: no fault, as a link loses messages."""
     adaptation_gain = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     for i in range(n):
         if health.begun == 1:
             # Nothing is known of it.
             health.absent[i], health.complete_stamp[i] = 1.0, stamp
-        health.absent[i] += adaptation_gain * ((0.0 if received[i] else 1.0) - health.absent[i])
+        health.absent[i] += adaptation_gain * (
+            (0.0 if received[i] else 1.0) - health.absent[i]
+        )
         health.lapses[i] *= 1.0 - adaptation_gain
         if not received[i] and health.received_stamp[i] == health.stamp:
             health.lapses[i] += 1.0
@@ -188,8 +208,13 @@ def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
         elif now.evidence.repeats & now.usable & (1 << i):
             share = subset.sensitivity[i]
             noise = core.settings.sensors.noise_std[i]
-            spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
-            moved = abs(now.prediction[i] - core.reference[i]) > LEAST_MOTION * spread + step
+            spread = math.sqrt(
+                (noise * noise + step * step / 12.0) / (share if share > 0 else 0.5)
+            )
+            moved = (
+                abs(now.prediction[i] - core.reference[i])
+                > LEAST_MOTION * spread + step
+            )
             isolated = now.verdict.suspects[i] and now.verdict.isolated
             if moved and (isolated or not now.verdict.alarm):
                 stuck |= 1 << i
@@ -215,8 +240,12 @@ def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
     """Leave channels whose values seem to come and go out of the sample, where enough are left."""
     now, health, n = core.now, core.health, core.settings.n
     # And those that were complete, and now lack samples again and again.
-    sparse = health.complete & intermittent_channels(health.absent, health.lapses, n, INTERMITTENT_SHARE)
-    now.evidence.flickers = sparse | intermittent_channels(health.gone, health.leaves, n, DOUBTED_SHARE)
+    sparse = health.complete & intermittent_channels(
+        health.absent, health.lapses, n, INTERMITTENT_SHARE
+    )
+    now.evidence.flickers = sparse | intermittent_channels(
+        health.gone, health.leaves, n, DOUBTED_SHARE
+    )
     for i in range(n):
         rest = now.usable & ~(now.evidence.flickers & 1 << i)
         if subsets[rest].spare:
@@ -237,7 +266,10 @@ def update_repeated(core: Core) -> int:
                 for a in range(3):
                     change += h[a] * (core.now.rate[a] - core.unit_rate[u, a])
                 fresh = fresh or core.health.run_stamp[i] == core.now.evidence.stamp
-                moved = moved or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+                moved = (
+                    moved
+                    or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+                )
         if fresh:
             for a in range(3):
                 core.unit_rate[u, a] = core.now.rate[a]
@@ -249,13 +281,19 @@ def update_repeated(core: Core) -> int:
 @compiled
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
     """Whether the rate of the channels in use is that of a vehicle at rest."""
-    square = now.rate[0] * now.rate[0] + now.rate[1] * now.rate[1] + now.rate[2] * now.rate[2]
+    square = (
+        now.rate[0] * now.rate[0]
+        + now.rate[1] * now.rate[1]
+        + now.rate[2] * now.rate[2]
+    )
     least = RESTS * settings.largest_noise + AT_REST
     return square < least * least
 
 
 @compiled
-def all_repeat(settings: PathSettings, health: Health, now: Current, stamp: int) -> bool:
+def all_repeat(
+    settings: PathSettings, health: Health, now: Current, stamp: int
+) -> bool:
     """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
@@ -288,14 +326,20 @@ LEAST_NOISE = 0.02  # of what the noise makes: smaller changes are smooth, and w
 
 
 @compiled
-def update_copies(copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int) -> None:
+def update_copies(
+    copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int
+) -> None:
     """Compare all pairs of units, once in `PERIOD`; ``copies.found`` is set where one is a copy and was none before."""
     if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
         return
     copies.stamp = stamp
     for a in range(settings.units):
         for b in range(a + 1, settings.units):
-            if copies.original[a] or copies.original[b] or not is_copy(copies, settings, line, a, b):
+            if (
+                copies.original[a]
+                or copies.original[b]
+                or not is_copy(copies, settings, line, a, b)
+            ):
                 continue
             copies.hits[a, b] += 1
             if copies.hits[a, b] >= HITS:
@@ -305,9 +349,14 @@ def update_copies(copies: Copies, settings: PathSettings, line: DelayBuffer, sta
 
 
 @compiled
-def is_copy(copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int) -> bool:
+def is_copy(
+    copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int
+) -> bool:
     """Whether one of two units gives what the other gives, or gave some samples ago."""
-    first, second = first_of_three(settings.members[a]), first_of_three(settings.members[b])
+    first, second = (
+        first_of_three(settings.members[a]),
+        first_of_three(settings.members[b]),
+    )
     if first < 0 or second < 0:
         return False
     for lag in range(min(MAX_LAG, min(line.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
@@ -315,7 +364,9 @@ def is_copy(copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b
             source, target = (second, first) if turned else (first, second)
             agrees = True
             for wanted in (FEW, ROWS):
-                agrees = agrees and sum_changes(copies, line, source, target, lag, wanted)
+                agrees = agrees and sum_changes(
+                    copies, line, source, target, lag, wanted
+                )
                 agrees = agrees and is_explained(copies, settings, target, wanted)
             if agrees:
                 return True
@@ -332,7 +383,9 @@ def first_of_three(members: int) -> int:
 
 
 @compiled
-def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int) -> bool:
+def sum_changes(
+    copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
+) -> bool:
     """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
 
     Of the newest samples, until so many as wanted have changed. ``source``, ``target``: first channel of the unit that
@@ -345,7 +398,10 @@ def sum_changes(copies: Copies, line: DelayBuffer, source: int, target: int, lag
             products[i, j] = 0.0
     newest, oldest = line.count - 1, max(line.count - RESTAMP_SAMPLES, 0)
     for k in range(newest, max(newest - 2 * wanted, oldest + lag + 1), -1):
-        if not (fill_change(line, source, k - lag, change, 0) and fill_change(line, target, k, change, 3)):
+        if not (
+            fill_change(line, source, k - lag, change, 0)
+            and fill_change(line, target, k, change, 3)
+        ):
             continue
         count += change[3] != 0.0 or change[4] != 0.0 or change[5] != 0.0
         for i in range(6):
@@ -362,12 +418,18 @@ def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -
     new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
     old = line.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
-        out[place + i] = new.values[first + i] - 2.0 * middle.values[first + i] + old.values[first + i]
+        out[place + i] = (
+            new.values[first + i]
+            - 2.0 * middle.values[first + i]
+            + old.values[first + i]
+        )
     return new.plain & middle.plain & old.plain & 7 << first == 7 << first
 
 
 @compiled
-def is_explained(copies: Copies, settings: PathSettings, target: int, count: int) -> bool:
+def is_explained(
+    copies: Copies, settings: PathSettings, target: int, count: int
+) -> bool:
     """Whether a linear map of the changes of one unit gives those of the other, ``count`` of them, and these are noise.
 
     The products of both are reduced by those of the first, one channel after the other: what is left is unexplained.
@@ -395,7 +457,11 @@ def is_explained(copies: Copies, settings: PathSettings, target: int, count: int
 def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
     """Find pairs of series (N, 3) of one rate, rad/s, of which one is a copy of the other: their numbers."""
     found = []
-    line, copies, settings = allocate(DelayBuffer), allocate(Copies), allocate(PathSettings)
+    line, copies, settings = (
+        allocate(DelayBuffer),
+        allocate(Copies),
+        allocate(PathSettings),
+    )
     settings["members"][0, :2] = 0b111, 0b111000
     rows = line["rows"][0]
     for a, b in itertools.combinations(range(len(series)), 2):

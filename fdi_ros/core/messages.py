@@ -32,8 +32,12 @@ IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
-LAST_STAMP = (_SIGN - 1) * _NS  # latest time that the header of a message can hold, to the second, ns
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # elements of a symmetric (3, 3) matrix by rows, in its upper triangle
+LAST_STAMP = (
+    _SIGN - 1
+) * _NS  # latest time that the header of a message can hold, to the second, ns
+_FULL = np.array(
+    [0, 1, 2, 1, 3, 4, 2, 4, 5]
+)  # elements of a symmetric (3, 3) matrix by rows, in its upper triangle
 _IN_ORDER = np.arange(MAX_CHANNELS)
 
 
@@ -73,7 +77,9 @@ def _write_double(out: Bytes, at: int, value: float) -> None:
 
 
 @compiled
-def _write_doubles(out: Bytes, at: int, values: NDArray[Any], places: Int, count: int) -> None:
+def _write_doubles(
+    out: Bytes, at: int, values: NDArray[Any], places: Int, count: int
+) -> None:
     """Write the values at the first so many places, as `_write_double` does."""
     for i in range(count):
         _write_double(out, at + 8 * i, values[places[i]])
@@ -89,7 +95,9 @@ def is_cdr(data: Bytes, offset: int, length: int) -> bool:
 
 
 @compiled
-def place_after_header(data: Bytes, offset: int, length: int, before: int, total: int) -> int:
+def place_after_header(
+    data: Bytes, offset: int, length: int, before: int, total: int
+) -> int:
     """Return where values stand among the doubles that follow a std_msgs/Header; or what is wrong, negative.
 
     The message lies in ``data`` from ``offset`` on. ``before``, ``total``: doubles before the values, and all that
@@ -108,7 +116,9 @@ def place_after_header(data: Bytes, offset: int, length: int, before: int, total
 
 
 @compiled
-def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, rate: Array) -> int:
+def read_rate(
+    data: Bytes, offset: int, length: int, before: int, total: int, rate: Array
+) -> int:
     """Read three of the doubles that follow a std_msgs/Header into rate (3,), and return its stamp, ns.
 
     Or what is wrong, negative: then the rate is left as it was. Other parameters as for `place_after_header`.
@@ -153,7 +163,11 @@ def read_only(data: Bytes) -> Bytes:
 
 def as_batch(data: bytes) -> tuple[Bytes, Int, Int]:
     """Return one message as a batch: bytes, offset (1,), length (1,)."""
-    return np.frombuffer(data, dtype=np.uint8), np.zeros(1, dtype=np.int64), np.array([len(data)])
+    return (
+        np.frombuffer(data, dtype=np.uint8),
+        np.zeros(1, dtype=np.int64),
+        np.array([len(data)]),
+    )
 
 
 # Writing ------------------------------------------------------------------------------------------------------------
@@ -195,14 +209,24 @@ class ImuTemplate:
         head += bytes(-(len(head) - ENCAPSULATION) % 8)
         absent = (-1.0, *(0.0,) * 8)
         body = (0.0, 0.0, 0.0, 1.0, *absent, *(0.0,) * 12, *(0.0,) * 3, *absent)
-        self.bytes = np.frombuffer(bytearray(head + struct.pack(f"<{IMU_DOUBLES}d", *body)), dtype=np.uint8)
+        self.bytes = np.frombuffer(
+            bytearray(head + struct.pack(f"<{IMU_DOUBLES}d", *body)), dtype=np.uint8
+        )
         """The message, to be copied or filled in place."""
         self.at = len(head) + 8 * IMU_BEFORE_RATE  # where the rate begins
 
-    def fill(self, stamp: int, rate: Sequence[float], covariance: Sequence[float]) -> bytes:
+    def fill(
+        self, stamp: int, rate: Sequence[float], covariance: Sequence[float]
+    ) -> bytes:
         """Return the message: stamp ns, rate (3,) rad/s, covariance (9,) by rows, symmetric, (rad/s)^2."""
         upper = np.array([covariance[i] for i in (0, 1, 2, 4, 5, 8)], dtype=np.float64)
-        fill_imu(self.bytes, self.at, stamp, np.array(rate, dtype=np.float64).reshape(3), upper)
+        fill_imu(
+            self.bytes,
+            self.at,
+            stamp,
+            np.array(rate, dtype=np.float64).reshape(3),
+            upper,
+        )
         return self.bytes.tobytes()
 
 
@@ -218,5 +242,7 @@ class ChannelsTemplate:
 
     def fill(self, values: Iterable[float]) -> bytes:
         """Return the message with these values."""
-        self.bytes[self.at :] = np.array([*values], dtype="<f8").reshape(self.count).view(np.uint8)
+        self.bytes[self.at :] = (
+            np.array([*values], dtype="<f8").reshape(self.count).view(np.uint8)
+        )
         return self.bytes.tobytes()

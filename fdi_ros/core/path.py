@@ -38,14 +38,24 @@ from fdi_ros.core.decision import (
     write_events,
 )
 from fdi_ros.core.fusion import fuse, update_level
-from fdi_ros.core.health import FINE, OUT_OF_RANGE, all_repeat, check, leave_flickering, update_copies, update_repeated
+from fdi_ros.core.health import (
+    FINE,
+    OUT_OF_RANGE,
+    all_repeat,
+    check,
+    leave_flickering,
+    update_copies,
+    update_repeated,
+)
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import Aligner, Core, Current, Live, PathSettings, Sample
 from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
 from fdi_ros.model.samples import Bytes
 
 NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
-NOISIER = 1.4  # and times that of any other: vibration of the body comes to no channel alone
+NOISIER = (
+    1.4  # and times that of any other: vibration of the body comes to no channel alone
+)
 RAIL_MARGIN = 0.9  # of the range: where the others predict less, a value out of it is a fault and no manoeuvre
 RAIL_LIMIT = 10.0  # ranges that the detector sees of a value out of range at most: any shows as well
 WAITING = -1  # instead of a number of events
@@ -58,7 +68,12 @@ sets of channels, (2^n,) `Subset`."""
 
 @compiled
 def run(
-    path: Path, samples: NDArray[Any], start: int, out: NDArray[Any], events: NDArray[Any], stop_at_event: bool
+    path: Path,
+    samples: NDArray[Any],
+    start: int,
+    out: NDArray[Any],
+    events: NDArray[Any],
+    stop_at_event: bool,
 ) -> tuple[int, int, bool]:
     """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
 
@@ -90,7 +105,9 @@ def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int)
     now = core.now
     if not now.waiting:
         prepare_sample(path, sample)
-    now.waiting = not now.learned_from and not judge_sample(bank, core.sample, now.input, now.verdict)
+    now.waiting = not now.learned_from and not judge_sample(
+        bank, core.sample, now.input, now.verdict
+    )
     return WAITING if now.waiting else conclude_sample(path, row, events, count)
 
 
@@ -112,7 +129,9 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     core, subsets = path[0][0], path[3]
     settings, now, stamp = core.settings, core.now, sample.stamp
     now.evidence.stamp = stamp
-    now.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.stale_time
+    now.evidence.interrupted = (
+        core.samples == 0 or stamp - core.last_stamp > settings.stale_time
+    )
     core.last_stamp = stamp
     core.samples += 1
     check(settings, core.health, sample)
@@ -134,10 +153,14 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     given = core.sample
     given.stamp, given.out, given.interrupted = stamp, out, now.evidence.interrupted
     given.beyond = given.mask & ~now.usable
-    given.held = core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
+    given.held = (
+        core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
+    )
     now.repeated = update_repeated(core) if settings.estimates else 0
     given.repeated = now.repeated != 0
-    now.all_repeat = settings.estimates and all_repeat(settings, core.health, now, stamp)
+    now.all_repeat = settings.estimates and all_repeat(
+        settings, core.health, now, stamp
+    )
     if now.all_repeat:
         given.mask = 0
     if settings.needs_acceleration:
@@ -158,7 +181,15 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
                 inside |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
-    delivered = restamp(core.line, settings, core.sample.estimate.late, sample, delivered, inside, aligned)
+    delivered = restamp(
+        core.line,
+        settings,
+        core.sample.estimate.late,
+        sample,
+        delivered,
+        inside,
+        aligned,
+    )
     for i in range(settings.n):
         if delivered >> i & 1 and abs(aligned[i]) < settings.max_rate[i]:
             plain |= 1 << i
@@ -186,7 +217,9 @@ def apply_estimate(core: Core) -> None:
         if math.isfinite(now.input[i]):
             now.corrected[i] = estimate.corrected[i]
             if now.usable >> i & 1:
-                core.correction[i] = now.aligned[i] - core.bias.value[i] - now.corrected[i]
+                core.correction[i] = (
+                    now.aligned[i] - core.bias.value[i] - now.corrected[i]
+                )
 
 
 @compiled
@@ -208,7 +241,12 @@ def update_noisy(settings: PathSettings, now: Current) -> None:
 @compiled
 def begin_bias(core: Core) -> None:
     """Begin to follow the biases that were just learned."""
-    n, settings, motion, largest = core.settings.n, core.settings, core.bias.outcome == IN_MOTION, 0.0
+    n, settings, motion, largest = (
+        core.settings.n,
+        core.settings,
+        core.bias.outcome == IN_MOTION,
+        0.0,
+    )
     lost = left_out(core)
     for i in range(n):
         largest = max(largest, core.health.step[i])
@@ -233,12 +271,20 @@ def fill_input(core: Core, out: int) -> None:
     now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
     core.sample.mask = now.usable
     for i in range(core.settings.n):
-        now.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        now.along[i] = (
+            axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        )
         now.input[i] = now.aligned[i] - core.bias.value[i]
-        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(now.aligned[i]):
+        if (
+            core.health.condition[i] == OUT_OF_RANGE
+            and not out >> i & 1
+            and math.isfinite(now.aligned[i])
+        ):
             limit = core.settings.max_rate[i]
             if abs(now.along[i]) < RAIL_MARGIN * limit:
-                now.input[i] = min(max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
+                now.input[i] = min(
+                    max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit
+                )
                 core.sample.mask |= 1 << i
             else:
                 core.saturated, core.saturated_stamp = True, now.evidence.stamp
@@ -269,9 +315,15 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     if changed and not settings.estimates:
         forget(path)
     living = alive(core)
-    checked = subsets[living].detectable & at_least(core.decision, settings, CHECKED, settings.alarms)
+    checked = subsets[living].detectable & at_least(
+        core.decision, settings, CHECKED, settings.alarms
+    )
     update_states(core, checked, 0 if changed else core.decision.suspicion, False)
-    last.statistic, last.threshold, last.alarm = verdict.statistic, verdict.threshold, verdict.alarm
+    last.statistic, last.threshold, last.alarm = (
+        verdict.statistic,
+        verdict.threshold,
+        verdict.alarm,
+    )
     update_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
 
@@ -303,7 +355,9 @@ STEP_BACK = 100_000_000  # ns; a clock set back by more is followed, less is wai
 
 
 @compiled
-def receive_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) -> int:
+def receive_stamped(
+    live: Live, aligner: Aligner, unit: int, stamp: int, now: int
+) -> int:
     """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
 
     ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it arrived, ns; 0: not known. What
@@ -352,7 +406,12 @@ def receive_arrived(live: Live, code: int, stamp: int) -> int:
 
 @compiled
 def process(
-    path: Path, aligner: NDArray[Any], live: NDArray[Any], events: NDArray[Any], fused: Bytes, integrity: Bytes
+    path: Path,
+    aligner: NDArray[Any],
+    live: NDArray[Any],
+    events: NDArray[Any],
+    fused: Bytes,
+    integrity: Bytes,
 ) -> int:
     """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
 
@@ -369,7 +428,13 @@ def process(
     monitor.events = count
     flags = WORKED | HAS_EVENTS if count > 0 else WORKED
     if main.last.valid:
-        fill_imu(fused, monitor.fused_at, main.last.instant - sample.shift, main.last.rate, main.last.covariance)
+        fill_imu(
+            fused,
+            monitor.fused_at,
+            main.last.instant - sample.shift,
+            main.last.rate,
+            main.last.covariance,
+        )
         flags |= HAS_RATE
     else:
         monitor.without_rate += 1

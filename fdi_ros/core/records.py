@@ -36,7 +36,9 @@ from fdi_ros.compiling.compiled import (
 )
 
 MAX_PENDING = 1024  # messages of one unit that wait at most
-RING = MAX_PENDING + 2  # messages kept of one unit: those that wait, one too many, and the one before them
+RING = (
+    MAX_PENDING + 2
+)  # messages kept of one unit: those that wait, one too many, and the one before them
 RESTAMP_SAMPLES = 1024  # kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
 BIAS_PORTIONS = 15  # into which the time of the average at the start is divided
 ACCELERATION_SAMPLES = 1024  # that the window of the angular acceleration spans; of a longer one the last count
@@ -94,7 +96,9 @@ class Unit:
     lag: Whole  # how far the last stood behind the common time, ns
     heard: Flag  # there was a message
     before: Whole  # stamp of the last message, accepted or not, ns
-    passed: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # by each other unit since the last accepted, ns
+    passed: Annotated[
+        NDArray[np.int64], "i8", (MAX_UNITS,)
+    ]  # by each other unit since the last accepted, ns
     delay: Whole  # by how much its stamps are late, ns; taken off every one
     leapt: Flag  # its stamps jumped back by more than the timeout, and none was accepted since
     parted: Flag  # without a jump it has fallen behind the common time by more than the timeout
@@ -150,7 +154,9 @@ class Sensors:
     gain: Axes  # row i: share of channel i in the least-squares rate, weights all equal
     share: Channels  # S_ii: what of a channel's own error stays in its residual
     detectable: Flags  # a fault of the channel reaches the parity vector
-    alike: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # channels that cannot be told apart
+    alike: Annotated[
+        NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)
+    ]  # channels that cannot be told apart
 
 
 @record
@@ -219,7 +225,9 @@ class Bank:
     states: Whole  # address of the first row
     states_size: Whole  # bytes of a row
     rows: Whole  # rows in use
-    row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]  # by the bits of the channels present
+    row: Annotated[
+        NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)
+    ]  # by the bits of the channels present
     judged: SampleVerdict
 
 
@@ -246,7 +254,9 @@ class Health:
     received_stamp: Stamps  # of the last sample that the channel delivered, ns
     bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
     condition: Flags  # `Condition` in this sample
-    counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]  # samples in each condition
+    counts: Annotated[
+        NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)
+    ]  # samples in each condition
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
     gone: Channels  # share of the values lately received that are not finite
@@ -283,13 +293,19 @@ class Copies:
     """Units that give the values of another one."""
 
     stamp: Whole  # of the last comparison, ns
-    hits: Annotated[NDArray[np.int64], "i8", (MAX_UNITS, MAX_UNITS)]  # comparisons in which two units agreed
-    original: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # number from 1 of the unit that each repeats; 0: none
+    hits: Annotated[
+        NDArray[np.int64], "i8", (MAX_UNITS, MAX_UNITS)
+    ]  # comparisons in which two units agreed
+    original: Annotated[
+        NDArray[np.int64], "i8", (MAX_UNITS,)
+    ]  # number from 1 of the unit that each repeats; 0: none
     channels: Mask  # of the units that repeat another one
     found: Flag  # in the last sample: all that was declared may rest on it
     # While two are compared:
     change: Annotated[NDArray[np.float64], "f8", (6,)]  # of either's channels, rad/s
-    products: Annotated[NDArray[np.float64], "f8", (6, 6)]  # of these, summed, (rad/s)^2
+    products: Annotated[
+        NDArray[np.float64], "f8", (6, 6)
+    ]  # of these, summed, (rad/s)^2
 
 
 @record
@@ -342,7 +358,9 @@ class Bias:
     sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
     max_sway: Real  # at rest, rad/s
     # While an average is concluded:
-    ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]  # values being sorted
+    ordered: Annotated[
+        NDArray[np.float64], "f8", (BIAS_PORTIONS,)
+    ]  # values being sorted
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
 
@@ -382,7 +400,9 @@ class Acceleration:
     window: Whole  # ns
     count: Whole  # samples so far
     oldest: Whole  # number of the sample that the difference is taken to
-    history: Annotated[list[TimedRate], ACCELERATION_SAMPLES]  # by number of the sample, modulo `ACCELERATION_SAMPLES`
+    history: Annotated[
+        list[TimedRate], ACCELERATION_SAMPLES
+    ]  # by number of the sample, modulo `ACCELERATION_SAMPLES`
     known: TimedRate  # last rate there was up to the oldest
     has_known: Whole  # 0: there was none yet
     value: Vector  # rad/s^2; zero where it is not known
@@ -406,7 +426,9 @@ class Evidence:
     """What the decision gets of one sample."""
 
     stamp: Whole  # ns
-    suspected: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
+    suspected: (
+        Mask  # suspects of the verdict; where evidence decides, channels that are stuck
+    )
     outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
@@ -433,8 +455,12 @@ class Decision:
     voted: Mask  # of it, by votes
     why: Flags  # why each channel was declared
     at: Whole  # place of the last sample in the window
-    sets: Annotated[NDArray[np.int64], "i8", (4, DECISION_SAMPLES)]  # of each sample of the window, by kind
-    count: Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]  # of these in whose set a channel is, by kind
+    sets: Annotated[
+        NDArray[np.int64], "i8", (4, DECISION_SAMPLES)
+    ]  # of each sample of the window, by kind
+    count: Annotated[
+        NDArray[np.int64], "i8", (4, MAX_CHANNELS)
+    ]  # of these in whose set a channel is, by kind
     alarms: Whole  # samples of the window with an alarm that counts
     last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
     renewed: Stamps  # when the sum of its errors was begun, ns
@@ -485,7 +511,9 @@ class PathSettings:
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
-    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
+    members: Annotated[
+        NDArray[np.int64], "i8", (MAX_UNITS,)
+    ]  # bits of the channels of each
     # Of the checks:
     max_rate: Channels  # rad/s
     non_finite_time: Whole  # ns
@@ -503,7 +531,9 @@ class PathSettings:
     return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
     # Of estimate and fusion:
     needs_acceleration: Flag
-    publish_under_doubt: Flag  # a rate of channels under doubt, where they cannot be left out
+    publish_under_doubt: (
+        Flag  # a rate of channels under doubt, where they cannot be left out
+    )
     estimates: Flag  # the detector estimates the errors of the sensors
     max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
     risk: Real  # allowed probability of an error above the level at a sample; 0: there is no level
@@ -521,7 +551,9 @@ class Current:
     all_repeat: Flag  # all channels repeat their values
     noisy: Mask  # channels much noisier than expected, and than the others
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
-    learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
+    learned_from: (
+        Flag  # the bias was learned from the sample, and nothing else is done with it
+    )
     aligned: Channels  # values of the instant that it stands for, rad/s
     corrected: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
     input: Channels  # values of all channels as the detector takes them, rad/s
@@ -534,8 +566,12 @@ class Current:
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
     others_rate: Vector  # of the channels by which motion is measured in `update_stuck`, rad/s; and room
-    prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
-    variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
+    prediction: (
+        Channels  # of each channel by the others, rad/s; NaN where they give none
+    )
+    variance: (
+        Channels  # of noise and what else differs from sample to sample, (rad/s)^2
+    )
     uncertainty: Channels  # `variance` and the variance of what is not known of the errors, (rad/s)^2
     parity: Parity
     rival: Channels  # A z of channels fused and left out, s/rad
@@ -544,7 +580,9 @@ class Current:
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
     lagging: Vector  # change of the rate up to the instant that is stated, rad/s
     plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
-    growth: Channels  # error variance, with that of the bias that remains, in noise_std^2
+    growth: (
+        Channels  # error variance, with that of the bias that remains, in noise_std^2
+    )
     verdict: SampleVerdict
     evidence: Evidence
 
@@ -559,14 +597,20 @@ class Core:
     line: DelayBuffer
     copies: Copies
     sample: SampleInput  # of the channels that the detector sees, and what it estimates of them
-    unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s
-    correction: Channels  # last estimated error of each channel, taken off its value, rad/s
+    unit_rate: Annotated[
+        NDArray[np.float64], "f8", (MAX_UNITS, 3)
+    ]  # when each unit last gave a new value, rad/s
+    correction: (
+        Channels  # last estimated error of each channel, taken off its value, rad/s
+    )
     remaining: Channels  # what residuals show of the unknown errors of each channel, standard deviation, rad/s
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
     reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
-    last_error: Channels  # last estimate of each channel's error that was not zero, rad/s
+    last_error: (
+        Channels  # last estimate of each channel's error that was not zero, rad/s
+    )
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
     samples: Whole  # so far
@@ -576,7 +620,9 @@ class Core:
     since: Stamps  # of the sample that brought the state, ns
     group: Mask  # after the last sample: the channels one of which is faulty
     error: Channels  # estimated error when the state came, rad/s
-    wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
+    wanted: (
+        Mask  # channels fused whose protection level is still to be worked out; 0: none
+    )
     last: OutputRow
     now: Current
 
@@ -594,6 +640,8 @@ class Live:
     shift: Whole  # to be taken off the stamp of the last sample to have that of its message, ns
     without_rate: Whole  # samples
     last_stamp: Whole  # of the last array, ns
-    clock_shift: Whole  # added to the stamps of arrays, ns; 0 until the clock was set back
+    clock_shift: (
+        Whole  # added to the stamps of arrays, ns; 0 until the clock was set back
+    )
     restarts: Whole  # times that it was
     inlets: Annotated[list[Inlet], MAX_UNITS]

@@ -59,7 +59,9 @@ class Source(ABC):
     """Whether messages carry the stamp of their measurement, and those of several units are aligned by it; else they
     are stamped when they arrive, and each is a sample of all channels."""
     topic_counts: ClassVar[range]  #: numbers of topics that a monitor takes
-    value_counts: ClassVar[range]  #: numbers of values that a message may have to be the gyros of a monitor
+    value_counts: ClassVar[
+        range
+    ]  #: numbers of values that a message may have to be the gyros of a monitor
     called: ClassVar[str]  #: a message in words: ``an Imu``
 
     # Compiled, per kind -------------------------------------------------------------------------------------------
@@ -71,12 +73,16 @@ class Source(ABC):
 
     @staticmethod
     @abstractmethod
-    def decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+    def decode_into(
+        data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
+    ) -> None:
         """Read k messages; code (k,), stamp (k,) and values (k, c), zeros before, take what each holds."""
 
     @staticmethod
     @abstractmethod
-    def receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    def receive(
+        aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int
+    ) -> int:
         """Take in one live message, its bytes, of the input topic ``inlet``, which arrived at ``stamp``, ns.
 
         ``aligner``, ``live``: as for `fdi_ros.core.path.process`. Returned is `fdi_ros.core.path.MORE` if a sample is
@@ -116,7 +122,11 @@ class Source(ABC):
         One with another number of values is malformed.
         """
         k = len(offset)
-        decoded = Decoded(np.zeros(k, dtype=np.uint8), np.zeros(k, dtype=np.int64), np.zeros((k, count)))
+        decoded = Decoded(
+            np.zeros(k, dtype=np.uint8),
+            np.zeros(k, dtype=np.int64),
+            np.zeros((k, count)),
+        )
         cls.decode_into(read_only(buffer), offset, length, *decoded)
         return decoded
 
@@ -144,7 +154,9 @@ class Source(ABC):
     """Names of the three-axis units that the channels belong to; empty: which of them share one is not known."""
     timeout: float  #: time after which a topic is silent, s
     max_lag = math.inf  #: how far the stamps of a topic may stay behind the others, s
-    delays: tuple[float, ...] = ()  #: by how much the stamps of each unit are late, as set, s
+    delays: tuple[
+        float, ...
+    ] = ()  #: by how much the stamps of each unit are late, as set, s
     mounts: Sequence[Array] = ()  #: mount rotation (3, 3) of each unit
 
     def __init__(self, config: Config) -> None:
@@ -155,7 +167,12 @@ class Source(ABC):
     def alignment(self) -> tuple[int, int, int, tuple[float, ...]]:
         """How the messages of the topics are aligned: units, largest skew ns, timeout ns, delays s."""
         imus = self.config.imus
-        return len(self.topics), round(imus.max_skew * 1e9), round(imus.timeout * 1e9), imus.delays
+        return (
+            len(self.topics),
+            round(imus.max_skew * 1e9),
+            round(imus.timeout * 1e9),
+            imus.delays,
+        )
 
     def check_channels(self, n: int) -> None:
         """Raise ConfigError if the units do not have n channels."""
@@ -186,7 +203,9 @@ class UnitSource(Source):
         self.names = self.units = config.imu_names
         self.timeout, self.max_lag = imus.timeout, imus.max_skew
         self.delays = imus.delays or (0.0,) * count
-        self.mounts = list(np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3)))
+        self.mounts = list(
+            np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3))
+        )
 
 
 class ArraySource(Source):
@@ -209,9 +228,13 @@ def _imu_place(data: Bytes, offset: int, length: int, count: int) -> int:
 
 
 @compiled
-def _imu_decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+def _imu_decode_into(
+    data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
+) -> None:
     for k in range(len(offset)):
-        measured = read_rate(data, offset[k], length[k], IMU_BEFORE_RATE, IMU_DOUBLES, values[k])
+        measured = read_rate(
+            data, offset[k], length[k], IMU_BEFORE_RATE, IMU_DOUBLES, values[k]
+        )
         if measured < 0:
             code[k] = -measured
         else:
@@ -219,10 +242,14 @@ def _imu_decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: 
 
 
 @compiled
-def _imu_receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+def _imu_receive(
+    aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int
+) -> int:
     if not 0 <= inlet < aligner[0].n:
         return 0
-    measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
+    measured = read_rate(
+        data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate
+    )
     return receive_stamped(live[0], aligner[0], inlet, measured, stamp)
 
 
@@ -278,7 +305,9 @@ def _array_place(data: Bytes, offset: int, length: int, count: int) -> int:
 
 
 @compiled
-def _array_read(data: Bytes, offset: int, length: int, count: int, values: Array) -> int:
+def _array_read(
+    data: Bytes, offset: int, length: int, count: int, values: Array
+) -> int:
     at = _array_place(data, offset, length, count)
     if at < 0:
         return -at
@@ -287,17 +316,25 @@ def _array_read(data: Bytes, offset: int, length: int, count: int, values: Array
 
 
 @compiled
-def _array_decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+def _array_decode_into(
+    data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
+) -> None:
     for k in range(len(offset)):
         code[k] = _array_read(data, offset[k], length[k], values.shape[1], values[k])
 
 
 @compiled
-def _array_receive(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+def _array_receive(
+    aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int
+) -> int:
     monitor = live[0]
     if not 0 <= inlet < aligner[0].n:
         return 0
-    return receive_arrived(monitor, _array_read(data, 0, len(data), monitor.channels, monitor.sample.z), stamp)
+    return receive_arrived(
+        monitor,
+        _array_read(data, 0, len(data), monitor.channels, monitor.sample.z),
+        stamp,
+    )
 
 
 class ChannelsSource(ArraySource):
@@ -317,11 +354,15 @@ class ChannelsSource(ArraySource):
             return super().explain(code, data, count)
         if code == _DIMENSIONS:
             (dimensions,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION)
-            return f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"
+            return (
+                f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"
+            )
         if code == _CUT_ARRAY:
             return f"{size} bytes are too few for the array they announce"
         if code == _WRONG_COUNT:
-            return f"array has {cls.announced(*as_batch(data))} values, expected {count}"
+            return (
+                f"array has {cls.announced(*as_batch(data))} values, expected {count}"
+            )
         return f"{size} bytes are too few for {count} values ({'little' if order == '<' else 'big'} endian)"
 
     @classmethod
@@ -331,11 +372,15 @@ class ChannelsSource(ArraySource):
         for start, size in zip(offset.tolist(), length.tolist(), strict=True):
             at = _count_at(data, start, size)
             if at >= 0:
-                return int.from_bytes(data[at : at + 4].tobytes(), "little" if data[start + 1] else "big")
+                return int.from_bytes(
+                    data[at : at + 4].tobytes(), "little" if data[start + 1] else "big"
+                )
         return 0
 
 
-SOURCES: dict[str, type[Source]] = {name: globals()[row.source] for name, row in INPUTS.items()}
+SOURCES: dict[str, type[Source]] = {
+    name: globals()[row.source] for name, row in INPUTS.items()
+}
 """By the value of the parameter ``input``."""
 
 

@@ -27,7 +27,12 @@ from fdi_ros.core.records import (
     Sensors,
     Subset,
 )
-from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
+from fdi_ros.model.geometry import (
+    MIN_CHANNELS,
+    MIN_SENSITIVITY,
+    MIN_SINGULAR_RATIO,
+    Geometry,
+)
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import MAX_RATE, Array, Mask
 
@@ -85,16 +90,24 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
     singular = np.linalg.svd(used, compute_uv=False)
     worst, best = singular[:, -1], singular[:, 0]
     spans = (bits.sum(axis=1) >= 3) & (worst >= MIN_SINGULAR_RATIO * best)
-    subsets["spans"], subsets["spare"] = spans, spans & (worst >= MIN_SPARE_RATIO * best)
+    subsets["spans"], subsets["spare"] = (
+        spans,
+        spans & (worst >= MIN_SPARE_RATIO * best),
+    )
     roots = bits[spans] / noise.noise_std
-    gain = np.linalg.pinv(roots[:, :, None] * geometry.axes).transpose(0, 2, 1) * roots[:, :, None]
+    gain = (
+        np.linalg.pinv(roots[:, :, None] * geometry.axes).transpose(0, 2, 1)
+        * roots[:, :, None]
+    )
     subsets["gain"][spans, :n] = gain
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
     subsets["sensitivity"][spans, :n] = np.where(bits[spans], share, 0.0)
     return subsets
 
 
-def prepare_capability(subsets: NDArray[Any], geometry: Geometry, can_run: list[bool]) -> None:
+def prepare_capability(
+    subsets: NDArray[Any], geometry: Geometry, can_run: list[bool]
+) -> None:
     """Complete subsets with what a method can do with each; can_run (n + 1,): whether it runs on k channels."""
     n = geometry.n
     bits = all_sets(n)
@@ -120,7 +133,9 @@ def fill_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
 
 
 @compiled
-def fill_growth(n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array) -> None:
+def fill_growth(
+    n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array
+) -> None:
     """How many times noise_std^2 the square of each channel's error in a sample is, into growth (n,).
 
     ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): what is not known of each channel's bias, standard
@@ -128,7 +143,9 @@ def fill_growth(n: int, noise_std: Array, variance: Array, remaining: Array, gro
     (as by the nominal biases of Blanch et al. 2015), whose square is at most n times that of independent ones.
     """
     for i in range(n):
-        growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (noise_std[i] * noise_std[i])
+        growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (
+            noise_std[i] * noise_std[i]
+        )
 
 
 @compiled
@@ -154,7 +171,13 @@ def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -
 
 @compiled
 def passes_test(
-    subset: Subset, axes: Array, noise_std: Array, n: int, mask: int, growth: Array, residual: Array
+    subset: Subset,
+    axes: Array,
+    noise_std: Array,
+    n: int,
+    mask: int,
+    growth: Array,
+    residual: Array,
 ) -> bool:
     """Whether the residuals (n,) of the channels in mask pass the separation test that the level rests on."""
     passes, least = True, math.inf
@@ -168,7 +191,9 @@ def passes_test(
             for j in range(n):
                 if mask >> j & 1:
                     taken = (
-                        axes[i, 0] * subset.gain[j, 0] + axes[i, 1] * subset.gain[j, 1] + axes[i, 2] * subset.gain[j, 2]
+                        axes[i, 0] * subset.gain[j, 0]
+                        + axes[i, 1] * subset.gain[j, 1]
+                        + axes[i, 2] * subset.gain[j, 2]
                     )
                     part = ((1.0 if i == j else 0.0) - taken) * noise_std[j]
                     before += part * part
@@ -179,7 +204,9 @@ def passes_test(
 
 
 @compiled
-def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
+def differentiate_rate(
+    acceleration: Acceleration, stamp: int, rate: NDArray[np.float64]
+) -> None:
     """Take the rate (3,) of one sample; the acceleration is then in ``acceleration.value``."""
     here = acceleration.count
     acceleration.count += 1
@@ -193,7 +220,8 @@ def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.
         return
     while acceleration.oldest + 1 < here and (
         here - acceleration.oldest >= ACCELERATION_SAMPLES
-        or acceleration.history[(acceleration.oldest + 1) % ACCELERATION_SAMPLES].stamp <= stamp - acceleration.window
+        or acceleration.history[(acceleration.oldest + 1) % ACCELERATION_SAMPLES].stamp
+        <= stamp - acceleration.window
     ):
         note_known(acceleration, acceleration.oldest + 1)
     if acceleration.has_known and math.isfinite(rate[0]):
@@ -205,7 +233,10 @@ def differentiate_rate(acceleration: Acceleration, stamp: int, rate: NDArray[np.
 @compiled
 def note_known(acceleration: Acceleration, oldest: int) -> None:
     """Go on to a number of the oldest sample, and remember its rate if it had one."""
-    acceleration.oldest, one = oldest, acceleration.history[oldest % ACCELERATION_SAMPLES]
+    acceleration.oldest, one = (
+        oldest,
+        acceleration.history[oldest % ACCELERATION_SAMPLES],
+    )
     if math.isfinite(one.rate[0]):
         acceleration.has_known = 1
         acceleration.known.stamp = one.stamp
@@ -216,7 +247,10 @@ def note_known(acceleration: Acceleration, oldest: int) -> None:
 # The detector: one row of constants and of memory for each set of channels present, or one for all --------------------
 
 
-UNPREPARED, REFUSED = -1, -2  # instead of a row: not prepared yet; the method cannot run on these channels
+UNPREPARED, REFUSED = (
+    -1,
+    -2,
+)  # instead of a row: not prepared yet; the method cannot run on these channels
 LARGEST_RATE = 1e6  # rad/s; methods of a paper take a larger finite value for this, so that squares stay finite
 
 
@@ -242,7 +276,9 @@ def clear_verdict(verdict: SampleVerdict, n: int) -> None:
 
 
 @compiled
-def judge_sample(bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict) -> bool:
+def judge_sample(
+    bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict
+) -> bool:
     """Judge a sample by those of all values z (n,) that are in its mask; all else but its values is filled in already.
 
     False, and nothing is done, if the constants for these channels are unprepared.
@@ -257,31 +293,57 @@ def judge_sample(bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdic
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            sample.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
+            sample.z[k] = (
+                min(max(z[i], -LARGEST_RATE), LARGEST_RATE)
+                if math.isfinite(z[i])
+                else 0.0
+            )
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
     judged.alarm = judged.isolated = sample.estimate.known = False
-    call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, sample, judged)
+    call(
+        bank.judge,
+        bank.constants,
+        row,
+        bank.constants_size,
+        bank.states,
+        bank.states_size,
+        sample,
+        judged,
+    )
     verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
     verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            verdict.suspects[i], verdict.outliers[i] = judged.suspects[k], judged.outliers[k]
-            verdict.error[i], verdict.scores[i], verdict.noise[i] = judged.error[k], judged.scores[k], judged.noise[k]
+            verdict.suspects[i], verdict.outliers[i] = (
+                judged.suspects[k],
+                judged.outliers[k],
+            )
+            verdict.error[i], verdict.scores[i], verdict.noise[i] = (
+                judged.error[k],
+                judged.scores[k],
+                judged.noise[k],
+            )
             k += 1
     return True
 
 
 @compiled
-def variance_of(sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]) -> float:
+def variance_of(
+    sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]
+) -> float:
     """Error variance of a channel, (rad/s)^2, from the rate along its own axis, rad/s."""
     axis = sensors.axes[i]
     scale = sensors.scale_std[i] * rate_along
-    timing = sensors.timing_std[i] * (axis[0] * acceleration[0] + axis[1] * acceleration[1] + axis[2] * acceleration[2])
+    timing = sensors.timing_std[i] * (
+        axis[0] * acceleration[0]
+        + axis[1] * acceleration[1]
+        + axis[2] * acceleration[2]
+    )
     return sensors.noise_std[i] * sensors.noise_std[i] + scale * scale + timing * timing
 
 
@@ -292,7 +354,10 @@ def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> Non
     sensors["axes"][:n], sensors["gain"][:n] = geometry.axes, geometry.least_squares.T
     for name in ("noise_std", "scale_std", "timing_std"):
         sensors[name][:n] = getattr(noise, name)
-    sensors["share"][:n], sensors["detectable"][:n] = np.diag(geometry.S), geometry.detectable
+    sensors["share"][:n], sensors["detectable"][:n] = (
+        np.diag(geometry.S),
+        geometry.detectable,
+    )
     sensors["alike"][:n, :n] = geometry.group_matrix
 
 
@@ -308,7 +373,9 @@ def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> Non
 # channels that are not in a set are zero.
 
 
-UNKNOWN_RATE = 1.0 / MAX_RATE**2  # k where nothing is known: an axis that no channel measures is no division by zero
+UNKNOWN_RATE = (
+    1.0 / MAX_RATE**2
+)  # k where nothing is known: an axis that no channel measures is no division by zero
 
 
 @compiled
@@ -401,7 +468,9 @@ def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) ->
 
 
 @compiled
-def fill_joint_parity(parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float) -> None:
+def fill_joint_parity(
+    parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float
+) -> None:
     """Work out A and G for errors of a covariance (n, n), (rad/s)^2; ``known`` of the rate: k in s^2/rad^2."""
     n, count = sensors.n, 0
     for i in range(n):
@@ -435,7 +504,9 @@ def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
 
 
 @compiled
-def covariance_of(gain: Array, n: int, variance: Array, together: Array, out: Symmetric) -> None:
+def covariance_of(
+    gain: Array, n: int, variance: Array, together: Array, out: Symmetric
+) -> None:
     """Covariance G (diag(variance) + together) G' (6,) of a rate, upper triangle, (rad/s)^2."""
     k = 0
     for a in range(3):

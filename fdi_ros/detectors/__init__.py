@@ -37,12 +37,16 @@ DETECTORS = {
 def detector_class(name: str) -> type[Detector]:
     """Class of a detector by name; `DetectorError` if there is none of that name lists those there are."""
     if name not in DETECTORS:
-        raise DetectorError(f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}")
+        raise DetectorError(
+            f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}"
+        )
     found: type[Detector] = pkgutil.resolve_name(f"{__name__}.{DETECTORS[name]}")
     return found
 
 
-def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options: Any) -> Detector:
+def create_detector(
+    name: str, geometry: Geometry, noise: NoiseModel, **options: Any
+) -> Detector:
     """Build a detector by name.
 
     Parameters

@@ -22,9 +22,25 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import Callback, Whole, address_of, allocate, as_input, compiled, record
+from fdi_ros.compiling.compiled import (
+    Callback,
+    Whole,
+    address_of,
+    allocate,
+    as_input,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import Bank, SampleInput, SampleVerdict
-from fdi_ros.core.subsets import REFUSED, UNPREPARED, describe_sensors, flags_of, judge_sample, present_in, whole_set
+from fdi_ros.core.subsets import (
+    REFUSED,
+    UNPREPARED,
+    describe_sensors,
+    flags_of,
+    judge_sample,
+    present_in,
+    whole_set,
+)
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -84,16 +100,22 @@ class Detector(ABC):
     accumulates: ClassVar[bool] = False
     """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
+    def __init__(
+        self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]
+    ) -> None:
         if refused := self.refuses(geometry.n):
             raise DetectorError(refused)
         self.geometry = geometry
         self.noise = noise.for_channels(geometry.n)
         self.options = options
-        self.constants = allocate(self.Constants)  #: the method's constants for all channels, (1,)
+        self.constants = allocate(
+            self.Constants
+        )  #: the method's constants for all channels, (1,)
         describe_sensors(self.constants["sensors"][0], geometry, self.noise)
         self._fewer: dict[int, Detector | None] = {}
-        self.refusals: dict[int, str] = {}  #: why the method cannot run on a set of channels, by its bits
+        self.refusals: dict[
+            int, str
+        ] = {}  #: why the method cannot run on a set of channels, by its bits
 
     @classmethod
     def refuses(cls, n: int) -> str:
@@ -145,7 +167,9 @@ class Detector(ABC):
         if mask not in self._fewer:
             kept = flags_of(mask, n)
             try:
-                self._fewer[mask] = type(self)(self.geometry.subset(kept), self.noise.subset(kept), **self.options)
+                self._fewer[mask] = type(self)(
+                    self.geometry.subset(kept), self.noise.subset(kept), **self.options
+                )
             except (FdiError, ValueError, np.linalg.LinAlgError) as error:
                 # Of near-parallel axes some methods cannot be built at all.
                 self._fewer[mask] = None
@@ -177,21 +201,31 @@ class Detector(ABC):
         """
         z = self._checked(z)
         rows = len(z)
-        turning = np.zeros((1, 3)) if acceleration is None else as_input(acceleration, np.float64)
+        turning = (
+            np.zeros((1, 3))
+            if acceleration is None
+            else as_input(acceleration, np.float64)
+        )
         if acceleration is not None and turning.shape != (rows, 3):
-            raise DetectorError(f"acceleration has shape {turning.shape}, expected ({rows}, 3)")
+            raise DetectorError(
+                f"acceleration has shape {turning.shape}, expected ({rows}, 3)"
+            )
         verdicts = allocate(SampleVerdict, rows)
         sample = allocate(SampleInput)
         sample["bias_std"][0, : self.geometry.n] = self.noise.bias_std
         done = 0
-        while (done := judge_rows(self.bank, z, turning, sample, verdicts, done)) < rows:
+        while (
+            done := judge_rows(self.bank, z, turning, sample, verdicts, done)
+        ) < rows:
             self.prepare(present_in(z[done], self.geometry.n))
         return as_verdict(verdicts, self.geometry.n)
 
     def _checked(self, z: Array) -> Array:
         z = as_input(z, np.float64)
         if z.ndim != 2 or z.shape[1] != self.geometry.n:
-            raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
+            raise DetectorError(
+                f"z has shape {z.shape}, expected (N, {self.geometry.n})"
+            )
         return z
 
 
@@ -211,9 +245,18 @@ class _Rows:
         self._oldest = 1
         bank = self.bank[0]
         bank["n"], bank["judge"], bank["rows"] = n, detector.judge.address, 1
-        bank["constants"], bank["states"] = address_of(self.constants), address_of(self.states)
-        bank["constants_size"], bank["states_size"] = self.constants.itemsize, self.states.itemsize
-        bank["takes_any"], bank["period"] = detector.takes_any, round(1e9 / detector.sample_rate)
+        bank["constants"], bank["states"] = (
+            address_of(self.constants),
+            address_of(self.states),
+        )
+        bank["constants_size"], bank["states_size"] = (
+            self.constants.itemsize,
+            self.states.itemsize,
+        )
+        bank["takes_any"], bank["period"] = (
+            detector.takes_any,
+            round(1e9 / detector.sample_rate),
+        )
         bank["row"] = UNPREPARED
         bank["row"][self._masks[0]] = 0
         self.constants[0] = detector.constants[0]
@@ -228,7 +271,10 @@ class _Rows:
             self._masks.append(mask)
             self.bank["rows"] = row + 1
         else:
-            row, self._oldest = self._oldest, self._oldest % (len(self.constants) - 1) + 1
+            row, self._oldest = (
+                self._oldest,
+                self._oldest % (len(self.constants) - 1) + 1,
+            )
             self.bank["row"][0, self._masks[row]] = UNPREPARED
             self._masks[row] = mask
         self.constants[row] = detector.constants[0]
@@ -238,7 +284,12 @@ class _Rows:
 
 @compiled
 def judge_rows(
-    bank: NDArray[Any], z: Array, acceleration: Array, sample: NDArray[Any], verdicts: NDArray[Any], start: int
+    bank: NDArray[Any],
+    z: Array,
+    acceleration: Array,
+    sample: NDArray[Any],
+    verdicts: NDArray[Any],
+    start: int,
 ) -> int:
     """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
 
@@ -248,7 +299,9 @@ def judge_rows(
         sample[0].mask, sample[0].stamp = present_in(z[k], bank[0].n), bank[0].clock
         bank[0].clock += bank[0].period
         for a in range(3):
-            sample[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
+            sample[0].acceleration[a] = acceleration[
+                k if len(acceleration) > 1 else 0, a
+            ]
         if not judge_sample(bank[0], sample[0], z[k], verdicts[k]):
             bank[0].clock -= bank[0].period
             return k
@@ -274,17 +327,25 @@ def accepted_options(method: type[Detector]) -> tuple[str, ...]:
     names: list[str] = []
     for kind in method.__mro__:
         parameters = inspect.signature(kind).parameters.values()
-        names += [one.name for one in parameters if one.kind == one.KEYWORD_ONLY and one.name not in names]
+        names += [
+            one.name
+            for one in parameters
+            if one.kind == one.KEYWORD_ONLY and one.name not in names
+        ]
         # What a class does not name it passes on to its base.
         if all(one.kind != one.VAR_KEYWORD for one in parameters):
             break
     return tuple(names)
 
 
-def built(method: Any, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Any:
+def built(
+    method: Any, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]
+) -> Any:
     """Build a method; `DetectorError` if it does not take an option, or cannot run on this geometry."""
     for option in options:
         if option not in accepted_options(method):
             known = ", ".join(accepted_options(method)) or "none"
-            raise DetectorError(f"detector {method.name} has no option {option!r}, expected one of: {known}")
+            raise DetectorError(
+                f"detector {method.name} has no option {option!r}, expected one of: {known}"
+            )
     return method(geometry, noise, **options)

@@ -17,8 +17,24 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, compiled, record
-from fdi_ros.detectors.naming import MISFIT, Inference, checks, explain, moved_by, set_mean
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    Channels,
+    Flag,
+    Mask,
+    Real,
+    Whole,
+    compiled,
+    record,
+)
+from fdi_ros.detectors.naming import (
+    MISFIT,
+    Inference,
+    checks,
+    explain,
+    moved_by,
+    set_mean,
+)
 from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
@@ -51,7 +67,9 @@ SMALLEST = 0.2
 one to the next at most 11 % of the delay are lost, and smaller faults are found at a longer time scale."""
 FIRST_LONG = 2  # sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
 STEP_LIMIT = 7.0  # a value counts as this many standard deviations at most (Huber 1965): beyond the largest size
-CEILING = 1e6  # sums stay below so many times the threshold: what has passed is forgotten
+CEILING = (
+    1e6  # sums stay below so many times the threshold: what has passed is forgotten
+)
 STANDS = 0.6
 """Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case: less
 than the sums need, as what is not known is counted here in full."""
@@ -74,7 +92,9 @@ DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 """A slow drift is looked for over so many s (480), as long as states are kept, and half as long, so many times."""
 LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biases by some 5 mrad/s, and no more
-FASTEST = 2.5  # and so many times as fast as that for a moment: warming is quickest at first
+FASTEST = (
+    2.5  # and so many times as fast as that for a moment: warming is quickest at first
+)
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
 Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
 Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]
@@ -133,7 +153,9 @@ class State:
 
 
 @compiled
-def add_evidence(params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int) -> None:
+def add_evidence(
+    params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int
+) -> None:
     """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
     first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
     scale.first[scale.newest] = first_sample
@@ -148,7 +170,11 @@ def add_evidence(params: Constants, kf: Estimator, scale: Scale, at: int, first_
             factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
             for k in range(SIZES):
                 if k >= first:
-                    sums[k] = min((1.0 + sums[k]) * min(factor * math.exp(-0.5 * size * size), cap), ceiling)
+                    sums[k] = min(
+                        (1.0 + sums[k])
+                        * min(factor * math.exp(-0.5 * size * size), cap),
+                        ceiling,
+                    )
                     total += sums[k]
                 factor *= factor
                 size *= 2.0
@@ -178,7 +204,9 @@ def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> fl
 
 
 @compiled
-def look_back(params: Constants, kf: Estimator, scale: Scale, i: int, sign: float) -> tuple[int, float]:
+def look_back(
+    params: Constants, kf: Estimator, scale: Scale, i: int, sign: float
+) -> tuple[int, float]:
     """Find since when channel i is off, and the evidence for it against the noise of that same time.
 
     Returns
@@ -204,11 +232,15 @@ def look_back(params: Constants, kf: Estimator, scale: Scale, i: int, sign: floa
                 squares += min(0.5 * step * step, FAR)
     # Of so many channels three fewer differ from what a rate explains.
     checks = max(count - 3.0, 1.0)
-    pooled = (trust + squares / max(count, 1) * checks) / (trust + checks * (since - 1.0))
+    pooled = (trust + squares / max(count, 1) * checks) / (
+        trust + checks * (since - 1.0)
+    )
     degrees = trust + since - 1.0
     scatter = scatter_of(scale, i, sign, since, mean)
     variance = max((trust + (since - 1.0) * scatter) / degrees, pooled)
-    return since, 0.5 * (degrees + 1.0) * math.log(1.0 + mean * mean * since / variance / degrees)
+    return since, 0.5 * (degrees + 1.0) * math.log(
+        1.0 + mean * mean * since / variance / degrees
+    )
 
 
 @compiled
@@ -222,9 +254,19 @@ def update_from_sample(params: Constants, state: State, learns: bool) -> None:
         scale.series[scale.newest, i] = 0.0
         if kf.judged >> i & 1:
             slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
-            scale.series[scale.newest, i] = kf.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
+            scale.series[scale.newest, i] = kf.statistic[i] / math.sqrt(
+                max(1.0, BURST * noise.quick[i], slow)
+            )
     update_shared(params, kf)
-    update_sample_noise(noise, params.sensors.n, kf.judged, kf.statistic, kf.inflation, learns, kf.samples % 2)
+    update_sample_noise(
+        noise,
+        params.sensors.n,
+        kf.judged,
+        kf.statistic,
+        kf.inflation,
+        learns,
+        kf.samples % 2,
+    )
     add_evidence(params, kf, scale, SAMPLE, kf.samples)
 
 
@@ -254,10 +296,14 @@ def update_from_block(params: Constants, state: State, learns: bool) -> None:
         else:
             update_long_noise(noise, k, n, known, scale.values, learns)
         for i in range(n):
-            scale.series[scale.newest, i] = scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
+            scale.series[scale.newest, i] = (
+                scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
+            )
             scale.values[i] = scale.information[i] = 0.0
         scale.filled = 0
-        add_evidence(params, kf, scale, k, kf.samples - (PER_BLOCK[k] + 1) * params.length + 1)
+        add_evidence(
+            params, kf, scale, k, kf.samples - (PER_BLOCK[k] + 1) * params.length + 1
+        )
 
 
 @compiled
@@ -288,7 +334,9 @@ def fill_scores(params: Constants, state: State, scores: Array) -> None:
 def forget_evidence(params: Constants, state: State) -> None:
     """Begin all sums anew, and end the case; the states and the noise stay."""
     state.case.open = False
-    state.case.isolated = state.case.suspects = state.estimator.excluded_from_rate = state.estimator.under_test = 0
+    state.case.isolated = state.case.suspects = state.estimator.excluded_from_rate = (
+        state.estimator.under_test
+    ) = 0
     for k in range(SCALES):
         scale = state.scales[k]
         scale.kept = scale.filled = 0
@@ -312,7 +360,11 @@ def look_for_case(params: Constants, state: State) -> None:
             for side in range(2):
                 for s in range(SIZES):
                     if scale.sums[side, i, s] > largest:
-                        largest, channel, sign = scale.sums[side, i, s], i, 1.0 - 2.0 * side
+                        largest, channel, sign = (
+                            scale.sums[side, i, s],
+                            i,
+                            1.0 - 2.0 * side,
+                        )
         if channel < 0 or largest < params.limit:
             continue
         since, evidence = look_back(params, kf, scale, channel, sign)
@@ -357,7 +409,11 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
     kf, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
     information = kf.parity.information
     before = case.before
-    if case.open or not is_after_hole(params, kf) or not predict_from(params, kf, kf.hole_at, before):
+    if (
+        case.open
+        or not is_after_hole(params, kf)
+        or not predict_from(params, kf, kf.hole_at, before)
+    ):
         return
     for i in range(n):
         change = prior = posterior = 0.0
@@ -368,7 +424,9 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
                 prior += share * before.p[j, k]
                 posterior += share * kf.states.p[j, k]
         if kf.judged >> i & 1:
-            worst = max(worst, change * change / max(prior - posterior, LEAST_SHARE * prior))
+            worst = max(
+                worst, change * change / max(prior - posterior, LEAST_SHARE * prior)
+            )
     if worst >= 2.0 * math.log(params.limit):
         case.onset = kf.hole_sample + 1
         open_case(params, state)
@@ -408,7 +466,9 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
     for i in range(n):
         if named >> i & 1:
             first, second = (i, -1) if first < 0 else (first, i)
-    if not information[first, first] > 0.0 or (second >= 0 and not information[second, second] > 0.0):
+    if not information[first, first] > 0.0 or (
+        second >= 0 and not information[second, second] > 0.0
+    ):
         return False
     both = correlation(information, first, second) if second >= 0 else 0.0
     free = max(1.0 - both * both, 1e-3)
@@ -418,15 +478,23 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
         # Regression on the one or two that are named.
         on_first = correlation(information, j, first)
         on_second = correlation(information, j, second) if second >= 0 else 0.0
-        a, b = (on_first - both * on_second) / free, (on_second - both * on_first) / free
+        a, b = (
+            (on_first - both * on_second) / free,
+            (on_second - both * on_first) / free,
+        )
         variance = 1.0 - a * on_first - b * on_second
         for back in range(scale.kept):
-            if scale.first[(scale.newest - back + KEPT) % KEPT] < case.onset - params.length:
+            if (
+                scale.first[(scale.newest - back + KEPT) % KEPT]
+                < case.onset - params.length
+            ):
                 break
             x = value_at(scale, back, first)
             y = value_at(scale, back, second) if second >= 0 else 0.0
             other = abs(value_at(scale, back, j) - a * x - b * y)
-            if variance > 1e-3 and other > OTHERS * math.sqrt(variance) + TURNED * max(abs(x), abs(y)):
+            if variance > 1e-3 and other > OTHERS * math.sqrt(variance) + TURNED * max(
+                abs(x), abs(y)
+            ):
                 return True
     return False
 
@@ -499,8 +567,14 @@ def goes_too_far(params: Constants, state: State) -> bool:
     if case.moved == 0.0 or kf.seconds - case.moved_at > WARMS:
         return False
     for r in range(params.layout.count):
-        far = r < params.sensors.n and abs(kf.states.x[r] - case.reference[r]) > LARGEST_MOVE
-        if far or (0 <= feeds[r] < params.sensors.n and abs(kf.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
+        far = (
+            r < params.sensors.n
+            and abs(kf.states.x[r] - case.reference[r]) > LARGEST_MOVE
+        )
+        if far or (
+            0 <= feeds[r] < params.sensors.n
+            and abs(kf.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE
+        ):
             return True
     return False
 
@@ -509,7 +583,11 @@ def goes_too_far(params: Constants, state: State) -> bool:
 def undo_move(params: Constants, state: State) -> None:
     """Open a case where all biases seemed to move; for `WARMS` no move is believed, as if they had moved too far."""
     case = state.case
-    case.onset, case.moved, case.moved_at = case.moved_since, math.e * LARGEST_MOVE, state.estimator.seconds
+    case.onset, case.moved, case.moved_at = (
+        case.moved_since,
+        math.e * LARGEST_MOVE,
+        state.estimator.seconds,
+    )
     open_case(params, state)
 
 
@@ -532,6 +610,10 @@ def follow_case(params: Constants, state: State) -> None:
     if kf.samples < case.next:
         return
     name_channels(params, state)
-    if case.open and case.inference.log_odds < ENDS and (kf.samples - case.onset) * params.period > 1.0:
+    if (
+        case.open
+        and case.inference.log_odds < ENDS
+        and (kf.samples - case.onset) * params.period > 1.0
+    ):
         forget_evidence(params, state)
         update_weights(params, kf)

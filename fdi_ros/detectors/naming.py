@@ -76,7 +76,9 @@ class Inference:
     y: Channels  # values less what is known of their errors, rad/s
     covariance: Square  # M, (rad/s)^2
     rate: Vector  # mean body rate, rad/s
-    angular_acceleration: Channels  # angular acceleration along each channel, lately largest, rad/s^2
+    angular_acceleration: (
+        Channels  # angular acceleration along each channel, lately largest, rad/s^2
+    )
     parity: Parity
     u: Channels  # A y, s/rad
     total: Real  # y' A y / 2
@@ -107,7 +109,12 @@ class Inference:
 @compiled
 def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
     """Set the mean of the last so many samples to be explained, and its covariance."""
-    n, layout, before, noise = params.sensors.n, params.layout, inference.before, kf.noise
+    n, layout, before, noise = (
+        params.sensors.n,
+        params.layout,
+        inference.before,
+        kf.noise,
+    )
     total_before(kf, kf.samples - size + 1, before, n)
     size = kf.samples - before.sample
     inference.mask = 0
@@ -142,7 +149,10 @@ def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) 
         if lasts:
             v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
         else:
-            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / params.length)
+            v = max(
+                v * max(1.0, BURST * noise.quick[i]),
+                noise.now.block[i] * over * size / params.length,
+            )
         bent = params.nonlinearity * params.nonlinearity * speed
         inference.covariance[i, i] += v / size + kf.peak_extra[i] * part + bent
         place = layout.delays[params.unit[i]]
@@ -153,11 +163,15 @@ def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) 
 
 
 @compiled
-def add_line(kf: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
+def add_line(
+    kf: Estimator, inference: Inference, n: int, size: int, lasts: bool
+) -> None:
     """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
     for i in range(n):
         for j in range(n):
-            slow = math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
+            slow = (
+                math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
+            )
             inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
 
 
@@ -204,26 +218,41 @@ def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
             inference.amplitude[p] += inference.inverse[p, q] * inference.along[q]
         inference.fit += 0.5 * inference.amplitude[p] * inference.along[p]
         if given == 0.0:
-            t += (inference.amplitude[p] * inference.amplitude[p] + inference.inverse[p, p]) / k
+            t += (
+                inference.amplitude[p] * inference.amplitude[p]
+                + inference.inverse[p, p]
+            ) / k
     for p in range(k):
         inference.matrix[p, p] += 1.0 / t
     log_det = invert(inference.matrix, k, inference.inverse) + k * math.log(t)
     gain = 0.0
     for p in range(k):
         for q in range(k):
-            gain += 0.5 * inference.along[p] * inference.inverse[p, q] * inference.along[q]
+            gain += (
+                0.5 * inference.along[p] * inference.inverse[p, q] * inference.along[q]
+            )
     return gain - 0.5 * log_det
 
 
 @compiled
-def add(inference: Inference, n: int, k: int, log_odds: float, members: int, whole: bool) -> None:
+def add(
+    inference: Inference, n: int, k: int, log_odds: float, members: int, whole: bool
+) -> None:
     """Add a hypothesis, that of k directions whose ratio was worked out last."""
     for i in range(n):
         inference.errors[inference.count, i] = 0.0
         for p in range(k):
-            inference.errors[inference.count, i] += inference.direction[p, i] * inference.amplitude[p]
-    inference.odds[inference.count], inference.fits[inference.count] = log_odds, inference.fit
-    inference.members[inference.count], inference.whole[inference.count] = members, whole
+            inference.errors[inference.count, i] += (
+                inference.direction[p, i] * inference.amplitude[p]
+            )
+    inference.odds[inference.count], inference.fits[inference.count] = (
+        log_odds,
+        inference.fit,
+    )
+    inference.members[inference.count], inference.whole[inference.count] = (
+        members,
+        whole,
+    )
     inference.count += 1
 
 
@@ -247,7 +276,10 @@ def add_channels(inference: Inference, n: int) -> None:
             add(inference, n, 1, odds - SPREAD, 1 << i, False)
     if free < 2:
         return
-    prior = math.log((COINCIDENCE if free > 2 else TWO_CHECKS * COINCIDENCE) / n) - 2.0 * SPREAD
+    prior = (
+        math.log((COINCIDENCE if free > 2 else TWO_CHECKS * COINCIDENCE) / n)
+        - 2.0 * SPREAD
+    )
     for i in range(n):
         for j in range(i):
             if inference.judged >> i & 1 and inference.judged >> j & 1:
@@ -256,7 +288,14 @@ def add_channels(inference: Inference, n: int) -> None:
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
                     set_direction(inference, n, 0, i)
                     set_direction(inference, n, 1, j)
-                    add(inference, n, 2, prior + log_ratio(inference, n, 2, 0.0), 1 << i | 1 << j, False)
+                    add(
+                        inference,
+                        n,
+                        2,
+                        prior + log_ratio(inference, n, 2, 0.0),
+                        1 << i | 1 << j,
+                        False,
+                    )
 
 
 @compiled
@@ -274,13 +313,24 @@ def add_units(params: Constants, inference: Inference) -> None:
         if count < 2 or inside == inference.mask:
             continue
         # Of a unit the others cannot check in all its axes, the rest is as good a hypothesis.
-        add(inference, n, count, prior - count * SPREAD + log_ratio(inference, n, count, 0.0), inside, False)
+        add(
+            inference,
+            n,
+            count,
+            prior - count * SPREAD + log_ratio(inference, n, count, 0.0),
+            inside,
+            False,
+        )
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
                 along = inference.angular_acceleration[i]
                 if way == 0:
-                    along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+                    along = (
+                        axes[i, 0] * rate[0]
+                        + axes[i, 1] * rate[1]
+                        + axes[i, 2] * rate[2]
+                    )
                 inference.direction[0, i] = along if inside >> i & 1 else 0.0
             odds = log_ratio(inference, n, 1, std * std)
             if odds > NO_LOG:
@@ -298,7 +348,9 @@ def update_spread(inference: Inference, n: int, total: float) -> None:
         if share > 1e-4:
             for i in range(n):
                 for j in range(n):
-                    inference.spread[i, j] += share * inference.errors[k, i] * inference.errors[k, j]
+                    inference.spread[i, j] += (
+                        share * inference.errors[k, i] * inference.errors[k, j]
+                    )
 
 
 @compiled
@@ -315,10 +367,15 @@ def largest_of(inference: Inference) -> int:
 def update_best(inference: Inference, n: int) -> None:
     """Note the likeliest hypothesis, and whether what it leaves is noise."""
     best = largest_of(inference)
-    inference.log_odds, inference.likeliest = inference.odds[best], inference.members[best]
+    inference.log_odds, inference.likeliest = (
+        inference.odds[best],
+        inference.members[best],
+    )
     inference.fit_of_best = inference.fits[best]
     free = checks(inference.mask & ~inference.likeliest, n)
-    inference.fitted = 2.0 * (inference.total - inference.fit_of_best) <= FIT + FIT_PER_CHECK * max(free, 0)
+    inference.fitted = 2.0 * (
+        inference.total - inference.fit_of_best
+    ) <= FIT + FIT_PER_CHECK * max(free, 0)
     inference.largest = 0.0
     for i in range(n):
         if inference.likeliest >> i & 1:
@@ -362,7 +419,13 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
 def explain(params: Constants, inference: Inference) -> None:
     """Explain a mean: find the smallest set of hypotheses that holds the truth with the confidence."""
     n = params.sensors.n
-    fill_joint_parity(inference.parity, params.sensors, inference.mask, inference.covariance, UNKNOWN_RATE)
+    fill_joint_parity(
+        inference.parity,
+        params.sensors,
+        inference.mask,
+        inference.covariance,
+        UNKNOWN_RATE,
+    )
     inference.total = 0.0
     for i in range(n):
         inference.u[i] = 0.0
@@ -390,5 +453,7 @@ def moved_by(inference: Inference, n: int) -> float:
     for i in range(n):
         if inference.mask >> i & 1:
             trace += inference.parity.information[i, i]
-    square = max(2.0 * inference.total - checks(inference.mask, n), 0.0) / max(trace, 1e-12)
+    square = max(2.0 * inference.total - checks(inference.mask, n), 0.0) / max(
+        trace, 1e-12
+    )
     return math.sqrt(square)

@@ -47,7 +47,13 @@ from fdi_ros.estimator.blocks import (
     update_rest,
     update_time_offsets,
 )
-from fdi_ros.estimator.error_states import begin_states, fill_signals, predict, prepare_layout, project
+from fdi_ros.estimator.error_states import (
+    begin_states,
+    fill_signals,
+    predict,
+    prepare_layout,
+    project,
+)
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     LONG_TIME,
@@ -74,7 +80,12 @@ from fdi_ros.estimator.noise import (
     update_sample_variance,
     update_unknown,
 )
-from fdi_ros.estimator.shared_noise import begin_shared, update_line, update_shape, update_shared_level
+from fdi_ros.estimator.shared_noise import (
+    begin_shared,
+    update_line,
+    update_shape,
+    update_shared_level,
+)
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
@@ -88,7 +99,9 @@ PAUSE = 5.0
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any,
 calibrated or not."""
-SHORT = 1.0 - 1e-9  # what is shown of the threshold where the sums have reached it, and there is no alarm
+SHORT = (
+    1.0 - 1e-9
+)  # what is shown of the threshold where the sums have reached it, and there is no alarm
 
 
 @compiled
@@ -143,10 +156,19 @@ def process_block(params: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     noise, learns = kf.noise, not case.open
-    update_largest_rate(noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2)
+    update_largest_rate(
+        noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
+    )
     update_unknown(noise, n, kf.span)
     update_sample_variance(
-        noise, n, kf.masks[0], params.length, kf.all_blocks, params.adaptation_gain, params.expected, learns
+        noise,
+        n,
+        kf.masks[0],
+        params.length,
+        kf.all_blocks,
+        params.adaptation_gain,
+        params.expected,
+        learns,
     )
     update_shared_level(params, kf)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
@@ -189,7 +211,9 @@ def forget_suspicion(params: Constants, state: State) -> None:
     Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is re-estimated.
     """
     kf, case = state.estimator, state.case
-    inflate_delays(params, kf, state.declared | (case.isolated | case.suspects if case.open else 0))
+    inflate_delays(
+        params, kf, state.declared | (case.isolated | case.suspects if case.open else 0)
+    )
     state.cleared, state.declared = False, 0
     forget_evidence(params, state)
     forget_motion(kf, params.sensors.n)
@@ -226,7 +250,9 @@ def fill_outliers(params: Constants, state: State, verdict: SampleVerdict) -> No
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
     kf, largest, far = state.estimator, 0.0, 0.0
     for i in range(params.sensors.n):
-        burst = max(1.0, BURST * kf.noise.quick[i], kf.shared.level[i] / kf.noise.now.sample[i])
+        burst = max(
+            1.0, BURST * kf.noise.quick[i], kf.shared.level[i] / kf.noise.now.sample[i]
+        )
         largest = max(largest, abs(kf.statistic[i]) / math.sqrt(burst))
         far = max(far, kf.distance[i])
     for i in range(params.sensors.n):
@@ -238,7 +264,9 @@ def fill_outliers(params: Constants, state: State, verdict: SampleVerdict) -> No
 
 
 @compiled
-def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def fill_verdict(
+    params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     unsure = case.open and case.isolated == 0
@@ -248,7 +276,10 @@ def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: 
     for i in range(n):
         variance = kf.shared.level[i] * odd
         verdict.noise[i] = math.sqrt(variance / params.expected[i])
-        sample.estimate.corrected[i], sample.estimate.variance[i] = kf.corrected[i], variance
+        sample.estimate.corrected[i], sample.estimate.variance[i] = (
+            kf.corrected[i],
+            variance,
+        )
         sample.estimate.bias[i] = kf.states.x[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         for j in range(n):
@@ -258,7 +289,9 @@ def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: 
         if unsure and kf.mask >> i & 1:
             # And where no hypothesis says why it is off, by what it differs from the others now.
             innovation = kf.innovation[i]
-            if innovation * innovation > THREE_SIGMA * (sample.estimate.covariance[i, i] + variance):
+            if innovation * innovation > THREE_SIGMA * (
+                sample.estimate.covariance[i, i] + variance
+            ):
                 sample.estimate.covariance[i, i] += innovation * innovation
     sample.estimate.behind, sample.estimate.spread = kf.behind, kf.spread
     sample.estimate.checked = 0 if is_blind(kf) else kf.checked
@@ -277,7 +310,9 @@ def fill_verdict(params: Constants, state: State, sample: SampleInput, verdict: 
 
 
 @callback(Constants, State, SampleInput, SampleVerdict)
-def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(
+    params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
     kf, case = state.estimator, state.case
     verdict.threshold = math.log(1.0 + params.limit)
@@ -296,7 +331,9 @@ def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleV
         verdict.statistic = 0.0
         return
     if sample.repeated:
-        verdict.statistic = min(math.log(1.0 + mean_of(params, state)), SHORT * verdict.threshold)
+        verdict.statistic = min(
+            math.log(1.0 + mean_of(params, state)), SHORT * verdict.threshold
+        )
         return
     update_shape(params, kf)
     process_sample(params, state, sample)
@@ -368,8 +405,12 @@ class Sequential(Detector):
         delay_std: float = 0.001,
     ) -> None:
         if not 0.5 < confidence < 1:
-            raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
-        self.run_length = FalseAlarmRate(run_length, None, false_alarms_per_hour, sample_rate).mean_run_length()
+            raise ConfigError(
+                f"confidence is {confidence:g}, expected above 0.5 and below 1"
+            )
+        self.run_length = FalseAlarmRate(
+            run_length, None, false_alarms_per_hour, sample_rate
+        ).mean_run_length()
         self.sample_rate = 100.0 if sample_rate is None else sample_rate
         walk = np.broadcast_to(np.asarray(bias_walk, dtype=np.float64), geometry.n)
         super().__init__(
@@ -388,25 +429,38 @@ class Sequential(Detector):
         for u, channels in enumerate(geometry.units):
             unit[list(channels)] = u
         params["units"], params["unit"][:n] = len(geometry.units), unit
-        params["members"][: len(geometry.units)] = [mask_of(channels) for channels in geometry.units]
+        params["members"][: len(geometry.units)] = [
+            mask_of(channels) for channels in geometry.units
+        ]
         prepare_layout(
             params["layout"],
             unit,
             len(geometry.units),
-            {"bias": noise.bias_std, "scale": np.maximum(noise.scale_std, LEAST_SCALE), "delay": delay_std},
+            {
+                "bias": noise.bias_std,
+                "scale": np.maximum(noise.scale_std, LEAST_SCALE),
+                "delay": delay_std,
+            },
             {"bias": walk},
         )
         params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
         params["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
         params["period"] = 1.0 / self.sample_rate
-        params["adaptation_gain"] = 1.0 / max(0.5 * self.sample_rate / params["length"], 8.0)
+        params["adaptation_gain"] = 1.0 / max(
+            0.5 * self.sample_rate / params["length"], 8.0
+        )
         params["expected"][:n] = noise.noise_std**2
-        params["timing"][:n], params["nonlinearity"] = np.maximum(noise.timing_std, LEAST_TIMING), BENT
+        params["timing"][:n], params["nonlinearity"] = (
+            np.maximum(noise.timing_std, LEAST_TIMING),
+            BENT,
+        )
         params["rest_std"] = REST_STD
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
         enough = used.sum(axis=1) >= MIN_CHANNELS
-        params["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
+        params["spans"][: 1 << n] = enough & (
+            singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0]
+        )
         params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         params["limit"], params["confidence"] = self.run_length, confidence
 

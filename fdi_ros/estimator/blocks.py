@@ -43,7 +43,9 @@ from fdi_ros.estimator.noise import MOTION, REST, THREE_SIGMA
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array
 
-QUIET = 3.0  # variance of blocks over that of rest before: a hover in vibration has more
+QUIET = (
+    3.0  # variance of blocks over that of rest before: a hover in vibration has more
+)
 REST_STD = 3e-4  # rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates
 UNLEARNED = 0.003  # rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn
 REST_CHI = 1.6  # scatter of the blocks of a second over that of noise: 72 degrees of freedom exceed it once in 1000
@@ -51,7 +53,9 @@ REST_LAST = 12.0  # square of the last block's distance from their mean: soon en
 
 
 @compiled
-def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float) -> bool:
+def rests(
+    rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float
+) -> bool:
     """Whether the rates (`REST_BLOCKS`, c) of blocks, rad/s, scatter as noise does, about zero.
 
     In any order, of the body or as single channels measure it; ``newest``: place of the last. ``variance``,
@@ -68,8 +72,15 @@ def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floo
             scatter += gap * gap / (variance[a] + floor)
             if k == newest:
                 last = max(last, gap * gap / (variance[a] + floor))
-        largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]))
-    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < THREE_SIGMA and last < REST_LAST
+        largest = max(
+            largest,
+            mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]),
+        )
+    return (
+        scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI
+        and largest < THREE_SIGMA
+        and last < REST_LAST
+    )
 
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
@@ -106,7 +117,10 @@ def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
 @compiled
 def is_after_hole(params: Constants, kf: Estimator) -> bool:
     """Whether there was a hole in the stream lately."""
-    return kf.hole_sample > 0 and (kf.samples - kf.hole_sample) * params.period < AFTER_HOLE
+    return (
+        kf.hole_sample > 0
+        and (kf.samples - kf.hole_sample) * params.period < AFTER_HOLE
+    )
 
 
 @compiled
@@ -118,7 +132,9 @@ def move_biases(params: Constants, kf: Estimator, std: float, rate_std: float) -
 
 
 @compiled
-def add_to_biases(params: Constants, states: ErrorStates, std: float, rate_std: float) -> None:
+def add_to_biases(
+    params: Constants, states: ErrorStates, std: float, rate_std: float
+) -> None:
     """Add to the variances of the biases and of their rates of change."""
     for r in range(params.layout.count):
         if r < params.sensors.n:
@@ -133,14 +149,18 @@ def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
     for u in range(1, params.units):
         if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
-            kf.states.p[place, place] += params.layout.prior[place] * params.layout.prior[place]
+            kf.states.p[place, place] += (
+                params.layout.prior[place] * params.layout.prior[place]
+            )
             # The states kept are surer than what is known now.
             for tier in range(TIERS):
                 kf.taken[tier] = 0
 
 
 @compiled
-def predict_from(params: Constants, kf: Estimator, seconds: float, states: ErrorStates) -> bool:
+def predict_from(
+    params: Constants, kf: Estimator, seconds: float, states: ErrorStates
+) -> bool:
     """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
     best, latest = -1, 0.0
     for tier in range(TIERS):
@@ -164,7 +184,9 @@ not be taken for motion, or delays would be learned as zero."""
 PEAK = 0.8  # what a peak of motion fades to with every block: gone in half a second
 TAKE_OFF = 0.002  # s; a smaller delay is an error state, whose first order is enough
 SURE = 25.0  # square of a delay in its variances from which it is sure: it moves the values of all that come after
-LONGEST_DELAY = 0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
+LONGEST_DELAY = (
+    0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
+)
 
 
 @compiled
@@ -186,12 +208,18 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
             total += square * kf.noise.now.block[i]
             alone += square * kf.noise.now.sample[i]
         worst, single = max(worst, total), max(single, alone)
-        kf.acceleration[a] = first * (kf.rates[0, a] - kf.rates[1, a]) + last * (kf.rates[1, a] - kf.rates[2, a])
+        kf.acceleration[a] = first * (kf.rates[0, a] - kf.rates[1, a]) + last * (
+            kf.rates[1, a] - kf.rates[2, a]
+        )
         between = (kf.ends[1, a] - kf.ends[2, a]) / span
         apart += (between - kf.acceleration[a]) * (between - kf.acceleration[a])
     single *= 2.0 / (span * span)
     kf.shaken = 0.0
-    noise = (first * first + last * last + (last - first) * (last - first)) * worst / params.length
+    noise = (
+        (first * first + last * last + (last - first) * (last - first))
+        * worst
+        / params.length
+    )
     if apart <= TURNING * single or span > 2.0 * params.length * params.period:
         return noise
     # Of vibration that blocks are too slow for nobody knows what it is: what channels see of it is no delay.
@@ -224,16 +252,23 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
         for a in range(3):
             h = params.sensors.axes[i, a]
             along += h * kf.acceleration[a]
-            after, before = (kf.rates[0, a] - kf.rates[1, a]) / ahead, (kf.rates[1, a] - kf.rates[2, a]) / behind
+            after, before = (
+                (kf.rates[0, a] - kf.rates[1, a]) / ahead,
+                (kf.rates[1, a] - kf.rates[2, a]) / behind,
+            )
             lately += h * after
             jerk += h * 2.0 * (after - before) / (ahead + behind)
         kf.angular_acceleration[i] = along if turning else 0.0
-        swift = params.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
+        swift = params.timing[i] * max(
+            max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0
+        )
         kf.extra[i] = swift * swift + params.nonlinearity * params.nonlinearity * speed
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
-            kf.extra[i] += second * (noise + kf.shaken) + ((0.5 * second * jerk) ** 2 if turning else 0.0)
+            kf.extra[i] += second * (noise + kf.shaken) + (
+                (0.5 * second * jerk) ** 2 if turning else 0.0
+            )
 
 
 @compiled
@@ -250,9 +285,13 @@ def judge_block(params: Constants, kf: Estimator) -> float:
         kf.means[1, i] -= kf.angular_acceleration[i] * kf.middles[1, i]
         for j in range(n):
             kf.matrix[i, j] = kf.block_at.covariance[i, j]
-        kf.matrix[i, i] += noise.now.block[i] * noise.longest[i] / params.length + kf.extra[i]
+        kf.matrix[i, i] += (
+            noise.now.block[i] * noise.longest[i] / params.length + kf.extra[i]
+        )
     fill_joint_parity(kf.block_parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
-    subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
+    subtract_errors(
+        layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
+    )
     chi, free = 0.0, -3.0
     for i in range(n):
         total = share = 0.0
@@ -268,7 +307,11 @@ def judge_block(params: Constants, kf: Estimator) -> float:
         for j in range(n):
             kf.block_information[i, j] = information[i, j]
         kf.block_values[i] = total
-        noise.share[i] = max(share / information[i, i], LEAST_SHARE) if information[i, i] > 0.0 else 1.0
+        noise.share[i] = (
+            max(share / information[i, i], LEAST_SHARE)
+            if information[i, i] > 0.0
+            else 1.0
+        )
     return min(1.0, usual_chi(free) / max(chi, 1e-9))
 
 
@@ -295,11 +338,20 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         kf.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
         kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
-    kf.rest = rests(kf.rest_rates, newest, kf.rest_noise, kf.rest_bias_variance, params.rest_std * params.rest_std)
+    kf.rest = rests(
+        kf.rest_rates,
+        newest,
+        kf.rest_noise,
+        kf.rest_bias_variance,
+        params.rest_std * params.rest_std,
+    )
     if kf.noise.lived[REST] > LONG_TIME:
         # A hover in vibration may turn as little: it is known by its noise.
         for i in range(n):
-            if kf.masks[1] >> i & 1 and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]:
+            if (
+                kf.masks[1] >> i & 1
+                and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]
+            ):
                 kf.rest = kf.rest and kf.noise.regime == REST
 
 
@@ -327,19 +379,34 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
         inside = kf.shared.vibration[a]
         quick = max(quick, inside)
         for i in range(n):
-            along = params.sensors.axes[i, a] * params.sensors.axes[i, a] / (UNEQUAL * UNEQUAL * params.length)
-            inside = max(inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i])
+            along = (
+                params.sensors.axes[i, a]
+                * params.sensors.axes[i, a]
+                / (UNEQUAL * UNEQUAL * params.length)
+            )
+            inside = max(
+                inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i]
+            )
             quick = max(quick, along * noise.now.block[i] * noise.longest[i])
         # A peak of vibration is no motion.
-        kf.usual_rate[a] += (kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]) / REST_BLOCKS
+        kf.usual_rate[a] += (
+            kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]
+        ) / REST_BLOCKS
         for i in range(n):
-            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
+            error = (
+                noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
+            )
             least = unlearnable(error, inside, kf.usual_rate[a])
             keep_least_variance(layout, i, RATE_X + a, least, kf.taught)
     for i in range(n):
         # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be learned
         # in the first seconds of motion.
-        error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / params.length
+        error = (
+            noise.now.block[i]
+            * noise.longest[i]
+            * math.sqrt(noise.unknown[i])
+            / params.length
+        )
         turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
         least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), turn)
         keep_least_variance(layout, i, TURN, least, kf.taught)
@@ -361,18 +428,33 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
         for i in range(n):
             for j in range(n):
                 kf.matrix[i, j] += kf.block_at.covariance[i, j]
-        subtract_errors(layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation)
+        subtract_errors(
+            layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
+        )
     if kf.rest or kept != kf.masks[1]:
         known = 1.0 / (params.rest_std * params.rest_std) if kf.rest else UNKNOWN_RATE
         fill_joint_parity(kf.block_parity, params.sensors, kept, kf.matrix, known)
     update_least_variances(params, kf)
-    update(layout, kf.states, kf.block_at, kf.block_parity.information, kf.block_innovation, weight, kf.taught)
+    update(
+        layout,
+        kf.states,
+        kf.block_at,
+        kf.block_parity.information,
+        kf.block_innovation,
+        weight,
+        kf.taught,
+    )
 
 
 @compiled
 def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
-    n, layout, square, ahead = params.sensors.n, params.layout, 0.0, kf.times[0] - kf.times[1]
+    n, layout, square, ahead = (
+        params.sensors.n,
+        params.layout,
+        0.0,
+        kf.times[0] - kf.times[1],
+    )
     for a in range(3):
         change = (kf.rates[0, a] - kf.rates[1, a]) / ahead
         square += change * change
@@ -381,12 +463,18 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     for i in range(n):
         quick = 0.0
         for a in range(3):
-            quick += params.sensors.axes[i, a] * (kf.rates[0, a] - kf.rates[1, a]) / ahead
+            quick += (
+                params.sensors.axes[i, a] * (kf.rates[0, a] - kf.rates[1, a]) / ahead
+            )
         if not begins:
             quick = 0.0
         if abs(kf.angular_acceleration[i]) > abs(quick):
             quick = kf.angular_acceleration[i]
-        kf.peak_turn[i] = quick if abs(quick) > PEAK * abs(kf.peak_turn[i]) else PEAK * kf.peak_turn[i]
+        kf.peak_turn[i] = (
+            quick
+            if abs(quick) > PEAK * abs(kf.peak_turn[i])
+            else PEAK * kf.peak_turn[i]
+        )
         kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
     for a in range(3):
         kf.signal_rate[a] = kf.rates[0, a] if moves else 0.0
@@ -421,7 +509,9 @@ def transfer_delays(params: Constants, kf: Estimator) -> bool:
         place = params.layout.delays[u]
         delay, variance = kf.states.x[place], kf.states.p[place, place]
         if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
-            step = min(max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u])
+            step = min(
+                max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u]
+            )
             kf.late[u] += step
             kf.states.x[place] -= step
             changed = changed or step != 0.0

@@ -18,7 +18,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, Square, Whole, compiled, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    MAX_UNITS,
+    Square,
+    Whole,
+    compiled,
+    record,
+)
 from fdi_ros.model.samples import Array
 
 ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
@@ -37,7 +44,9 @@ class StateKind(NamedTuple):
     """By what each of its states is multiplied; none: one state, which is the rate of change of `feeds`."""
     prior: float  # standard deviation before anything is shown, where `prepare_layout` is given no other
     walk: float = 0.0  # random walk, per sqrt(s), where none other is given
-    memory: float = 0.0  # s, after which a rate of change has faded: a Gauss-Markov process
+    memory: float = (
+        0.0  # s, after which a rate of change has faded: a Gauss-Markov process
+    )
     feeds: str = ""  # name of the kind whose rate of change this is
 
 
@@ -56,7 +65,10 @@ ERROR_KINDS = (
 MULTIPLIERS = tuple(by for kind in ERROR_KINDS for by in kind.by)
 """Of each signal of a channel, those of all kinds in order."""
 SIGNALS = len(MULTIPLIERS)
-MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.by), 1) for kind in ERROR_KINDS)
+MAX_STATES = sum(
+    (MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.by), 1)
+    for kind in ERROR_KINDS
+)
 
 States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]
 Places = Annotated[NDArray[np.int64], "i8", (MAX_STATES,)]
@@ -78,7 +90,9 @@ class Layout:
     walk: States  # per sqrt(s)
     memory: States  # s; 0: for ever
     feeds: Places  # state whose rate of change it is; -1: none
-    delays: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # state of the delay of each unit; -1: none
+    delays: Annotated[
+        NDArray[np.int64], "i8", (MAX_UNITS,)
+    ]  # state of the delay of each unit; -1: none
 
 
 @record
@@ -105,7 +119,9 @@ def places_of(name: str, n: int, units: int) -> list[list[int]]:
     for kind in ERROR_KINDS:
         owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.by), 1)
         if kind.name == name:
-            return [[at + owner * each + k for k in range(each)] for owner in range(owners)]
+            return [
+                [at + owner * each + k for k in range(each)] for owner in range(owners)
+            ]
         at += owners * each
     raise KeyError(name)
 
@@ -123,10 +139,19 @@ def prepare_layout(
     place of the table's. `ValueError` if one is in neither.
     """
     n = len(unit)
-    layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = n, MULTIPLIERS, -1, -1, -1
+    layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = (
+        n,
+        MULTIPLIERS,
+        -1,
+        -1,
+        -1,
+    )
     count = signals = 0
     for kind in ERROR_KINDS:
-        owners, own = places_of(kind.name, n, units), slice(signals, signals + len(kind.by))
+        owners, own = (
+            places_of(kind.name, n, units),
+            slice(signals, signals + len(kind.by)),
+        )
         signals = own.stop
         prior, walk = (
             np.broadcast_to(given.get(kind.name, usual), max(n, len(owners)))
@@ -180,7 +205,9 @@ def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
 
 
 @compiled
-def fill_signals(layout: Layout, rate: Array, angular_acceleration: Array, signals: Array) -> None:
+def fill_signals(
+    layout: Layout, rate: Array, angular_acceleration: Array, signals: Array
+) -> None:
     """Signals (n, `SIGNALS`) at a body rate (3,) rad/s and an angular acceleration along each channel (n,) rad/s^2."""
     for i in range(layout.n):
         for k in range(SIGNALS):
@@ -218,7 +245,9 @@ def project(layout: Layout, states: ErrorStates, at: Projection) -> None:
 
 
 @compiled
-def subtract_errors(layout: Layout, states: ErrorStates, signals: Array, values: Array, out: Array) -> None:
+def subtract_errors(
+    layout: Layout, states: ErrorStates, signals: Array, values: Array, out: Array
+) -> None:
     """Values (n,) less what the states say of their errors, rad/s."""
     for i in range(layout.n):
         total = values[i]
@@ -257,14 +286,24 @@ def update(
                 states.x[r] += taught[r] * at.weighted[j, r] * innovation[j]
                 share = at.weighted[j, r]
                 for c in range(r + 1):
-                    states.p[r, c] -= (1.0 - (1.0 - taught[r]) * (1.0 - taught[c])) * share * at.columns[j, c]
+                    states.p[r, c] -= (
+                        (1.0 - (1.0 - taught[r]) * (1.0 - taught[c]))
+                        * share
+                        * at.columns[j, c]
+                    )
     for r in range(count):
         for c in range(r):
             states.p[c, r] = states.p[r, c]
 
 
 @compiled
-def fill_shares(layout: Layout, states: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
+def fill_shares(
+    layout: Layout,
+    states: ErrorStates,
+    at: Projection,
+    information: Array,
+    taught: Array,
+) -> None:
     """Put into ``taught`` (states,), which holds the least variances, the share of its gain that each state takes."""
     for r in range(layout.count):
         least, taught[r], gained = taught[r], 1.0, 0.0
@@ -273,14 +312,18 @@ def fill_shares(layout: Layout, states: ErrorStates, at: Projection, information
                 if information[j, j] != 0.0:
                     gained += at.weighted[j, r] * at.columns[j, r]
             if gained > 0.0 and states.p[r, r] - gained < least:
-                taught[r] = 1.0 - math.sqrt(1.0 - min(max(states.p[r, r] - least, 0.0) / gained, 1.0))
+                taught[r] = 1.0 - math.sqrt(
+                    1.0 - min(max(states.p[r, r] - least, 0.0) / gained, 1.0)
+                )
         elif layout.feeds[r] >= layout.n:
             # The rate of change of a state is learned with it.
             taught[r] = taught[layout.feeds[r]]
 
 
 @compiled
-def keep_least_variance(layout: Layout, i: int, by: int, least: float, taught: Array) -> None:
+def keep_least_variance(
+    layout: Layout, i: int, by: int, least: float, taught: Array
+) -> None:
     """Let the states that enter channel i by ``by`` keep a variance: a unit learns from the axis that shows most."""
     for k in range(SIGNALS):
         place = layout.place[i, k]
@@ -289,7 +332,9 @@ def keep_least_variance(layout: Layout, i: int, by: int, least: float, taught: A
 
 
 @compiled
-def fill_gain(layout: Layout, at: Projection, information: Array, j: int, weight: float) -> None:
+def fill_gain(
+    layout: Layout, at: Projection, information: Array, j: int, weight: float
+) -> None:
     """Column j of P C' A, into ``at.weighted``."""
     row = at.weighted[j]
     for r in range(layout.count):

@@ -34,9 +34,28 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.core.subsets import UNKNOWN_RATE, apply_gain, fill_joint_parity, fill_parity
-from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, fill_signals, subtract_errors
-from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
+from fdi_ros.core.subsets import (
+    UNKNOWN_RATE,
+    apply_gain,
+    fill_joint_parity,
+    fill_parity,
+)
+from fdi_ros.estimator.error_states import (
+    ErrorStates,
+    Layout,
+    Projection,
+    States,
+    fill_signals,
+    subtract_errors,
+)
+from fdi_ros.estimator.noise import (
+    FAR,
+    MOTION,
+    THREE_SIGMA,
+    Noise,
+    SharedNoise,
+    change_regime,
+)
 from fdi_ros.model.samples import Array
 
 BLOCK_TIME = 0.04  # s; four samples at 100 Hz, and short against what moves a body
@@ -50,7 +69,11 @@ SNAPSHOT_TIME, TIERS, SNAPSHOTS = 3.0 * BLOCK_TIME, 5, 8
 """s between snapshots, three blocks; of each tier every eighth goes on to the next."""
 REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
 STRIDE = round(LONG_TIME / BLOCK_TIME)
-SAMPLES, BLOCKS, COARSE = 256, 1024, 512  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
+SAMPLES, BLOCKS, COARSE = (
+    256,
+    1024,
+    512,
+)  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
 LEAST_SHARE = 0.02  # share of noise in the variance of a statistic, at least: what is less is rounding
 SENSITIVE = 1e-6  # share of a channel's own variance in its parity, below which a fault does not show
 CHECKABLE = 0.01  # information over that with all errors known: with less a fault would have to be ten times as large
@@ -78,7 +101,9 @@ class Constants:
     adaptation_gain: Real  # of the noise of the moment, per block
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
-    nonlinearity: Real  # error that is not linear in the rate, standard deviation, share of it
+    nonlinearity: (
+        Real  # error that is not linear in the rate, standard deviation, share of it
+    )
     rest_std: Real  # of the rate at rest, rad/s
     spans: Sets  # sets of channels that span space
     least: Whole  # samples that a fault lasts
@@ -134,7 +159,9 @@ class Estimator:
     known: Channels  # information of each channel if all errors of the sensors were known, s^2/rad^2
     growth: Channels  # variance of each channel with that of the states, (rad/s)^2
     judged: Mask  # channels that the others check
-    checked: Mask  # of them, those of which what is not known of the states hides no fault
+    checked: (
+        Mask  # of them, those of which what is not known of the states hides no fault
+    )
     speed_squared: Real  # of the rate of the last block, (rad/s)^2
     parity: Parity  # of a sample
     fused: Parity  # of a sample, without the channels left aside
@@ -167,8 +194,12 @@ class Estimator:
     acceleration: Vector  # of the body in the middle of the block before, rad/s^2
     block_parity: Parity
     block_at: Projection
-    matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]  # M of a block, (rad/s)^2
-    block_information: Square  # A of all its channels, whatever is learned from, s^2/rad^2
+    matrix: Annotated[
+        NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)
+    ]  # M of a block, (rad/s)^2
+    block_information: (
+        Square  # A of all its channels, whatever is learned from, s^2/rad^2
+    )
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
     angular_acceleration: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
@@ -184,7 +215,9 @@ class Estimator:
     rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
-    hole_at: Real  # when the first of the last holes in the stream began, s since the start
+    hole_at: (
+        Real  # when the first of the last holes in the stream began, s since the start
+    )
     hole_sample: Whole  # number of the last sample before it; 0: there was none
     used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held
@@ -222,7 +255,11 @@ def update_weights(params: Constants, kf: Estimator) -> None:
         if kf.mask >> i & 1 and information * kf.matrix[i, i] > SENSITIVE:
             kf.judged |= 1 << i
             for j in range(n):
-                share += kf.parity.information[i, j] * kf.parity.information[i, j] * noise.now.sample[j]
+                share += (
+                    kf.parity.information[i, j]
+                    * kf.parity.information[i, j]
+                    * noise.now.sample[j]
+                )
             kf.share[i] = max(share / information, LEAST_SHARE)
             # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
             hidden = kf.known[i] / information - 1.0
@@ -305,7 +342,11 @@ def update_statistics(params: Constants, kf: Estimator) -> None:
             variance = kf.share[i] + more * (1.0 - kf.share[i])
             kf.statistic[i] = total / math.sqrt(kf.parity.information[i, i] * variance)
             kf.inflation[i] = variance / kf.share[i]
-            chi += total * kf.innovation[i] / max(kf.shared.level[i] / kf.noise.now.sample[i], 1.0)
+            chi += (
+                total
+                * kf.innovation[i]
+                / max(kf.shared.level[i] / kf.noise.now.sample[i], 1.0)
+            )
             free += 1.0
         kf.distance[i] = abs(kf.statistic[i]) * math.sqrt(kf.share[i] * kf.inflation[i])
     kf.odd = max(1.0, chi / usual_chi(free))
@@ -371,14 +412,21 @@ def close_block(params: Constants, kf: Estimator) -> None:
         # A unit may be slower than the others.
         if 2.0 * kf.sum_count[i] >= params.length:
             present |= 1 << i
-        kf.means[1, i], kf.means[0, i] = kf.means[0, i], kf.sum_values[i] / max(kf.sum_count[i], 1.0)
+        kf.means[1, i], kf.means[0, i] = (
+            kf.means[0, i],
+            kf.sum_values[i] / max(kf.sum_count[i], 1.0),
+        )
         kf.middles[1, i] = kf.middles[0, i]
         kf.middles[0, i] = kf.sum_time[i] / max(kf.sum_count[i], 1.0) - middle
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
     kf.masks[1], kf.masks[0] = kf.masks[0], present
     for a in range(3):
         kf.rates[2, a], kf.rates[1, a] = kf.rates[1, a], kf.rates[0, a]
-        kf.ends[2, a], kf.ends[1, a], kf.ends[0, a] = kf.ends[1, a], kf.ends[0, a], kf.total.instant[a]
+        kf.ends[2, a], kf.ends[1, a], kf.ends[0, a] = (
+            kf.ends[1, a],
+            kf.ends[0, a],
+            kf.total.instant[a],
+        )
         kf.rates[0, a] = kf.sum_rate[a] / params.length
         kf.sum_rate[a] = 0.0
     kf.times[2], kf.times[1], kf.times[0] = kf.times[1], kf.times[0], kf.begun + middle

@@ -42,12 +42,17 @@ THREE_SIGMA, FAR = 9.0, 100.0
 """Squares of three standard deviations, which one of 370 normal values exceeds, and of ten, which none does."""
 BURST = 0.75  # share of the variance of half a second that is no scatter: it counts where it exceeds the learned one
 QUIETEST = 0.1  # of the variance expected: less is not believed, or the noise would be unknown when it comes back
-QUIETEST_BLOCK = 0.03  # the same of blocks: quantised values at rest have means that scatter less
+QUIETEST_BLOCK = (
+    0.03  # the same of blocks: quantised values at rest have means that scatter less
+)
 LOUDEST = 1e4  # of blocks at most: in a hundred times the noise expected nothing could be told
 UNKNOWN = 16.0  # variance of long times over that of blocks at most, before any was measured: four times the noise
 FASTER = 16.0  # four times as fast as ever: vibration and what is not linear are others than in a hover
 WILD = 5.0  # standard deviations that no normal value reaches: gone with the next one it is no fault
-WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0  # before any was seen: one in 200 000, of which 4000 samples tell more
+WILD_EVENTS, WILD_SAMPLES = (
+    0.02,
+    4000.0,
+)  # before any was seen: one in 200 000, of which 4000 samples tell more
 SURELY = 0.8  # share of a level of long times that is no scatter of its estimate, which is from some 80 values at most
 TRUST = 50.0  # degrees of freedom at most: what has more is normal
 TAIL_MEMORY = 6000.0
@@ -99,7 +104,9 @@ class Noise:
     block_set: Mask  # of the last block
     steps: Channels  # half squared differences of the samples of the block
     counted: Channels  # how many
-    cross: Channels  # what is in common says that the variance is larger by, share of it
+    cross: (
+        Channels  # what is in common says that the variance is larger by, share of it
+    )
     square: Channels  # mean of them
     neighbours: Channels  # mean product of adjacent ones
     squares: Pair  # the last two
@@ -125,7 +132,9 @@ class SharedNoise:
     count: Real  # samples that it is of
     line: Square  # of R what lines explained while nothing was suspicious, (rad/s)^2
     excess: Real  # level of R over that of independent channels, at least 1
-    coherent: Real  # share of the noise that lines explain, and independent channels do not
+    coherent: (
+        Real  # share of the noise that lines explain, and independent channels do not
+    )
     level: Channels  # variance of each channel now, (rad/s)^2
     past: Annotated[NDArray[np.float64], "f8", (PAST, MAX_CHANNELS)]  # rad/s
     taken: Whole  # fourth differences of this block
@@ -178,11 +187,17 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
     after = noise.kept[regime]
     for i in range(n):
         before.sample[i], before.block[i] = noise.now.sample[i], noise.now.block[i]
-        noise.now.sample[i] = max(after.sample[i], noise.now.sample[i] if at_least else 0.0)
-        noise.now.block[i] = max(after.block[i], noise.now.block[i] if at_least else 0.0)
+        noise.now.sample[i] = max(
+            after.sample[i], noise.now.sample[i] if at_least else 0.0
+        )
+        noise.now.block[i] = max(
+            after.block[i], noise.now.block[i] if at_least else 0.0
+        )
         for k in range(SCALES + LAGS):
             before.level[k, i] = noise.now.level[k, i]
-            noise.now.level[k, i] = max(after.level[k, i], noise.now.level[k, i] if at_least else 0.0)
+            noise.now.level[k, i] = max(
+                after.level[k, i], noise.now.level[k, i] if at_least else 0.0
+            )
     noise.regime = regime
     update_longest(noise, n)
 
@@ -201,7 +216,9 @@ def place_of(noise: Noise, mask: int) -> int:
 
 
 @compiled
-def update_sample_noise(noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
+def update_sample_noise(
+    noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int
+) -> None:
     """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
     gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
     # Of other channels the rate is another: their difference would be that of the errors of the sensors.
@@ -217,7 +234,9 @@ def update_sample_noise(noise: Noise, n: int, mask: int, t: Array, inflation: Ar
             noise.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * noise.quick[i])
             if learn:
-                noise.neighbours[i] += gain * (min(step * noise.squares[odd, i], FAR) - noise.neighbours[i])
+                noise.neighbours[i] += gain * (
+                    min(step * noise.squares[odd, i], FAR) - noise.neighbours[i]
+                )
                 noise.square[i] += gain * (step - noise.square[i])
             noise.squares[odd, i] = step
     count_wild(noise, SAMPLE, n, mask, t)
@@ -234,12 +253,21 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
             if abs(noise.last[scale, i]) > WILD and t[i] * t[i] < THREE_SIGMA:
                 noise.wild[scale, i] += 1.0
             noise.last[scale, i] = t[i]
-        noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (noise.wild[scale, i] + WILD_EVENTS)
+        noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (
+            noise.wild[scale, i] + WILD_EVENTS
+        )
 
 
 @compiled
 def update_sample_variance(
-    noise: Noise, n: int, mask: int, length: int, blocks: int, adaptation_gain: float, expected: Array, learn: bool
+    noise: Noise,
+    n: int,
+    mask: int,
+    length: int,
+    blocks: int,
+    adaptation_gain: float,
+    expected: Array,
+    learn: bool,
 ) -> None:
     """Learn the variance of samples, beside the one expected (n,) (rad/s)^2, from those of a block.
 
@@ -254,7 +282,9 @@ def update_sample_variance(
             noise.quick[i] += adaptation_gain * (step + part * (1.0 - noise.quick[i]))
             if learn:
                 factor = 1.0 + gain * (step + part * noise.cross[i])
-                noise.now.sample[i] = max(noise.now.sample[i] * factor, QUIETEST * expected[i])
+                noise.now.sample[i] = max(
+                    noise.now.sample[i] * factor, QUIETEST * expected[i]
+                )
         noise.steps[i] = noise.counted[i] = 0.0
     update_degrees(noise, n, mask)
 
@@ -270,23 +300,33 @@ def update_degrees(noise: Noise, n: int, mask: int) -> None:
         if mask >> i & 1:
             total += noise.neighbours[i] / (noise.square[i] * noise.square[i]) - 1.0
             count += 1
-    scatter = TAIL_SCATTER / math.sqrt(min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY))
+    scatter = TAIL_SCATTER / math.sqrt(
+        min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    )
     for i in range(n):
         own_excess = noise.neighbours[i] / (noise.square[i] * noise.square[i]) - 1.0
         excess = max(total / max(count, 1), own_excess - 2.0 * scatter, 1e-3)
-        noise.degrees[i] = min(3.0 + 0.5 / excess, TRUST, 2.0 + noise.seen[SAMPLE] / LEARNED_IN)
+        noise.degrees[i] = min(
+            3.0 + 0.5 / excess, TRUST, 2.0 + noise.seen[SAMPLE] / LEARNED_IN
+        )
 
 
 @compiled
-def update_block_noise(noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
+def update_block_noise(
+    noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool
+) -> None:
     """Take the statistics t (n,) of a block; expected: (n,) (rad/s)^2."""
     gain = 1.0 / min(noise.seen[BLOCK] + 25.0, 100.0)
     for i in range(n):
         if mask >> i & 1:
             step = t[i] - noise.last[BLOCK, i]
             if noise.seen[BLOCK] > 1 and learn and mask == noise.block_set:
-                ratio = min(0.5 * step * step * noise.longest[i] / noise.share[i], THREE_SIGMA)
-                least = max(QUIETEST * noise.now.sample[i], QUIETEST_BLOCK * expected[i])
+                ratio = min(
+                    0.5 * step * step * noise.longest[i] / noise.share[i], THREE_SIGMA
+                )
+                least = max(
+                    QUIETEST * noise.now.sample[i], QUIETEST_BLOCK * expected[i]
+                )
                 block = max(noise.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
                 noise.now.block[i] = min(block, LOUDEST * expected[i])
             noise.now.level[BLOCK, i] = noise.now.block[i] / noise.now.sample[i]
@@ -295,29 +335,54 @@ def update_block_noise(noise: Noise, n: int, mask: int, t: Array, expected: Arra
 
 
 @compiled
-def update_slow_level(noise: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
+def update_slow_level(
+    noise: Noise, k: int, i: int, step: float, gain: float, learn: bool
+) -> None:
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
         level, square = noise.now.level[k, i], 0.5 * step * step * noise.longest[i]
-        noise.now.level[k, i] += gain * (min(square, THREE_SIGMA * max(level, 1.0)) - level)
+        noise.now.level[k, i] += gain * (
+            min(square, THREE_SIGMA * max(level, 1.0)) - level
+        )
 
 
 @compiled
-def update_long_noise(noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
+def update_long_noise(
+    noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool
+) -> None:
     """Take the statistics t (n,) of a longer time: its level over that of blocks."""
-    quarter, gain = int(noise.seen[QUARTER]) % 4, 1.0 / min(noise.seen[scale] + 3.0, 80.0)
+    quarter, gain = (
+        int(noise.seen[QUARTER]) % 4,
+        1.0 / min(noise.seen[scale] + 3.0, 80.0),
+    )
     for i in range(n):
         if mask >> i & 1:
             if scale == QUARTER:
                 # Noise with a memory shows at a second's distance, a beat at half its period.
                 step = t[i] - noise.apart[quarter, i]
-                update_slow_level(noise, QUARTER, i, step, gain, learn and noise.seen[scale] > 4)
+                update_slow_level(
+                    noise, QUARTER, i, step, gain, learn and noise.seen[scale] > 4
+                )
                 for lag in range(1, LAGS + 1):
                     step = t[i] - noise.apart[(quarter - lag) % 4, i]
-                    update_slow_level(noise, SCALES + lag - 1, i, step, gain, learn and noise.seen[scale] > lag)
+                    update_slow_level(
+                        noise,
+                        SCALES + lag - 1,
+                        i,
+                        step,
+                        gain,
+                        learn and noise.seen[scale] > lag,
+                    )
                 noise.apart[quarter, i] = t[i]
             else:
-                update_slow_level(noise, scale, i, t[i] - noise.last[scale, i], gain, learn and noise.seen[scale] > 1)
+                update_slow_level(
+                    noise,
+                    scale,
+                    i,
+                    t[i] - noise.last[scale, i],
+                    gain,
+                    learn and noise.seen[scale] > 1,
+                )
     update_longest(noise, n)
     count_wild(noise, scale, n, mask, t)
 
@@ -335,4 +400,6 @@ def update_unknown(noise: Noise, n: int, seconds: float) -> None:
     noise.lived[noise.regime] += seconds
     lived = noise.lived[noise.regime]
     for i in range(n):
-        noise.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / noise.longest[i])
+        noise.unknown[i] = 1.0 + UNKNOWN / (
+            1.0 + 0.25 * lived * lived / noise.longest[i]
+        )

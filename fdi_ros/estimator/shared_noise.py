@@ -35,14 +35,18 @@ from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
 MEMORY = 2.0  # half seconds that everything here is a mean of
-LINE = 1.0 / 6.0  # excess of the inverse of the dimensions where all is a line: two dimensions in a parity of three
+LINE = (
+    1.0 / 6.0
+)  # excess of the inverse of the dimensions where all is a line: two dimensions in a parity of three
 INCOHERENT = 0.25  # squared correlation that chance reaches in a second
 COHERENT = 1.0 - INCOHERENT  # from which all is coherent: as far from one
 STEADY = 4.0
 """Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
 parallel channels see a tenth more or less makes a variance wrong by a sixth there."""
 UNEQUAL = 0.15  # by how much units see vibration differently; logs show 0.04 to 0.6
-INDEPENDENT = 4.0  # values of a block that are independent of one another: all four at 100 Hz
+INDEPENDENT = (
+    4.0  # values of a block that are independent of one another: all four at 100 Hz
+)
 NEAR_SINGULAR = 1e-3  # share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is measured
 
 
@@ -108,7 +112,9 @@ def add_fourth_difference(params: Constants, kf: Estimator) -> None:
         shared.difference[i] = 0.0
         if shared.kept >> i & 1:
             ends = kf.corrected[i] + past[3, i]
-            shared.difference[i] = (ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]) / math.sqrt(70.0)
+            shared.difference[i] = (
+                ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]
+            ) / math.sqrt(70.0)
     apply_gain(shared.alone.gain, n, shared.difference, shared.common)
     size = 0.0
     for a in range(3):
@@ -146,7 +152,10 @@ def update_shape(params: Constants, kf: Estimator) -> None:
         shared.kept, shared.fresh = kept, 0
         fill_parity(shared.even, params.sensors, kept, shared.ones)
     if noise.regime != shared.regime:
-        shared.regime, shared.count = noise.regime, 0.5 * params.length / params.adaptation_gain
+        shared.regime, shared.count = (
+            noise.regime,
+            0.5 * params.length / params.adaptation_gain,
+        )
         for i in range(n):
             shared.local[i] = 0.0
             for j in range(n):
@@ -166,14 +175,22 @@ def update_shared_level(params: Constants, kf: Estimator) -> None:
         coherent = max(coherent, update_dimensions(params, kf, k))
         for i in range(n):
             for j in range(i + 1):
-                pooled += (1.0 if i == j else 2.0) * shared.even.information[i, j] * shared.outer[i, j]
+                pooled += (
+                    (1.0 if i == j else 2.0)
+                    * shared.even.information[i, j]
+                    * shared.outer[i, j]
+                )
         pooled /= max(k - 1.0, 0.5)
     shared.coherent = coherent
     for i in range(n):
         level = noise.now.sample[i] * max(1.0, BURST * noise.quick[i], shared.excess)
         seen = 0.0
         for a in range(3):
-            seen += params.sensors.axes[i, a] * params.sensors.axes[i, a] * shared.vibration[a]
+            seen += (
+                params.sensors.axes[i, a]
+                * params.sensors.axes[i, a]
+                * shared.vibration[a]
+            )
         level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
         shared.level[i] = level + coherent * max(pooled - level, 0.0)
 
@@ -216,14 +233,21 @@ def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
 def update_coherence(params: Constants, kf: Estimator) -> float:
     """Take the products of a block into their means, and what they say of each variance; return the coherent share."""
     shared, n, noise = kf.shared, params.sensors.n, kf.noise
-    adaptation_gain, count = params.adaptation_gain / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
+    adaptation_gain, count = (
+        params.adaptation_gain / MEMORY if shared.taken else 0.0,
+        max(shared.taken, 1),
+    )
     steady = update_common(shared, adaptation_gain, count) < STEADY
     explained = total = 0.0
     for i in range(n):
         noise.cross[i] = along = 0.0
-        shared.apart[i] += adaptation_gain * (shared.apart_sum[i] / count - shared.apart[i])
+        shared.apart[i] += adaptation_gain * (
+            shared.apart_sum[i] / count - shared.apart[i]
+        )
         for a in range(3):
-            shared.mixed[a, i] += adaptation_gain * (shared.mixed_sum[a, i] / count - shared.mixed[a, i])
+            shared.mixed[a, i] += adaptation_gain * (
+                shared.mixed_sum[a, i] / count - shared.mixed[a, i]
+            )
             shared.mixed_sum[a, i] = 0.0
         for a in range(3):
             for b in range(3):
@@ -233,9 +257,17 @@ def update_coherence(params: Constants, kf: Estimator) -> float:
         total += shared.apart[i]
         shared.apart_sum[i] = 0.0
         if steady and shared.alone.information[i, i] > 0.0:
-            noise.cross[i] = min(max(2.0 * along / shared.alone.information[i, i], -THREE_SIGMA), THREE_SIGMA)
+            noise.cross[i] = min(
+                max(2.0 * along / shared.alone.information[i, i], -THREE_SIGMA),
+                THREE_SIGMA,
+            )
     shared.taken = 0
-    return min(max((explained / max(total, 1e-30) - INCOHERENT) / (COHERENT - INCOHERENT), 0.0), 1.0)
+    return min(
+        max(
+            (explained / max(total, 1e-30) - INCOHERENT) / (COHERENT - INCOHERENT), 0.0
+        ),
+        1.0,
+    )
 
 
 @compiled
@@ -244,11 +276,17 @@ def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> fl
     over = 0.0
     for a in range(3):
         for b in range(3):
-            shared.square[a, b] += adaptation_gain * (shared.common_sum[a, b] / count - shared.square[a, b])
+            shared.square[a, b] += adaptation_gain * (
+                shared.common_sum[a, b] / count - shared.square[a, b]
+            )
             shared.common_sum[a, b] = 0.0
-            over += shared.alone.normal[max(a, b), min(a, b)] * shared.square[a, b] / 3.0
+            over += (
+                shared.alone.normal[max(a, b), min(a, b)] * shared.square[a, b] / 3.0
+            )
             shared.factor[a, b] = shared.square[a, b]
-        shared.factor[a, a] = shared.factor[a, a] * (1.0 + NEAR_SINGULAR) + NEAR_SINGULAR * 1e-11
+        shared.factor[a, a] = (
+            shared.factor[a, a] * (1.0 + NEAR_SINGULAR) + NEAR_SINGULAR * 1e-11
+        )
     invert(shared.factor, 3, shared.inverse)
     return over
 
@@ -262,8 +300,17 @@ def update_vibration(params: Constants, kf: Estimator) -> None:
         if length > 2.0 and kf.blocks > 0:
             # About a line through the samples of the block.
             slope = kf.rates[0, a] - kf.rates[1, a]
-            about = shared.rate_squares[a] - shared.rate_sum[a] * shared.rate_sum[a] / length
-            within = (about - slope * slope * (length * length - 1.0) / (12.0 * length)) / (length - 2.0)
-        shared.within[a] += params.adaptation_gain / MEMORY * (within - shared.within[a])
+            about = (
+                shared.rate_squares[a]
+                - shared.rate_sum[a] * shared.rate_sum[a] / length
+            )
+            within = (
+                about - slope * slope * (length * length - 1.0) / (12.0 * length)
+            ) / (length - 2.0)
+        shared.within[a] += (
+            params.adaptation_gain / MEMORY * (within - shared.within[a])
+        )
         shared.rate_sum[a] = shared.rate_squares[a] = 0.0
-        shared.vibration[a] = max(shared.within[a] - noise, shared.square[a, a] - noise, 0.0)
+        shared.vibration[a] = max(
+            shared.within[a] - noise, shared.square[a, a] - noise, 0.0
+        )

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options, built
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.montecarlo import Counts, Field, Preparation, Refusals, Schema, TrialProtocol, geometry_of
+from fdi_ros.experiments.montecarlo import (
+    Counts,
+    Field,
+    Preparation,
+    Refusals,
+    Schema,
+    TrialProtocol,
+    geometry_of,
+)
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, solve_log
 from fdi_ros.model.samples import Array, Mask
@@ -31,7 +39,13 @@ class ChiSquare:
 
     name = "chi_square"
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel, *, false_alarm_probability: float | None = None) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        false_alarm_probability: float | None = None,
+    ) -> None:
         self.geometry, self.noise = geometry, noise.for_channels(geometry.n)
         self.options: dict[str, Any] = {}
         white = geometry.axes / self.noise.noise_std[:, None]
@@ -41,7 +55,10 @@ class ChiSquare:
         scale = np.where(geometry.detectable, length, np.inf)
         self._normalised = (self._parity.T @ basis.T / scale).T
         self.threshold = chi2_isf(
-            FalseAlarmRate(false_alarm_probability=false_alarm_probability).per_sample(), geometry.n - 3
+            FalseAlarmRate(
+                false_alarm_probability=false_alarm_probability
+            ).per_sample(),
+            geometry.n - 3,
         )
 
     def detect(self, z: Array) -> Verdict:
@@ -49,9 +66,19 @@ class ChiSquare:
         square = (_products(z, self._parity) ** 2).cumsum(axis=1)[:, -1]
         scores = np.abs(_products(z, self._normalised))
         alarm = square >= self.threshold
-        suspects = alarm[:, None] & (np.arange(z.shape[1]) == scores.argmax(axis=1)[:, None])
+        suspects = alarm[:, None] & (
+            np.arange(z.shape[1]) == scores.argmax(axis=1)[:, None]
+        )
         threshold = np.full(len(z), self.threshold)
-        return Verdict(square, threshold, alarm, suspects, alarm, np.where(suspects, scores, 0.0), scores)
+        return Verdict(
+            square,
+            threshold,
+            alarm,
+            suspects,
+            alarm,
+            np.where(suspects, scores, 0.0),
+            scores,
+        )
 
     def reset(self) -> None:
         """Nothing is remembered."""
@@ -64,15 +91,23 @@ def _products(z: Array, forms: Array) -> Array:
 
 BOUND = 3.0
 """Guaranteed bound of a channel in a study, in noise_std: what a user who takes 3 sigma for the limit would set."""
-LOOSE_BOUNDS = 0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
+LOOSE_BOUNDS = (
+    0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
+)
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
 """Methods that leave several suspects and rank them by their scores; of others the largest normalised error counts."""
 
-NORMALISED_SCORES = ("likelihood_ratio", "chi_square")  # methods whose scores are the normalised residuals ``|w_i|``
+NORMALISED_SCORES = (
+    "likelihood_ratio",
+    "chi_square",
+)  # methods whose scores are the normalised residuals ``|w_i|``
 
 Method = Detector | ChiSquare
 
-METHODS: dict[str, Any] = {**{name: detector_class(name) for name in DETECTORS}, ChiSquare.name: ChiSquare}
+METHODS: dict[str, Any] = {
+    **{name: detector_class(name) for name in DETECTORS},
+    ChiSquare.name: ChiSquare,
+}
 """All that a study can compare."""
 
 
@@ -99,17 +134,38 @@ class Contender:
     def evaluate(self, z: Array) -> Evaluation:
         """Verdicts on samples z (N, n) rad/s."""
         verdict = self.detector.detect(z)
-        worst = verdict.scores if self.detector.name in RANKED_BY_SCORE else np.abs(verdict.error) * self._weight
-        named = np.where(verdict.alarm, _largest(np.where(verdict.suspects, worst, -1.0)), -1)
+        worst = (
+            verdict.scores
+            if self.detector.name in RANKED_BY_SCORE
+            else np.abs(verdict.error) * self._weight
+        )
+        named = np.where(
+            verdict.alarm, _largest(np.where(verdict.suspects, worst, -1.0)), -1
+        )
         with np.errstate(invalid="ignore"):
             ratio = verdict.statistic / verdict.threshold
-        best = _largest(verdict.scores) if self.detector.name in NORMALISED_SCORES else None
-        return Evaluation(np.where(verdict.alarm, ratio, np.nan), verdict.suspects, verdict.isolated, named, best)
+        best = (
+            _largest(verdict.scores)
+            if self.detector.name in NORMALISED_SCORES
+            else None
+        )
+        return Evaluation(
+            np.where(verdict.alarm, ratio, np.nan),
+            verdict.suspects,
+            verdict.isolated,
+            named,
+            best,
+        )
 
     def ratios(self, z: Array) -> Array:
         """Statistic over threshold of every sample, (N,), alarm or not; -inf where not judged."""
         verdict = self.detector.detect(z)
-        return np.nan_to_num(verdict.statistic / verdict.threshold, nan=-np.inf, posinf=1e300, neginf=-np.inf)
+        return np.nan_to_num(
+            verdict.statistic / verdict.threshold,
+            nan=-np.inf,
+            posinf=1e300,
+            neginf=-np.inf,
+        )
 
 
 class Contenders(NamedTuple):
@@ -170,7 +226,10 @@ class CommonRate(TrialProtocol[Cell]):
     @cached_property
     def contenders(self) -> list[Contenders]:
         """Methods at their loose thresholds for each geometry."""
-        return [self.build(g, self.settings["detectors"], self.settings["options"]) for g in range(len(self.specs))]
+        return [
+            self.build(g, self.settings["detectors"], self.settings["options"])
+            for g in range(len(self.specs))
+        ]
 
     def preparation_cells(self) -> list[Cell]:
         """List the geometries, with healthy channels."""
@@ -178,7 +237,9 @@ class CommonRate(TrialProtocol[Cell]):
 
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
-        return self.settings["sound_trials" if cell.healthy else "trials"], self.settings["block"]
+        return self.settings[
+            "sound_trials" if cell.healthy else "trials"
+        ], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find by method the ratios of healthy samples that can decide a threshold."""
@@ -186,34 +247,53 @@ class CommonRate(TrialProtocol[Cell]):
         # Twice the share of alarms, and more.
         kept = int(2 * max(alarms) * len(z)) + 50
         running = self.contenders[cell.geometry].running
-        largest = {name: np.sort(one.ratios(z))[::-1][:kept].tolist() for name, one in running.items()}
+        largest = {
+            name: np.sort(one.ratios(z))[::-1][:kept].tolist()
+            for name, one in running.items()
+        }
         return {"trials": count, "largest": largest}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by geometry, method and false-alarm rate."""
-        return {"factors": [factors_of(blocks, self.settings["false_alarms"]) for blocks in found]}
+        return {
+            "factors": [
+                factors_of(blocks, self.settings["false_alarms"]) for blocks in found
+            ]
+        }
 
     def refusals(self) -> Refusals:
         """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
-        return {str(spec): one.refused for spec, one in zip(self.specs, self.contenders, strict=True)}
+        return {
+            str(spec): one.refused
+            for spec, one in zip(self.specs, self.contenders, strict=True)
+        }
 
     @abstractmethod
-    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Any]:
+    def draw(
+        self, cell: Cell, count: int, rng: np.random.Generator
+    ) -> tuple[Array, Any]:
         """Draw values of trials, rad/s, and which channels are off."""
 
     @abstractmethod
     def loose(self) -> tuple[NoiseModel, float]:
         """Error model of a channel, and the false-alarm probability per sample of the loose thresholds."""
 
-    def build(self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]) -> Contenders:
+    def build(
+        self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]
+    ) -> Contenders:
         """Build methods of `METHODS` at their loose thresholds for a geometry; ``own``: options by name, which win."""
         geometry, (noise, probability) = self.geometries[g], self.loose()
         running, refused, streaming = {}, {}, {}
         for name in names:
             accepted = accepted_options(METHODS[name])
-            options = dict(FalseAlarmRate(false_alarm_probability=probability).as_options(accepted))
+            options = dict(
+                FalseAlarmRate(false_alarm_probability=probability).as_options(accepted)
+            )
             if not options and "max_faults" in accepted:
-                options = {"threshold": LOOSE_BOUNDS, "max_faults": min(2, geometry.n - 4)}
+                options = {
+                    "threshold": LOOSE_BOUNDS,
+                    "max_faults": min(2, geometry.n - 4),
+                }
             options |= own.get(name, {})
             try:
                 contender = Contender(built(METHODS[name], geometry, noise, options))
@@ -227,17 +307,27 @@ class CommonRate(TrialProtocol[Cell]):
         return Contenders(running, refused | streaming)
 
 
-def factors_of(blocks: Sequence[Counts], false_alarms: Sequence[float]) -> dict[str, list[float]]:
+def factors_of(
+    blocks: Sequence[Counts], false_alarms: Sequence[float]
+) -> dict[str, list[float]]:
     """Multiple of its loose threshold by method for each false-alarm rate, from blocks of healthy channels.
 
     Each has the number of its ``trials``, and by method its ``largest`` ratios.
     """
     trials = sum(block["trials"] for block in blocks)
-    pooled = {name: [ratio for block in blocks for ratio in block["largest"][name]] for name in blocks[0]["largest"]}
-    return {name: [threshold_factor(own, alarm, trials) for alarm in false_alarms] for name, own in pooled.items()}
+    pooled = {
+        name: [ratio for block in blocks for ratio in block["largest"][name]]
+        for name in blocks[0]["largest"]
+    }
+    return {
+        name: [threshold_factor(own, alarm, trials) for alarm in false_alarms]
+        for name, own in pooled.items()
+    }
 
 
-def threshold_factor(largest: Sequence[float], alarm_probability: float, trials: int) -> float:
+def threshold_factor(
+    largest: Sequence[float], alarm_probability: float, trials: int
+) -> float:
     """Ratio that the given share of trials reaches, from their largest ratios; at least the loose threshold, 1."""
     rank = round(alarm_probability * trials)
     ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
@@ -255,7 +345,11 @@ def moustakides_delay(shift: float, run_length: float) -> float:
     No method has less than the CUSUM tuned to the very change (Moustakides 1986), for a ``shift`` > 0 of the mean of a
     standard normal: the fault in standard deviations times sqrt(S_ii).
     """
-    limit = solve_log(lambda limit: cusum_run_length(limit, shift / 2, 0.0), run_length, math.log(run_length) / shift)
+    limit = solve_log(
+        lambda limit: cusum_run_length(limit, shift / 2, 0.0),
+        run_length,
+        math.log(run_length) / shift,
+    )
     return cusum_run_length(limit, shift / 2, shift)
 
 

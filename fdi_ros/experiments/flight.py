@@ -53,9 +53,14 @@ class Motion:
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
+        k = np.clip(
+            np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2
+        )
         u = np.clip((t - self.time[k]) / (self.time[k + 1] - self.time[k]), 0, 1)
-        return self.rate[k] + (self.rate[k + 1] - self.rate[k]) * (u * u * (3 - 2 * u))[:, None]
+        return (
+            self.rate[k]
+            + (self.rate[k + 1] - self.rate[k]) * (u * u * (3 - 2 * u))[:, None]
+        )
 
 
 def vehicle_motion(
@@ -85,7 +90,9 @@ def vehicle_motion(
     return Motion(np.array(times), np.array(rates))
 
 
-def _phase(kind: str, max_rate: float, rng: np.random.Generator) -> list[tuple[Array, float]]:
+def _phase(
+    kind: str, max_rate: float, rng: np.random.Generator
+) -> list[tuple[Array, float]]:
     """Rates to go to and how long to hold each, s; ends at rest."""
     stop = (np.zeros(3), float(rng.uniform(0.2, 0.6)))
     if kind == "rest":
@@ -95,7 +102,10 @@ def _phase(kind: str, max_rate: float, rng: np.random.Generator) -> list[tuple[A
         heading = rng.uniform(-0.15, 0.15, 3) * max_rate * [0.3, 0.3, 1.0]
         return [(heading, float(rng.uniform(1.0, 3.0))), stop]
     count = int(rng.integers(3, 7))
-    swings = [(rng.uniform(-max_rate, max_rate, 3), float(rng.uniform(0.02, 0.3))) for _ in range(count)]
+    swings = [
+        (rng.uniform(-max_rate, max_rate, 3), float(rng.uniform(0.02, 0.3)))
+        for _ in range(count)
+    ]
     return [*swings, stop]
 
 
@@ -105,11 +115,15 @@ class GyroErrors:
 
     noise_std: float = 0.0025  # white noise of one sample, rad/s
     bias_std: float = 0.01  # bias at switch-on, rad/s
-    bias_walk: float = 2e-5  # random walk of the bias, rad/s per square root of a second
+    bias_walk: float = (
+        2e-5  # random walk of the bias, rad/s per square root of a second
+    )
     scale_std: float = 0.001  # scale factor, dimensionless
     misalignment_std: float = 0.001  # angle between true and nominal axis, rad, in each of the two directions across it
     delay_std: float = 0.0002  # sampling instant of a chip against the stamp, s
-    resolution: float = float(np.radians(1 / 16.4))  # step of the converter, rad/s; 0: none
+    resolution: float = float(
+        np.radians(1 / 16.4)
+    )  # step of the converter, rad/s; 0: none
     max_rate: float = 34.9  # range of the converter, rad/s
     channels_per_chip: int = 3  # channels that are sampled together
 
@@ -117,7 +131,9 @@ class GyroErrors:
         """Make one unit: draw all that stays as it is from switch-on."""
         n = geometry.n
         across = rng.normal(0, self.misalignment_std, (n, 3))
-        along = np.sum(across * geometry.axes, axis=1) / np.sum(geometry.axes**2, axis=1)
+        along = np.sum(across * geometry.axes, axis=1) / np.sum(
+            geometry.axes**2, axis=1
+        )
         tilted = geometry.axes + across - along[:, None] * geometry.axes
         chip = np.arange(n) // self.channels_per_chip
         return Gyros(
@@ -137,7 +153,9 @@ class Gyros:
     delay: Array
     errors: GyroErrors
 
-    def measure(self, motion: Motion, stamp: NDArray[np.int64], rng: np.random.Generator) -> Block:
+    def measure(
+        self, motion: Motion, stamp: NDArray[np.int64], rng: np.random.Generator
+    ) -> Block:
         """Sample at the given stamps, (N,) ns, strictly increasing; the motion's time is 0 at the first."""
         errors = self.errors
         seconds = (stamp - stamp[0]) * 1e-9
@@ -154,7 +172,9 @@ class Gyros:
         return Block(stamp, z)
 
 
-def regular_stamps(duration: float, sample_rate: float, start: int = 0) -> NDArray[np.int64]:
+def regular_stamps(
+    duration: float, sample_rate: float, start: int = 0
+) -> NDArray[np.int64]:
     """Stamps of evenly spaced samples, (N,) ns, from start ns."""
     count = int(np.floor(duration * sample_rate)) + 1
     return start + np.round(np.arange(count) * (1e9 / sample_rate)).astype(np.int64)
@@ -163,7 +183,11 @@ def regular_stamps(duration: float, sample_rate: float, start: int = 0) -> NDArr
 # The trials -----------------------------------------------------------------------------------------------------------
 
 NONE = "none"  # the cell in which every channel stays healthy
-DEFAULT_SIZES = {name: kind.study_size for name, kind in FAULT_KINDS.items() if kind.study_size is not None}
+DEFAULT_SIZES = {
+    name: kind.study_size
+    for name, kind in FAULT_KINDS.items()
+    if kind.study_size is not None
+}
 """Of each kind that needs one, in its own unit."""
 
 
@@ -189,7 +213,10 @@ class Flight(TrialProtocol[str]):
         "detectors": Field("detectors", "all"),
         "kinds": Field(
             "texts",
-            [NONE, *(name for name, kind in FAULT_KINDS.items() if not kind.whole_unit)],
+            [
+                NONE,
+                *(name for name, kind in FAULT_KINDS.items() if not kind.whole_unit),
+            ],
             choices=(NONE, *FAULT_KINDS),
         ),
         "sizes": Field("mapping", DEFAULT_SIZES),
@@ -213,11 +240,20 @@ class Flight(TrialProtocol[str]):
         """List the kinds of faults."""
         return list(self.settings["kinds"])
 
-    def run(self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(
+        self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation
+    ) -> Counts:
         """Simulate flights and run the monitor with every method on them."""
         flights = [self._flight(cell, rng) for _ in range(count)]
-        running = {name: one for name, one in self._monitors.items() if isinstance(one, Pipeline)}
-        return {"trials": count, "methods": {name: _counted(one, flights) for name, one in running.items()}}
+        running = {
+            name: one
+            for name, one in self._monitors.items()
+            if isinstance(one, Pipeline)
+        }
+        return {
+            "trials": count,
+            "methods": {name: _counted(one, flights) for name, one in running.items()},
+        }
 
     def summary(self, cell: str, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of flights by outcome, delays, and root mean square errors of the fused rate, rad/s."""
@@ -227,7 +263,9 @@ class Flight(TrialProtocol[str]):
 
     def refusals(self) -> Refusals:
         """Return the methods that do not run on the geometry."""
-        refused = {name: why for name, why in self._monitors.items() if isinstance(why, str)}
+        refused = {
+            name: why for name, why in self._monitors.items() if isinstance(why, str)
+        }
         return {str(self.settings["geometry"]): refused}
 
     @cached_property
@@ -236,7 +274,10 @@ class Flight(TrialProtocol[str]):
 
     def _config(self, **settings: str) -> Config:
         """Return the settings of the monitor, with others beside those of the study."""
-        axes = {"geometry.preset": "axes", "geometry.axes": self._geometry.axes.ravel().tolist()}
+        axes = {
+            "geometry.preset": "axes",
+            "geometry.axes": self._geometry.axes.ravel().tolist(),
+        }
         return Config.from_parameters({**axes, **self.settings["monitor"], **settings})
 
     def _monitor(self, name: str) -> Pipeline | str:
@@ -254,20 +295,42 @@ class Flight(TrialProtocol[str]):
         """Draw one flight."""
         settings = self.settings
         stamp = regular_stamps(settings["duration"], self._config().sample_rate)
-        motion: Motion = vehicle_motion(settings["duration"], rng, rest=settings["rest"], max_rate=settings["max_rate"])
+        motion: Motion = vehicle_motion(
+            settings["duration"],
+            rng,
+            rest=settings["rest"],
+            max_rate=settings["max_rate"],
+        )
         block = GyroErrors().draw(self._geometry, rng).measure(motion, stamp, rng)
         channel = int(rng.integers(self._geometry.n))
         onset = float(rng.uniform(settings["rest"] + 0.5, settings["duration"] / 2))
         seed, sign = int(rng.integers(2**31)), float(rng.choice([-1.0, 1.0]))
         truth = motion.rate_at((stamp - stamp[0]) * 1e-9)
         if kind == NONE:
-            return Flown(block, truth, None, int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9))))
+            return Flown(
+                block,
+                truth,
+                None,
+                int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9))),
+            )
         size = settings["sizes"].get(kind, DEFAULT_SIZES.get(kind))
         if size is not None and FAULT_KINDS[kind].has_signed_size():
             size *= sign
         names = self._geometry.channel_names
-        injector = Injector([Fault(names[channel], create_kind(kind, size=size), start=onset, seed=seed)], names)
-        return Flown(injector.apply(block), truth, channel, int(injector.active(stamp)[:, 0].argmax()))
+        injector = Injector(
+            [
+                Fault(
+                    names[channel], create_kind(kind, size=size), start=onset, seed=seed
+                )
+            ],
+            names,
+        )
+        return Flown(
+            injector.apply(block),
+            truth,
+            channel,
+            int(injector.active(stamp)[:, 0].argmax()),
+        )
 
 
 def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
@@ -285,12 +348,19 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
     for flown in flights:
         monitor.restart()
         output = monitor.process(flown.block)
-        scored = score(*standing(output), flown.channel, np.arange(len(output), dtype=np.float64) - flown.onset)
+        scored = score(
+            *standing(output),
+            flown.channel,
+            np.arange(len(output), dtype=np.float64) - flown.onset,
+        )
         outcomes[scored.outcome] += 1
         if math.isfinite(scored.isolated_after):
             delays[str(int(scored.isolated_after))] += 1
         without_rate += int((~output.valid[flown.onset :]).sum())
-        for part, rows in (("before", slice(flown.onset)), ("after", slice(flown.onset, None))):
+        for part, rows in (
+            ("before", slice(flown.onset)),
+            ("after", slice(flown.onset, None)),
+        ):
             squares = ((output.rate[rows] - flown.truth[rows]) ** 2).sum(axis=1)
             errors[part].append(squares[output.valid[rows]])
     return {
@@ -302,7 +372,10 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
         "without_rate": without_rate,
         "delays": dict(delays),
         **{
-            part: {"squares": math.fsum(float(e.sum()) for e in found), "count": sum(map(len, found))}
+            part: {
+                "squares": math.fsum(float(e.sum()) for e in found),
+                "count": sum(map(len, found)),
+            }
             for part, found in errors.items()
         },
     }
@@ -312,8 +385,13 @@ def _figures(counts: Counts, sample_rate: float) -> Figures:
     """Shares of the flights by outcome, and how good the rate is."""
     delays = quantiles(counts["delays"])
     return {
-        **{name: share(counts[name], counts["trials"]) for name in ("right", "wrong", "ambiguous", "silent")},
-        "delay_s": {level: None if d is None else d / sample_rate for level, d in delays.items()},
+        **{
+            name: share(counts[name], counts["trials"])
+            for name in ("right", "wrong", "ambiguous", "silent")
+        },
+        "delay_s": {
+            level: None if d is None else d / sample_rate for level, d in delays.items()
+        },
         "rms_before": rms(**counts["before"]),
         "rms_after": rms(**counts["after"]),
         "samples_without_rate": counts["without_rate"],

@@ -40,10 +40,18 @@ from fdi_ros.system.yaml_file import read_yaml
 Schema = Mapping[str, Field]
 """Settings of a section by name. Besides the kinds of `Field`: detectors, geometry, geometries, mapping."""
 Cell = TypeVar("Cell")  # what distinguishes one cell of a section from the others
-Counts = dict[str, Any]  # what trials gave: numbers, None, and lists or mappings by text of these
-Preparation = dict[str, Any]  # what the first stage gives; in the result under ``found``
-Figures = dict[str, Any]  # of one cell of the second stage, in the order of the result; shares are an `Estimate`
-Refusals = Mapping[str, Mapping[str, str]]  # by geometry and method: why the method does not run
+Counts = dict[
+    str, Any
+]  # what trials gave: numbers, None, and lists or mappings by text of these
+Preparation = dict[
+    str, Any
+]  # what the first stage gives; in the result under ``found``
+Figures = dict[
+    str, Any
+]  # of one cell of the second stage, in the order of the result; shares are an `Estimate`
+Refusals = Mapping[
+    str, Mapping[str, str]
+]  # by geometry and method: why the method does not run
 
 
 class TrialProtocol(ABC, Generic[Cell]):
@@ -79,7 +87,9 @@ class TrialProtocol(ABC, Generic[Cell]):
         return {}
 
     @abstractmethod
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(
+        self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation
+    ) -> Counts:
         """Run one block of the second stage."""
 
     @abstractmethod
@@ -96,7 +106,9 @@ AnyProtocol = TrialProtocol[Any]
 
 def protocol_class(kind: str) -> type[AnyProtocol]:
     """Class of a key of `PROTOCOLS`."""
-    found: type[AnyProtocol] = pkgutil.resolve_name(f"fdi_ros.experiments.{PROTOCOLS[kind]}")
+    found: type[AnyProtocol] = pkgutil.resolve_name(
+        f"fdi_ros.experiments.{PROTOCOLS[kind]}"
+    )
     return found
 
 
@@ -114,7 +126,9 @@ class Section:
     """One set of trials of a study."""
 
     kind: str
-    settings: Mapping[str, Any]  # every setting of the kind, defaults filled in; plain values that JSON can hold
+    settings: Mapping[
+        str, Any
+    ]  # every setting of the kind, defaults filled in; plain values that JSON can hold
 
 
 @dataclass(frozen=True)
@@ -127,27 +141,40 @@ class Study:
     sections: tuple[Section, ...]
 
 
-def load_study(path: str | Path, trials: int | None = None, seed: int | None = None) -> Study:
+def load_study(
+    path: str | Path, trials: int | None = None, seed: int | None = None
+) -> Study:
     """Read a study file; trials per cell and seed win over it. `StudyError` if it is missing or does not fit."""
     raw = read_yaml(path, "study", StudyError)
     if not isinstance(raw, dict):
-        raise StudyError(f"study {path} is empty or no mapping, expected title, seed and sections")
+        raise StudyError(
+            f"study {path} is empty or no mapping, expected title, seed and sections"
+        )
     title = checked("study", "title", Field("text", ""), raw.pop("title", ""))
     if not title.isprintable():
         raise StudyError(f"study.title is {title!r}, expected printable text")
     stated = checked("study", "seed", Field("int", 0, 0, 2**63), raw.pop("seed", 0))
     for kind in raw:
         if kind not in PROTOCOLS:
-            raise StudyError(f"study {path} has unknown section {kind!r}, expected some of: {', '.join(PROTOCOLS)}")
-    sections = {kind: section_settings(kind, raw[kind], protocol_class(kind).schema) for kind in raw}
+            raise StudyError(
+                f"study {path} has unknown section {kind!r}, expected some of: {', '.join(PROTOCOLS)}"
+            )
+    sections = {
+        kind: section_settings(kind, raw[kind], protocol_class(kind).schema)
+        for kind in raw
+    }
     if not sections:
-        raise StudyError(f"study {path} has no section, expected some of: {', '.join(PROTOCOLS)}")
+        raise StudyError(
+            f"study {path} has no section, expected some of: {', '.join(PROTOCOLS)}"
+        )
     if seed is not None and seed < 0:
         raise StudyError(f"seed is {seed}, expected 0 or more")
     if trials is not None and trials < 1:
         raise StudyError(f"trials is {trials}, expected 1 or more")
     instead = {} if trials is None else {"trials": trials}
-    made = tuple(Section(kind, settings | instead) for kind, settings in sections.items())
+    made = tuple(
+        Section(kind, settings | instead) for kind, settings in sections.items()
+    )
     return Study(Path(path).stem, title, stated if seed is None else seed, made)
 
 
@@ -160,7 +187,11 @@ def section_settings(kind: str, raw: Any, schema: Schema) -> dict[str, Any]:
     for name in raw:
         if name not in schema:
             close = difflib.get_close_matches(str(name), schema, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"expected some of: {', '.join(schema)}"
+            hint = (
+                f"did you mean {close[0]!r}?"
+                if close
+                else f"expected some of: {', '.join(schema)}"
+            )
             raise StudyError(f"section {kind} has unknown setting {name!r}, {hint}")
     settings = {}
     for name, field in schema.items():
@@ -176,18 +207,31 @@ def checked(section: str, name: str, field: Field, value: Any) -> Any:
     where = f"{section}.{name}"
     if field.kind == "detectors":
         named = replace(field, kind="texts", choices=field.choices or tuple(DETECTORS))
-        return list(named.choices) if value == "all" else list(check(named, value, where, StudyError))
+        return (
+            list(named.choices)
+            if value == "all"
+            else list(check(named, value, where, StudyError))
+        )
     if field.kind == "geometry":
         try:
             geometry_of(value)
         except (FdiError, ValueError, TypeError) as error:
-            known = ", ".join((*NAMED_GEOMETRIES, "cone_4 to cone_12", "[[x, y, z], ...]"))
+            known = ", ".join(
+                (*NAMED_GEOMETRIES, "cone_4 to cone_12", "[[x, y, z], ...]")
+            )
             detail = f": {error}" if isinstance(error, FdiError) else ""
-            raise StudyError(f"{where} is {value!r}, expected one of: {known}{detail}") from error
+            raise StudyError(
+                f"{where} is {value!r}, expected one of: {known}{detail}"
+            ) from error
         return value
     if field.kind == "geometries":
-        many = isinstance(value, list) and not (value and isinstance(value[0], list) and _is_axis(value[0]))
-        return [checked(section, name, replace(field, kind="geometry"), one) for one in (value if many else [value])]
+        many = isinstance(value, list) and not (
+            value and isinstance(value[0], list) and _is_axis(value[0])
+        )
+        return [
+            checked(section, name, replace(field, kind="geometry"), one)
+            for one in (value if many else [value])
+        ]
     if field.kind == "mapping":
         if not isinstance(value, dict):
             raise StudyError(f"{where} is {value!r}, expected names and values")
@@ -211,7 +255,10 @@ def geometry_of(spec: Any) -> Geometry:
 
 # Running one ----------------------------------------------------------------------------------------------------------
 
-PREPARING, TRIALS = 0, 1  # the first stage prepares what the trials of the second need: thresholds, limits
+PREPARING, TRIALS = (
+    0,
+    1,
+)  # the first stage prepares what the trials of the second need: thresholds, limits
 FORMAT = 1  # of the JSON
 
 
@@ -246,7 +293,9 @@ class StudyResult:
     sections: list[SectionResult]
 
 
-def run_block(kind: str, settings: str, preparation: str, seed: int, block: Block) -> Counts:
+def run_block(
+    kind: str, settings: str, preparation: str, seed: int, block: Block
+) -> Counts:
     """Run one block of trials, wherever: the result depends on the arguments alone.
 
     Settings and preparation come as JSON: detectors are built once per process for each. The block's own generator is
@@ -254,7 +303,9 @@ def run_block(kind: str, settings: str, preparation: str, seed: int, block: Bloc
     """
     protocol, prepared = _built(kind, settings, preparation)
     rng = np.random.default_rng(
-        np.random.SeedSequence(seed, spawn_key=(block.section, block.stage, block.cell, block.block))
+        np.random.SeedSequence(
+            seed, spawn_key=(block.section, block.stage, block.cell, block.block)
+        )
     )
     cell = _cells(protocol, block.stage)[block.cell]
     if block.stage == PREPARING:
@@ -263,13 +314,17 @@ def run_block(kind: str, settings: str, preparation: str, seed: int, block: Bloc
 
 
 @lru_cache(maxsize=16)
-def _built(kind: str, settings: str, preparation: str) -> tuple[AnyProtocol, Preparation]:
+def _built(
+    kind: str, settings: str, preparation: str
+) -> tuple[AnyProtocol, Preparation]:
     """Build a protocol; its preparation is empty in the first stage."""
     return protocol_class(kind)(json.loads(settings)), json.loads(preparation)
 
 
 def _cells(protocol: AnyProtocol, stage: int) -> list[Any]:
-    return protocol.preparation_cells() if stage == PREPARING else protocol.trial_cells()
+    return (
+        protocol.preparation_cells() if stage == PREPARING else protocol.trial_cells()
+    )
 
 
 def run_study(
@@ -286,9 +341,15 @@ def run_study(
     """
     protocols = [protocol_class(one.kind)(one.settings) for one in study.sections]
 
-    def run(stage: int, preparations: Sequence[Preparation]) -> list[list[list[Counts]]]:
+    def run(
+        stage: int, preparations: Sequence[Preparation]
+    ) -> list[list[list[Counts]]]:
         """Run all blocks of a stage, and return them for every cell of every section."""
-        blocks = [block for s, protocol in enumerate(protocols) for block in _blocks(s, protocol, stage)]
+        blocks = [
+            block
+            for s, protocol in enumerate(protocols)
+            for block in _blocks(s, protocol, stage)
+        ]
         texts = [
             (one.kind, json.dumps(one.settings), json.dumps(preparation))
             for one, preparation in zip(study.sections, preparations, strict=True)
@@ -299,19 +360,34 @@ def run_study(
             counts[job] = done
             if progress is not None:
                 progress((stage + len(counts) / len(jobs)) / 2)
-        found: list[list[list[Counts]]] = [[[] for _ in _cells(protocol, stage)] for protocol in protocols]
+        found: list[list[list[Counts]]] = [
+            [[] for _ in _cells(protocol, stage)] for protocol in protocols
+        ]
         for k, block in enumerate(blocks):
             found[block.section][block.cell].append(counts[k])
         return found
 
     found = run(PREPARING, [{} for _ in protocols])
-    prepared = [protocol.conclude(own) for protocol, own in zip(protocols, found, strict=True)]
+    prepared = [
+        protocol.conclude(own) for protocol, own in zip(protocols, found, strict=True)
+    ]
     sections, trials = [], run(TRIALS, prepared)
-    for one, protocol, preparation, counts in zip(study.sections, protocols, prepared, trials, strict=True):
+    for one, protocol, preparation, counts in zip(
+        study.sections, protocols, prepared, trials, strict=True
+    ):
         cells = zip(protocol.trial_cells(), counts, strict=True)
-        figures = [protocol.summary(cell, reduce(added, blocks), preparation) for cell, blocks in cells]
-        sections.append(SectionResult(one.kind, one.settings, preparation, protocol.refusals(), figures))
-    return StudyResult(FORMAT, __version__, study.name, study.title, study.seed, sections)
+        figures = [
+            protocol.summary(cell, reduce(added, blocks), preparation)
+            for cell, blocks in cells
+        ]
+        sections.append(
+            SectionResult(
+                one.kind, one.settings, preparation, protocol.refusals(), figures
+            )
+        )
+    return StudyResult(
+        FORMAT, __version__, study.name, study.title, study.seed, sections
+    )
 
 
 def _blocks(section: int, protocol: AnyProtocol, stage: int) -> list[Block]:
@@ -319,5 +395,8 @@ def _blocks(section: int, protocol: AnyProtocol, stage: int) -> list[Block]:
     for c, cell in enumerate(_cells(protocol, stage)):
         trials, size = protocol.trials(cell)
         count = math.ceil(trials / size)
-        blocks += [Block(section, stage, c, b, min(size, trials - b * size)) for b in range(count)]
+        blocks += [
+            Block(section, stage, c, b, min(size, trials - b * size))
+            for b in range(count)
+        ]
     return blocks

@@ -18,10 +18,14 @@ LIMIT = "best possible"
 DASHES = ("solid", "dash", "dot")
 SIZE = "fault, standard deviations"
 
-Say = Callable[[Any], str]  # words of the figures of a method, or of the limit, in a cell
+Say = Callable[
+    [Any], str
+]  # words of the figures of a method, or of the limit, in a cell
 ByDetector = tuple[str, Mapping[str, Any], Say]
 """A column of a table: its head, the figures of each detector, and their words; None: there are none."""
-Curve = tuple[Sequence[float], Sequence[Estimate]]  # x, and for each x a figure with its confidence interval
+Curve = tuple[
+    Sequence[float], Sequence[Estimate]
+]  # x, and for each x a figure with its confidence interval
 
 
 class Group(NamedTuple):
@@ -44,10 +48,14 @@ def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:
     """Parts of all sections in their order, as their protocols show them."""
     parts = []
     for section in result.sections:
-        for spec, cells in groupby(section.cells, lambda cell: cell.get("geometry", "")):
+        for spec, cells in groupby(
+            section.cells, lambda cell: cell.get("geometry", "")
+        ):
             if section.kind in how:
                 mounting = spec if isinstance(spec, str) else f"{len(spec)} given axes"
-                parts += how[section.kind](Group(mounting, list(cells), section.settings))
+                parts += how[section.kind](
+                    Group(mounting, list(cells), section.settings)
+                )
     return parts
 
 
@@ -58,34 +66,67 @@ def tables(result: StudyResult) -> list[Section]:
 
 def headline(result: StudyResult) -> str:
     """Tables as text."""
-    return text_of([f"{result.title or result.study}, seed {result.seed}"], tables(result))
+    return text_of(
+        [f"{result.title or result.study}, seed {result.seed}"], tables(result)
+    )
 
 
 def report(result: StudyResult) -> str:
     """Lay out the page: curves with their confidence bands, tables, what did not run, settings."""
     sections = [*_shown(result, _CURVES), *tables(result)]
     for section in result.sections:
-        refused = [(g, name, why) for g, names in section.not_run.items() for name, why in names.items()]
+        refused = [
+            (g, name, why)
+            for g, names in section.not_run.items()
+            for name, why in names.items()
+        ]
         if refused:
-            sections.append(Section(f"Not run: {section.kind}", "", (("mounting", "detector", "why"), refused)))
-    settings = [(s.kind, name, str(value)) for s in result.sections for name, value in s.settings.items()]
-    sections.append(Section("Settings", f"Seed {result.seed}.", (("section", "setting", "value"), settings)))
+            sections.append(
+                Section(
+                    f"Not run: {section.kind}",
+                    "",
+                    (("mounting", "detector", "why"), refused),
+                )
+            )
+    settings = [
+        (s.kind, name, str(value))
+        for s in result.sections
+        for name, value in s.settings.items()
+    ]
+    sections.append(
+        Section(
+            "Settings",
+            f"Seed {result.seed}.",
+            (("section", "setting", "value"), settings),
+        )
+    )
     return page(f"fdi_ros: {result.title or result.study}", [], sections)
 
 
 def _table(title: str, hint: str, columns: Sequence[ByDetector]) -> Section:
     """Lay out a table with a row for each detector."""
     names = dict.fromkeys(name for _, figures, _ in columns for name in figures)
-    rows = [(name, *(say(figures.get(name)) for _, figures, say in columns)) for name in names]
-    return _alike_together(title, hint, ("detector", *(head for head, _, _ in columns)), rows)
+    rows = [
+        (name, *(say(figures.get(name)) for _, figures, say in columns))
+        for name in names
+    ]
+    return _alike_together(
+        title, hint, ("detector", *(head for head, _, _ in columns)), rows
+    )
 
 
-def _alike_together(title: str, hint: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Section:
+def _alike_together(
+    title: str, hint: str, head: Sequence[str], rows: Sequence[Sequence[str]]
+) -> Section:
     """Lay out a table whose first column has the detectors: those of equal figures share a row."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for name, *words in rows:
         alike.setdefault(tuple(words), []).append(name)
-    return Section(title, hint, (head, [(", ".join(names), *words) for words, names in alike.items()]))
+    return Section(
+        title,
+        hint,
+        (head, [(", ".join(names), *words) for words, names in alike.items()]),
+    )
 
 
 def _of(name: str) -> Say:
@@ -96,7 +137,11 @@ def _of(name: str) -> Say:
         if figure is None or math.isnan(figure.value):
             return "-"
         percent = 100 * figure.value
-        return f"{percent:.1f}" if figure.value >= 0.01 or not percent else f"{percent:.2g}"
+        return (
+            f"{percent:.1f}"
+            if figure.value >= 0.01 or not percent
+            else f"{percent:.2g}"
+        )
 
     return say
 
@@ -117,16 +162,31 @@ def _plot(
     """Curves with their confidence bands, beside the best possible where it is known: x, y."""
     data: list[dict[str, Any]] = []
     for k, (name, (at, figures)) in enumerate(curves.items()):
-        line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
+        line = {
+            "color": PALETTE[k % len(PALETTE)],
+            "dash": DASHES[k // len(PALETTE) % len(DASHES)],
+            "width": 2,
+        }
         common = {"name": name, "x": list(at), "line": line}
         band = {"low": [f.low for f in figures], "high": [f.high for f in figures]}
         data.append({"type": "band", **common, **band, "showlegend": False})
-        data.append({"type": "scatter", "mode": "lines+markers", **common, "y": [f.value for f in figures]})
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines+markers",
+                **common,
+                "y": [f.value for f in figures],
+            }
+        )
     if limit[1]:
         line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
         known = {"x": list(limit[0]), "y": list(limit[1]), "line": line}
         data.append({"type": "scatter", "mode": "lines", "name": LIMIT, **known})
-    layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": x}},
+        "yaxis": {"title": {"text": y}},
+        "height": 420,
+    }
     if log:
         layout[log]["type"] = "log"
     return Section(title, "", "", [{"data": data, "layout": layout}])
@@ -141,20 +201,28 @@ def _snapshot(group: Group) -> list[Section]:
             _table(
                 _rates_title(group, cell),
                 "Percent declared, by false-alarm rate.",
-                [(f"{alarm:g}", _at(cell, k), _of("declared")) for k, alarm in enumerate(alarms)],
+                [
+                    (f"{alarm:g}", _at(cell, k), _of("declared"))
+                    for k, alarm in enumerate(alarms)
+                ],
             )
             for cell in group.faults
         ]
     healthy, *faults = group.cells
     columns: list[ByDetector] = [("healthy", _at(healthy), _of("declared"))]
     right, declared = _of("right"), _of("declared")
-    columns += [(f"{cell['size']:g}", _at(cell), lambda at: f"{right(at)} ({declared(at)})") for cell in faults]
+    columns += [
+        (f"{cell['size']:g}", _at(cell), lambda at: f"{right(at)} ({declared(at)})")
+        for cell in faults
+    ]
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
     found = [_table(f"One fault, {group.mounting}", hint, columns)]
     columns = []
     for cell in faults:
         ranking = {name: at for name, at in _at(cell).items() if "identified" in at}
-        columns += [(f"{cell['size']:g}", ranking, _of("identified"))] if ranking else []
+        columns += (
+            [(f"{cell['size']:g}", ranking, _of("identified"))] if ranking else []
+        )
     if columns:
         title = f"Largest residual is the right one, {group.mounting}"
         found.append(_table(title, "Percent, alarm or not.", columns))
@@ -177,7 +245,11 @@ def _double(group: Group, cell: Figures) -> Section:
         "suspects, mean": mean,
     }
     title = f"Two faults of {cell['size']:g} standard deviations, {group.mounting}"
-    return _table(title, "Percent; coverage of what was declared.", [(head, _at(cell), words[head]) for head in words])
+    return _table(
+        title,
+        "Percent; coverage of what was declared.",
+        [(head, _at(cell), words[head]) for head in words],
+    )
 
 
 def _snapshot_curves(group: Group) -> list[Section]:
@@ -186,12 +258,33 @@ def _snapshot_curves(group: Group) -> list[Section]:
         return []
     if len(alarms) == 1:
         sizes = [cell["size"] for cell in faults]
-        curves = {name: (sizes, [_at(cell)[name]["right"] for cell in faults]) for name in _at(faults[0])}
-        return [_plot(f"Right declarations, {group.mounting}", curves, SIZE, "declared, right channel named")]
+        curves = {
+            name: (sizes, [_at(cell)[name]["right"] for cell in faults])
+            for name in _at(faults[0])
+        }
+        return [
+            _plot(
+                f"Right declarations, {group.mounting}",
+                curves,
+                SIZE,
+                "declared, right channel named",
+            )
+        ]
     found = []
     for cell in faults:
-        curves = {name: (alarms, [at["declared"] for at in points]) for name, points in cell["methods"].items()}
-        found.append(_plot(_rates_title(group, cell), curves, "false alarms per sample", "declared", log="xaxis"))
+        curves = {
+            name: (alarms, [at["declared"] for at in points])
+            for name, points in cell["methods"].items()
+        }
+        found.append(
+            _plot(
+                _rates_title(group, cell),
+                curves,
+                "false alarms per sample",
+                "declared",
+                log="xaxis",
+            )
+        )
     return found
 
 
@@ -212,11 +305,30 @@ def _delay(group: Group) -> list[Section]:
 def _delay_curves(group: Group) -> list[Section]:
     curves = {}
     for name in group.cells[0]["methods"]:
-        known = [(cell["size"], mean) for cell in group.cells if (mean := cell["methods"][name]["mean_delay"])]
+        known = [
+            (cell["size"], mean)
+            for cell in group.cells
+            if (mean := cell["methods"][name]["mean_delay"])
+        ]
         if known:
-            curves[name] = ([size for size, _ in known], [figure for _, figure in known])
-    limit = ([cell["size"] for cell in group.cells], [cell["limit"]["moustakides"] for cell in group.cells])
-    return [_plot(f"Delay, {group.mounting}", curves, SIZE, "mean delay, samples", "yaxis", limit)]
+            curves[name] = (
+                [size for size, _ in known],
+                [figure for _, figure in known],
+            )
+    limit = (
+        [cell["size"] for cell in group.cells],
+        [cell["limit"]["moustakides"] for cell in group.cells],
+    )
+    return [
+        _plot(
+            f"Delay, {group.mounting}",
+            curves,
+            SIZE,
+            "mean delay, samples",
+            "yaxis",
+            limit,
+        )
+    ]
 
 
 def _flight(group: Group) -> list[Section]:
@@ -228,13 +340,19 @@ def _flight(group: Group) -> list[Section]:
         return number(at["rms_after"], ".4f")
 
     said: Sequence[tuple[str, str, Say]] = (
-        ("Declared, and no healthy channel with it", "Percent of flights.", _of("right")),
+        (
+            "Declared, and no healthy channel with it",
+            "Percent of flights.",
+            _of("right"),
+        ),
         ("A healthy channel declared", "Percent of flights.", _of("wrong")),
         ("Delay to the declaration", "Median and 90 % quantile, s.", delays),
         ("Error of the fused rate from the onset on", "Root mean square, rad/s.", rms),
     )
     return [
-        _table(title, hint, [(cell["fault"], cell["methods"], say) for cell in group.cells])
+        _table(
+            title, hint, [(cell["fault"], cell["methods"], say) for cell in group.cells]
+        )
         for title, hint, say in said
     ]
 
@@ -243,18 +361,35 @@ def _search(group: Group) -> list[Section]:
     """Shares of each selection: of the searches with the paper's tolerance, then of all methods at each rate."""
     found, settings = [], group.settings
     for cell in group.cells:
-        rows = [(name, "tolerance (8)", shares) for name, shares in cell["paper_tolerance"].items()]
+        rows = [
+            (name, "tolerance (8)", shares)
+            for name, shares in cell["paper_tolerance"].items()
+        ]
         for k, alarm in enumerate(settings["false_alarms"]):
-            rows += [(name, f"{alarm:g}", shares) for name, shares in _at(cell, k).items()]
+            rows += [
+                (name, f"{alarm:g}", shares) for name, shares in _at(cell, k).items()
+            ]
         words = [word for word in rows[0][2] if word != "false_alarm"] if rows else []
         title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
         ratio = settings["sigma_ratio"]
         hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
-        head = ("detector", "false alarms", *(word.replace("_", ", ") for word in words))
-        said = [(name, alarm, *(_of(word)(shares) for word in words)) for name, alarm, shares in rows]
+        head = (
+            "detector",
+            "false alarms",
+            *(word.replace("_", ", ") for word in words),
+        )
+        said = [
+            (name, alarm, *(_of(word)(shares) for word in words))
+            for name, alarm, shares in rows
+        ]
         found.append(_alike_together(title, hint, head, said))
     return found
 
 
-_TABLES: Mapping[str, Shows] = {"snapshot": _snapshot, "delay": _delay, "flight": _flight, "residual_search": _search}
+_TABLES: Mapping[str, Shows] = {
+    "snapshot": _snapshot,
+    "delay": _delay,
+    "flight": _flight,
+    "residual_search": _search,
+}
 _CURVES: Mapping[str, Shows] = {"snapshot": _snapshot_curves, "delay": _delay_curves}

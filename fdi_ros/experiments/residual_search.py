@@ -48,7 +48,9 @@ class ResidualSearch(CommonRate):
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
         "options": Field("mapping", {}),
-        "selections": Field("texts", [STANDS_OUT, PRINTED, ALL], choices=(STANDS_OUT, PRINTED, ALL)),
+        "selections": Field(
+            "texts", [STANDS_OUT, PRINTED, ALL], choices=(STANDS_OUT, PRINTED, ALL)
+        ),
         "false_alarms": Field("numbers", [0.15, 0.01], 1e-5, 0.5),
         "max_rate": Field("float", math.radians(2.0), 1e-6, 100.0),
         "sigma_ratio": Field("float", 0.2, 1e-3, 1e3),
@@ -66,21 +68,32 @@ class ResidualSearch(CommonRate):
 
     def trial_cells(self) -> list[Cell]:
         """List the healthy channels, and each selection of trials."""
-        return [Cell(0), *(Cell(0, selection=selection) for selection in self.settings["selections"])]
+        return [
+            Cell(0),
+            *(
+                Cell(0, selection=selection)
+                for selection in self.settings["selections"]
+            ),
+        ]
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by method and false-alarm rate."""
         (factors,) = super().conclude(found)["factors"]
         return {"factors": factors}
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(
+        self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation
+    ) -> Counts:
         """Draw trials of the protocol and evaluate every method on them."""
         z, failed = self.draw(cell, count, rng)
         methods, paper = {}, {}
         for name, contender in self.contenders[0].running.items():
             evaluation = contender.evaluate(z)
             factors = preparation["factors"][name]
-            methods[name] = [_counted(evaluation.ratio >= one, evaluation.named, failed) for one in factors]
+            methods[name] = [
+                _counted(evaluation.ratio >= one, evaluation.named, failed)
+                for one in factors
+            ]
             if name in self._paper:
                 declared = self._paper[name].detect(z).alarm
                 paper[name] = _counted(declared, evaluation.named, failed)
@@ -97,9 +110,14 @@ class ResidualSearch(CommonRate):
             "selection": cell.selection or "sound",
             "drawn": counts["drawn"],
             "trials": kept,
-            "paper_tolerance": {name: shares(outcomes) for name, outcomes in counts["paper"].items()},
+            "paper_tolerance": {
+                name: shares(outcomes) for name, outcomes in counts["paper"].items()
+            },
             "methods": {
-                name: [{"false_alarm": alarm, **shares(one)} for alarm, one in zip(alarms, own, strict=True)]
+                name: [
+                    {"false_alarm": alarm, **shares(one)}
+                    for alarm, one in zip(alarms, own, strict=True)
+                ]
                 for name, own in counts["methods"].items()
             },
         }
@@ -107,7 +125,9 @@ class ResidualSearch(CommonRate):
     def loose(self) -> tuple[NoiseModel, float]:
         """Errors of the protocol, and thresholds at which methods name a channel nearly always."""
         zero, scale = self._zero_std, self.settings["scale_std"]
-        return NoiseModel(zero, scale, bound=BOUND * (zero + scale * self.settings["max_rate"])), LOOSE_FALSE_ALARM
+        return NoiseModel(
+            zero, scale, bound=BOUND * (zero + scale * self.settings["max_rate"])
+        ), LOOSE_FALSE_ALARM
 
     @property
     def _zero_std(self) -> float:
@@ -117,12 +137,16 @@ class ResidualSearch(CommonRate):
     @cached_property
     def _paper(self) -> dict[str, Detector]:
         return {
-            name: create_detector(name, self.geometries[0], self.loose()[0], tolerance="paper")
+            name: create_detector(
+                name, self.geometries[0], self.loose()[0], tolerance="paper"
+            )
             for name in self.contenders[0].running
             if "tolerance" in accepted_options(detector_class(name))
         }
 
-    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Index | None]:
+    def draw(
+        self, cell: Cell, count: int, rng: np.random.Generator
+    ) -> tuple[Array, Index | None]:
         """Draw trials and keep those of a selection: z (N, n) rad/s, and the failed channel (N,); None: none is."""
         n = self.geometries[0].n
         omega = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
@@ -131,7 +155,9 @@ class ResidualSearch(CommonRate):
         if not cell.healthy:
             failed = rng.integers(n, size=count)
             strength = rng.uniform(-1, 1, (2, count))
-            off = np.sign(strength) * ((self.settings["worst"] - CLIP) * np.abs(strength) + CLIP)
+            off = np.sign(strength) * (
+                (self.settings["worst"] - CLIP) * np.abs(strength) + CLIP
+            )
             scale[np.arange(count), failed], zero[np.arange(count), failed] = off
         along = omega @ self.geometries[0].axes.T
         error = along * scale * self.settings["scale_std"] + zero * self._zero_std
@@ -149,8 +175,16 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
     healthy[rows, failed] = False
     others = size[healthy].reshape(len(size), -1)
     middle, spread = others.mean(axis=1), others.std(axis=1)
-    inside: NDArray[np.bool_] = (middle - 3 * spread < own) & (own < middle + 3 * spread)
-    return inside if selection == PRINTED else ~inside if selection == STANDS_OUT else inside | True
+    inside: NDArray[np.bool_] = (middle - 3 * spread < own) & (
+        own < middle + 3 * spread
+    )
+    return (
+        inside
+        if selection == PRINTED
+        else ~inside
+        if selection == STANDS_OUT
+        else inside | True
+    )
 
 
 def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> Counts:

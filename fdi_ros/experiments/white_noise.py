@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.contenders import BOUND, Cell, CommonRate, Contender, Evaluation, factors_of, moustakides_delay
+from fdi_ros.experiments.contenders import (
+    BOUND,
+    Cell,
+    CommonRate,
+    Contender,
+    Evaluation,
+    factors_of,
+    moustakides_delay,
+)
 from fdi_ros.experiments.montecarlo import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
@@ -23,7 +31,9 @@ from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
-FALSE_ALARM_MARGIN = 4.0  # the loose thresholds have this many times the false-alarm rate asked for
+FALSE_ALARM_MARGIN = (
+    4.0  # the loose thresholds have this many times the false-alarm rate asked for
+)
 
 
 class Snapshot(CommonRate):
@@ -46,7 +56,9 @@ class Snapshot(CommonRate):
         super().__init__(settings)
         self._derived = self.settings["thresholds"] == DERIVED
         if self._derived and len(self.settings["false_alarms"]) > 1:
-            raise StudyError("snapshot.thresholds is 'derived', expected one of snapshot.false_alarms")
+            raise StudyError(
+                "snapshot.thresholds is 'derived', expected one of snapshot.false_alarms"
+            )
         self._ready: dict[int, dict[str, list[tuple[Contender, float]]]] = {}
 
     def preparation_cells(self) -> list[Cell]:
@@ -55,21 +67,35 @@ class Snapshot(CommonRate):
 
     def trial_cells(self) -> list[Cell]:
         """List each geometry, with healthy channels and with faults of each size."""
-        return [Cell(g, size) for g in range(len(self.specs)) for size in [0.0, *self.settings["sizes"]]]
+        return [
+            Cell(g, size)
+            for g in range(len(self.specs))
+            for size in [0.0, *self.settings["sizes"]]
+        ]
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by geometry, method and false-alarm rate."""
         if self._derived:
-            return {"factors": [{name: [1.0] for name in loose.running} for loose in self.contenders]}
+            return {
+                "factors": [
+                    {name: [1.0] for name in loose.running} for loose in self.contenders
+                ]
+            }
         return super().conclude(found)
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(
+        self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation
+    ) -> Counts:
         """Draw samples and evaluate every method on them."""
         z, struck = self.draw(cell, count, rng)
         methods = {}
-        for name, contenders in self._at_rates(cell.geometry, preparation["factors"][cell.geometry]).items():
+        for name, contenders in self._at_rates(
+            cell.geometry, preparation["factors"][cell.geometry]
+        ).items():
             evaluations = {one: one.evaluate(z) for one in dict(contenders)}
-            methods[name] = [counted(evaluations[one], factor, struck) for one, factor in contenders]
+            methods[name] = [
+                counted(evaluations[one], factor, struck) for one, factor in contenders
+            ]
         return {"trials": count, "methods": methods}
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
@@ -80,16 +106,21 @@ class Snapshot(CommonRate):
             "size": cell.size,
             "trials": counts["trials"],
             "methods": {
-                name: [_shares(*at) for at in zip(alarms, own, strict=True)] for name, own in counts["methods"].items()
+                name: [_shares(*at) for at in zip(alarms, own, strict=True)]
+                for name, own in counts["methods"].items()
             },
         }
 
     def loose(self) -> tuple[NoiseModel, float]:
         """White noise, and more false alarms than asked for."""
         margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
-        return _noise(self.settings["noise_std"]), min(margin * max(self.settings["false_alarms"]), 0.9)
+        return _noise(self.settings["noise_std"]), min(
+            margin * max(self.settings["false_alarms"]), 0.9
+        )
 
-    def _at_rates(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Contender, float]]]:
+    def _at_rates(
+        self, g: int, factors: Mapping[str, Sequence[float]]
+    ) -> dict[str, list[tuple[Contender, float]]]:
         """Each method with the factor of each false-alarm rate; those that depend on their threshold built anew."""
         if g not in self._ready:
             self._ready[g] = {}
@@ -97,20 +128,29 @@ class Snapshot(CommonRate):
                 options = loose.detector.options
                 if "threshold" in options:
                     own = self.settings["options"].get(name, {})
-                    at = ({name: {**own, "threshold": options["threshold"] * factor}} for factor in factors[name])
-                    self._ready[g][name] = [(self.build(g, [name], one).running[name], 1.0) for one in at]
+                    at = (
+                        {name: {**own, "threshold": options["threshold"] * factor}}
+                        for factor in factors[name]
+                    )
+                    self._ready[g][name] = [
+                        (self.build(g, [name], one).running[name], 1.0) for one in at
+                    ]
                 else:
                     self._ready[g][name] = [(loose, factor) for factor in factors[name]]
         return self._ready[g]
 
-    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, Mask]:
+    def draw(
+        self, cell: Cell, count: int, rng: np.random.Generator
+    ) -> tuple[Array, Mask]:
         """Draw samples z (N, n) rad/s, and which channels are struck (N, n)."""
         geometry, sigma = self.geometries[cell.geometry], self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
         struck = np.zeros(z.shape, dtype=bool)
         if cell.size:
-            order = rng.random(z.shape).argsort(axis=1, kind="stable")[:, : self.settings["faults"]]
+            order = rng.random(z.shape).argsort(axis=1, kind="stable")[
+                :, : self.settings["faults"]
+            ]
             rows = np.arange(count)[:, None]
             struck[rows, order] = True
             z[rows, order] += cell.size * sigma * rng.choice([-1.0, 1.0], order.shape)
@@ -138,7 +178,9 @@ def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
     sizes = suspects.sum(axis=1)[declared]
     return {
         "trials": len(struck),
-        "identified": None if evaluation.best is None else int(struck[rows, evaluation.best].sum()),
+        "identified": None
+        if evaluation.best is None
+        else int(struck[rows, evaluation.best].sum()),
         "declared": int(declared.sum()),
         "right": int(right.sum()),
         "isolated": int(isolated.sum()),
@@ -155,7 +197,10 @@ def _shares(false_alarm: float, counts: Counts) -> Figures:
     return {
         "false_alarm": false_alarm,
         **({} if identified is None else {"identified": share(identified, trials)}),
-        **{name: share(counts[name], trials) for name in ("declared", "right", "isolated_right")},
+        **{
+            name: share(counts[name], trials)
+            for name in ("declared", "right", "isolated_right")
+        },
         "isolated_wrong": share(wrong, trials),
         "covered_when_declared": share(counts["covered"], counts["declared"]),
         "set_sizes": counts["set_sizes"],
@@ -195,14 +240,24 @@ class Delay(CommonRate):
 
     def trial_cells(self) -> list[Cell]:
         """List each size of fault on each geometry."""
-        return [Cell(g, size) for g in range(len(self.specs)) for size in self.settings["sizes"]]
+        return [
+            Cell(g, size)
+            for g in range(len(self.specs))
+            for size in self.settings["sizes"]
+        ]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratio of every window of healthy samples."""
-        z, running = self.draw(cell, count, rng)[0], self.contenders[cell.geometry].running
+        z, running = (
+            self.draw(cell, count, rng)[0],
+            self.contenders[cell.geometry].running,
+        )
         return {
             "trials": count,
-            "largest": {name: _ratios(one, z).max(axis=1).tolist() for name, one in running.items()},
+            "largest": {
+                name: _ratios(one, z).max(axis=1).tolist()
+                for name, one in running.items()
+            },
         }
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
@@ -211,15 +266,22 @@ class Delay(CommonRate):
         factors = [factors_of(blocks, [with_alarm]) for blocks in found]
         return {
             "window": self._window,
-            "factors": [{name: factor for name, (factor,) in one.items()} for one in factors],
+            "factors": [
+                {name: factor for name, (factor,) in one.items()} for one in factors
+            ],
         }
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(
+        self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation
+    ) -> Counts:
         """Draw streams and run every method on them."""
         z, _ = self.draw(cell, count, rng)
         lead, factors = self.settings["lead"], preparation["factors"][cell.geometry]
         running = self.contenders[cell.geometry].running
-        methods = {name: _delays(_ratios(one, z) >= factors[name], lead) for name, one in running.items()}
+        methods = {
+            name: _delays(_ratios(one, z) >= factors[name], lead)
+            for name, one in running.items()
+        }
         return {"trials": count, "methods": methods}
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
@@ -232,14 +294,25 @@ class Delay(CommonRate):
             "geometry": self.specs[cell.geometry],
             "size": cell.size,
             "trials": counts["trials"],
-            "methods": {name: _waited(own, running[name].has_memory) for name, own in counts["methods"].items()},
+            "methods": {
+                name: _waited(own, running[name].has_memory)
+                for name, own in counts["methods"].items()
+            },
             # To nine digits: what linear algebra gives alike on all machines.
-            "limit": {"moustakides": float(f"{moustakides_delay(shift, run_length):.9g}")},
+            "limit": {
+                "moustakides": float(f"{moustakides_delay(shift, run_length):.9g}")
+            },
         }
 
-    def draw(self, cell: Cell, count: int, rng: np.random.Generator) -> tuple[Array, None]:
+    def draw(
+        self, cell: Cell, count: int, rng: np.random.Generator
+    ) -> tuple[Array, None]:
         """Draw streams (count, length, n) rad/s: windows of healthy samples, or with a fault after the lead."""
-        n, lead, sigma = self.geometries[cell.geometry].n, self.settings["lead"], self.settings["noise_std"]
+        n, lead, sigma = (
+            self.geometries[cell.geometry].n,
+            self.settings["lead"],
+            self.settings["noise_std"],
+        )
         length = self._window if cell.healthy else lead + self.settings["longest"]
         z = sigma * rng.standard_normal((count, length, n))
         if not cell.healthy:
@@ -249,7 +322,9 @@ class Delay(CommonRate):
 
     def loose(self) -> tuple[NoiseModel, float]:
         """White noise, and a run length somewhat shorter than the one asked for."""
-        return _noise(self.settings["noise_std"]), RUN_LENGTH_MARGIN / self.settings["run_length"]
+        return _noise(self.settings["noise_std"]), RUN_LENGTH_MARGIN / self.settings[
+            "run_length"
+        ]
 
 
 def _ratios(contender: Contender, z: Array) -> Array:

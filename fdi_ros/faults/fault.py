@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.settings import setting
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import FAULT_KINDS, ChannelSamples, FaultKind, Memory, check_fields
+from fdi_ros.faults.kinds import (
+    FAULT_KINDS,
+    ChannelSamples,
+    FaultKind,
+    Memory,
+    check_fields,
+)
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -40,7 +46,9 @@ class Fault:
         check_fields(self, f"fault {self.kind.name}")
         if not self.stop > self.start:
             expected = f"expected more than start {self.start:g} s"
-            raise FaultError(f"fault {self.kind.name}: stop is {self.stop:g} s, {expected}")
+            raise FaultError(
+                f"fault {self.kind.name}: stop is {self.stop:g} s, {expected}"
+            )
 
     @property
     def size(self) -> float | None:
@@ -52,23 +60,48 @@ class Fault:
         """Find the indices of the channels it strikes; `FaultError` if there is no such channel or unit."""
         struck: list[int] = []
         for name in self.channel.split(","):
-            found = [i for i, known in enumerate(channel_names) if name == known or known.startswith(f"{name}.")]
+            found = [
+                i
+                for i, known in enumerate(channel_names)
+                if name == known or known.startswith(f"{name}.")
+            ]
             if not found:
-                raise FaultError(f"fault on unknown channel {name!r}, expected one of: {', '.join(channel_names)}")
+                raise FaultError(
+                    f"fault on unknown channel {name!r}, expected one of: {', '.join(channel_names)}"
+                )
             struck += [i for i in found if i not in struck]
         if self.kind.whole_unit and len(struck) != 3:
-            raise FaultError(f"fault {self.kind.name} on {self.channel!r} strikes {len(struck)} channels, expected 3")
+            raise FaultError(
+                f"fault {self.kind.name} on {self.channel!r} strikes {len(struck)} channels, expected 3"
+            )
         return tuple(struck)
 
     def __str__(self) -> str:
-        words = [f"channel={self.channel}", f"kind={self.kind.name}", f"start={self.start:.12g}"]
+        words = [
+            f"channel={self.channel}",
+            f"kind={self.kind.name}",
+            f"start={self.start:.12g}",
+        ]
         words += [] if self.stop == math.inf else [f"stop={self.stop:.12g}"]
         words += [f"seed={self.seed}"] if self.seed else []
         options = {name: getattr(self.kind, name) for name in self.kind.options()}
-        return " ".join(words + [f"{name}={value:.12g}" for name, value in options.items() if value is not None])
+        return " ".join(
+            words
+            + [
+                f"{name}={value:.12g}"
+                for name, value in options.items()
+                if value is not None
+            ]
+        )
 
 
-_KEYS = ("channel", "kind", "start", "stop", "seed")  # what every fault may be given, besides the options of its kind
+_KEYS = (
+    "channel",
+    "kind",
+    "start",
+    "stop",
+    "seed",
+)  # what every fault may be given, besides the options of its kind
 
 
 def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
@@ -77,13 +110,22 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
     `FaultError` if there is no such kind, or an option is missing, out of range or not taken by it.
     """
     if name not in FAULT_KINDS:
-        raise FaultError(f"unknown fault kind {name!r}, expected one of: {', '.join(FAULT_KINDS)}")
-    kind, given = FAULT_KINDS[name], {option: value for option, value in options.items() if value is not None}
+        raise FaultError(
+            f"unknown fault kind {name!r}, expected one of: {', '.join(FAULT_KINDS)}"
+        )
+    kind, given = (
+        FAULT_KINDS[name],
+        {option: value for option, value in options.items() if value is not None},
+    )
     taken = kind.options()
     for option in given:
         if option not in taken:
-            raise FaultError(f"fault {name} takes no {option}, only: {', '.join((*_KEYS, *taken))}")
-    return kind(**{option: given.get(option, field.default) for option, field in taken.items()})
+            raise FaultError(
+                f"fault {name} takes no {option}, only: {', '.join((*_KEYS, *taken))}"
+            )
+    return kind(
+        **{option: given.get(option, field.default) for option, field in taken.items()}
+    )
 
 
 def fault_from(items: Mapping[str, Any]) -> Fault:
@@ -130,7 +172,9 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
     faults = []
     for number, entry in enumerate(entries, 1):
         if not isinstance(entry, dict):
-            raise FaultError(f"scenario {path}, fault {number}: expected keys and values, got {entry!r}")
+            raise FaultError(
+                f"scenario {path}, fault {number}: expected keys and values, got {entry!r}"
+            )
         try:
             faults.append(fault_from(entry))
         except FaultError as error:
@@ -145,25 +189,39 @@ class Injector:
     times of the faults count from, ns; None: that of the first sample.
     """
 
-    def __init__(self, faults: Sequence[Fault], channel_names: Sequence[str], start_stamp: int | None = None) -> None:
+    def __init__(
+        self,
+        faults: Sequence[Fault],
+        channel_names: Sequence[str],
+        start_stamp: int | None = None,
+    ) -> None:
         self.faults = tuple(faults)
         self.channel_names = tuple(channel_names)
         self.channels = tuple(fault.channels(channel_names) for fault in self.faults)
         self.start_stamp = start_stamp
         self._memories: list[Memory] = [{} for _ in self.faults]
-        self._random = [np.random.default_rng([fault.seed, k]) for k, fault in enumerate(self.faults)]
+        self._random = [
+            np.random.default_rng([fault.seed, k])
+            for k, fault in enumerate(self.faults)
+        ]
 
     def time(self, stamp: NDArray[np.int64]) -> Array:
         """Seconds since the first sample, of stamps, ns."""
         if self.start_stamp is None:
-            raise FaultError("no sample has been seen yet: the time of a fault has no origin")
+            raise FaultError(
+                "no sample has been seen yet: the time of a fault has no origin"
+            )
         return np.asarray((stamp - self.start_stamp) * 1e-9)
 
     def active(self, stamp: NDArray[np.int64]) -> Mask:
         """Ground truth: (N, faults) whether each fault is active at stamps (N,) ns."""
         time = self.time(stamp)
         columns = [(time >= fault.start) & (time < fault.stop) for fault in self.faults]
-        return np.column_stack(columns) if columns else np.zeros((len(stamp), 0), dtype=bool)
+        return (
+            np.column_stack(columns)
+            if columns
+            else np.zeros((len(stamp), 0), dtype=bool)
+        )
 
     def struck(self, stamp: NDArray[np.int64]) -> Mask:
         """Ground truth: (N, n) whether each channel carries an active fault at stamps (N,) ns."""
@@ -189,13 +247,27 @@ class Injector:
             return block
         if self.start_stamp is None:
             self.start_stamp = int(block.stamp[0])
-        time, active, z = self.time(block.stamp), self.active(block.stamp), block.z.copy()
-        received = np.ones(z.shape, dtype=bool) if block.received is None else block.received.copy()
+        time, active, z = (
+            self.time(block.stamp),
+            self.active(block.stamp),
+            block.z.copy(),
+        )
+        received = (
+            np.ones(z.shape, dtype=bool)
+            if block.received is None
+            else block.received.copy()
+        )
         for k, fault in enumerate(self.faults):
             index = list(self.channels[k])
-            struck = ChannelSamples(time, time - fault.start, active[:, k], z[:, index], received[:, index])
+            struck = ChannelSamples(
+                time, time - fault.start, active[:, k], z[:, index], received[:, index]
+            )
             # What is recorded may be infinite, and so may be what is added.
             with np.errstate(invalid="ignore", over="ignore"):
                 fault.kind.strike(struck, self._memories[k], self._random[k])
             z[:, index], received[:, index] = struck.z, struck.received
-        return Block(block.stamp, z, None if block.received is None and received.all() else received)
+        return Block(
+            block.stamp,
+            z,
+            None if block.received is None and received.all() else received,
+        )

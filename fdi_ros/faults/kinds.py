@@ -32,7 +32,9 @@ class ChannelSamples(NamedTuple):
     received: Mask  #: (N, c)
 
 
-Memory = dict[str, Any]  #: what a fault keeps of the samples before; empty at the start of a stream
+Memory = dict[
+    str, Any
+]  #: what a fault keeps of the samples before; empty at the start of a stream
 
 
 def check_fields(owner: Any, called: str) -> None:
@@ -40,9 +42,13 @@ def check_fields(owner: Any, called: str) -> None:
     for name, field in fields_of(owner).items():
         value = getattr(owner, name)
         if value is REQUIRED:
-            raise FaultError(f"{called} needs {name}" + (f" in {field.unit}" if field.unit else ""))
+            raise FaultError(
+                f"{called} needs {name}" + (f" in {field.unit}" if field.unit else "")
+            )
         if value is not None or field.default is not None:
-            object.__setattr__(owner, name, check(field, value, f"{called}: {name}", FaultError))
+            object.__setattr__(
+                owner, name, check(field, value, f"{called}: {name}", FaultError)
+            )
 
 
 FAULT_KINDS: dict[str, type[FaultKind]] = {}  #: every kind of fault by name
@@ -54,7 +60,9 @@ class FaultKind(ABC):
     name: ClassVar[str]
     study_size: ClassVar[float | None] = None
     """Size in simulated flights unless they set one: well above the noise, well below what needs no monitor."""
-    whole_unit: ClassVar[bool] = False  #: whether it strikes the three channels of a unit, and nothing less
+    whole_unit: ClassVar[bool] = (
+        False  #: whether it strikes the three channels of a unit, and nothing less
+    )
 
     def __init_subclass__(cls) -> None:
         if "name" in vars(cls):
@@ -63,7 +71,9 @@ class FaultKind(ABC):
     def __post_init__(self) -> None:
         check_fields(self, f"fault {self.name}")
         if getattr(self, "size", None) == 0 and self.has_signed_size():
-            raise FaultError(f"fault {self.name}: size is 0{self.options()['size'].unit_suffix}, which changes nothing")
+            raise FaultError(
+                f"fault {self.name}: size is 0{self.options()['size'].unit_suffix}, which changes nothing"
+            )
 
     @classmethod
     def options(cls) -> dict[str, Field]:
@@ -77,14 +87,18 @@ class FaultKind(ABC):
         return size is not None and size.default is REQUIRED and size.low < 0
 
     @abstractmethod
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Change the next samples of a stream in place; the generator is for this fault alone."""
 
 
 class Memoryless(FaultKind):
     """A kind whose output depends on the time since the start and on the true values alone."""
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Replace the active samples."""
         active = samples.active
         samples.z[active] = self.faulty(samples.since[active, None], samples.z[active])
@@ -138,9 +152,17 @@ class Stuck(FaultKind):
     """Repeats size, or without size the last value."""
 
     name = "stuck"
-    size: float | None = setting(None, "value that is repeated; without it the last finite one", "rad/s", -100.0, 100.0)
+    size: float | None = setting(
+        None,
+        "value that is repeated; without it the last finite one",
+        "rad/s",
+        -100.0,
+        100.0,
+    )
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Hold the given value, or the last finite one before the start."""
         active, z = samples.active, samples.z
         first = int(np.argmax(active)) if active.any() else len(active)
@@ -159,7 +181,9 @@ class Dropout(FaultKind):
     name = "dropout"
     missing: int = setting(0, "1: gives nothing", "", 0, 1)
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Take the values out, and with them that anything was received."""
         samples.z[samples.active] = np.nan
         if self.missing:
@@ -174,7 +198,9 @@ class Intermittent(Memoryless):
     study_size = 0.1
     size: float = setting(REQUIRED, "what is added", "rad/s", -100.0, 100.0)
     period: float = setting(1.0, "from one beginning to the next", "s", 1e-3, 3600.0)
-    duty: float = setting(0.5, "share of the period with the fault, from its beginning", "", 1e-3, 0.999)
+    duty: float = setting(
+        0.5, "share of the period with the fault, from its beginning", "", 1e-3, 0.999
+    )
 
     def faulty(self, since: Array, z: Array) -> Array:
         """Add the size in the first part of every period."""
@@ -190,7 +216,9 @@ class Noise(FaultKind):
     study_size = 0.05
     size: float = setting(REQUIRED, "standard deviation", "rad/s", 1e-9, 100.0)
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Add a normal number to every sample."""
         drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
         samples.z[samples.active] += self.size * drawn
@@ -205,11 +233,15 @@ class Spike(FaultKind):
     size: float = setting(REQUIRED, "height of a spike", "rad/s", 1e-9, 100.0)
     rate: float = setting(1.0, "mean number of spikes per second", "1/s", 1e-3, 1e4)
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Let a spike fall on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
         time, active = samples.time, samples.active
         before = memory.get("last", time[0])
-        probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[:, None]
+        probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[
+            :, None
+        ]
         drawn = random.random((int(active.sum()), samples.z.shape[1]))
         # One draw decides both: below half the probability a spike down, below the whole a spike up.
         spike = np.where(drawn < probability / 2, -self.size, self.size)
@@ -247,9 +279,13 @@ class Delay(FaultKind):
 
     name = "delay"
     study_size = 10.0
-    size: int = setting(REQUIRED, "by how much the values are late", "samples", 1, 100_000)
+    size: int = setting(
+        REQUIRED, "by how much the values are late", "samples", 1, 100_000
+    )
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Give the last samples, which are kept; before there are enough of them repeat the first."""
         active = samples.active
         for name, now in (("z", samples.z), ("received", samples.received)):
@@ -265,7 +301,9 @@ class Oscillation(Memoryless):
     name = "oscillation"
     study_size = 0.1
     size: float = setting(REQUIRED, "amplitude", "rad/s", 1e-9, 100.0)
-    frequency: float = setting(1.0, "of the sine, which begins at zero", "Hz", 1e-3, 1e4)
+    frequency: float = setting(
+        1.0, "of the sine, which begins at zero", "Hz", 1e-3, 1e4
+    )
 
     def faulty(self, since: Array, z: Array) -> Array:
         """Add the sine."""
@@ -279,6 +317,8 @@ class TriadLoss(FaultKind):
     name = "triad_loss"
     whole_unit = True
 
-    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+    def strike(
+        self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
+    ) -> None:
         """Do as a dropout with missing=1."""
         Dropout(missing=1).strike(samples, memory, random)

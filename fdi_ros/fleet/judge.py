@@ -19,7 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.csv_file import has_gyros
-from fdi_ros.bag.raw import LFS, LOG_SUFFIXES, SUFFIXES, Damage, files_of_bag, find_files
+from fdi_ros.bag.raw import (
+    LFS,
+    LOG_SUFFIXES,
+    SUFFIXES,
+    Damage,
+    files_of_bag,
+    find_files,
+)
 from fdi_ros.bag.reader import FORMATS
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file, parameters_of
@@ -55,10 +62,14 @@ def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
             raise BagError(f"there is no {path}")
         whole = path.parent if path in (files_of_bag(path.parent) or ()) else path
         for recording in _below(path, unread) if path.is_dir() else [whole]:
-            found.setdefault(os.path.realpath(recording), Path(os.path.abspath(recording)))
+            found.setdefault(
+                os.path.realpath(recording), Path(os.path.abspath(recording))
+            )
     if not found:
         expected = f"expected names that end in {', '.join((*SUFFIXES, *LOG_SUFFIXES))}"
-        raise BagError("; ".join([f"no recording in {', '.join(given)}: {expected}", *unread]))
+        raise BagError(
+            "; ".join([f"no recording in {', '.join(given)}: {expected}", *unread])
+        )
     return sorted(found.values()), unread
 
 
@@ -81,7 +92,9 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
             yield here
         for path in (here / name for name in sorted(files)):
             # What else lies in the folder of a bag is a part of it, but for logs.
-            if (bag is None or path.name.lower().endswith(LOG_SUFFIXES)) and _is_recording(path, unread):
+            if (
+                bag is None or path.name.lower().endswith(LOG_SUFFIXES)
+            ) and _is_recording(path, unread):
                 yield path
 
 
@@ -136,7 +149,9 @@ def judge_all(
     jobs = []
     for path in paths:
         # The last name of a folder alone may be shared: drone_1/logs and drone_2/logs are not one vehicle.
-        flight = Flight(storable(str(path)), storable(str(path.parent)), digest_of(path))
+        flight = Flight(
+            storable(str(path)), storable(str(path.parent)), digest_of(path)
+        )
         row = tables.flights.get(flight.path)
         # What could not be judged is tried again: it may be mended.
         if row is not None and row["digest"] == flight.digest and not row["error"]:
@@ -144,10 +159,15 @@ def judge_all(
         jobs.append((path, flight, parameters, calibrated))
     there = len(paths) - len(jobs)
     try:
-        done = run_jobs(judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words))
+        done = run_jobs(
+            judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words)
+        )
         for count, (_, judged) in enumerate(done, 1):
             flight, episodes, text = judged
-            tables.add(replace(flight, config=tables.keep_config(text) if text else ""), episodes)
+            tables.add(
+                replace(flight, config=tables.keep_config(text) if text else ""),
+                episodes,
+            )
             show((there + count) / len(paths))
     finally:
         tables.write()
@@ -161,7 +181,9 @@ def digest_of(path: Path) -> str:
         for file in (*find_files(path, Damage()), *path.glob("metadata.yaml")):
             about = file.stat()
             stats.append((file.name, about.st_size, about.st_mtime_ns))
-    return hashlib.sha256(repr(stats).encode("utf-8", "backslashreplace")).hexdigest()[:32]
+    return hashlib.sha256(repr(stats).encode("utf-8", "backslashreplace")).hexdigest()[
+        :32
+    ]
 
 
 def judge(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
@@ -170,7 +192,9 @@ def judge(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judg
         return _judged(path, flight, parameters, calibrated)
     except FdiError as error:
         return _failed(flight, str(error))
-    except Exception as error:  # A defect met in one recording must not cost the others.
+    except (
+        Exception
+    ) as error:  # A defect met in one recording must not cost the others.
         return _failed(flight, f"defect of fdi_ros: {type(error).__name__}: {error}")
 
 
@@ -180,13 +204,20 @@ def _failed(flight: Flight, error: str) -> Judged:
 
 
 def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
-    text, flight, looks = parameters, replace(flight, measured=bool(parameters)), set[str]()
+    text, flight, looks = (
+        parameters,
+        replace(flight, measured=bool(parameters)),
+        set[str](),
+    )
     if not parameters:
         start = starting_config_of(path, "no config")
         text, looks = start.text, {start.look} - {""}
     if calibrated:
         try:
-            text, flight = _calibrated(path, text), replace(flight, calibration="on itself", measured=True)
+            text, flight = (
+                _calibrated(path, text),
+                replace(flight, calibration="on itself", measured=True),
+            )
         except FdiError as error:
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
@@ -194,11 +225,18 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
     summary = replay(path, config, sinks=[seen])
     origin = summary.stream.origin_ns
     if not summary.scores.samples or origin is None:
-        raise BagError("its topics have no time in common: there is no sample of all channels")
-    looks |= {f"{second} gives the values of {first}: one sensor" for first, second in seen.copies}
+        raise BagError(
+            "its topics have no time in common: there is no sample of all channels"
+        )
+    looks |= {
+        f"{second} gives the values of {first}: one sensor"
+        for first, second in seen.copies
+    }
     noise = tuple(seen.segments.noise().quiet.tolist())
     date = _date(origin + round(summary.scores.start_s * 1e9))
-    row = _row(replace(flight, date=date, noise=noise, why=tuple(sorted(looks))), summary)
+    row = _row(
+        replace(flight, date=date, noise=noise, why=tuple(sorted(looks))), summary
+    )
     return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
 
@@ -206,16 +244,23 @@ def _calibrated(path: Path, parameters: str) -> str:
     """Return the text of a parameter file, calibrated on a recording."""
     given = parameters_of(parameters)
     config = Config.from_parameters(given)
-    result = calibrate(read_block(path, config, end=CALIBRATED / config.sample_rate), config)
+    result = calibrate(
+        read_block(path, config, end=CALIBRATED / config.sample_rate), config
+    )
     kept = {name: value for name, value in given.items() if name not in REPLACED}
-    return parameter_file({**kept, **result.settings}, f"made by fdi calibrate from {shown(path.name)}")
+    return parameter_file(
+        {**kept, **result.settings}, f"made by fdi calibrate from {shown(path.name)}"
+    )
 
 
 class _Seen(Sink):
     """What a summary does not have: the noise of the channels, and units that are copies."""
 
     def __init__(self, config: Config) -> None:
-        self._rate, self.segments = config.sample_rate, NoiseSegments(build_geometry(config).n)
+        self._rate, self.segments = (
+            config.sample_rate,
+            NoiseSegments(build_geometry(config).n),
+        )
         self.copies: set[tuple[str, str]] = set()
         """Units, with their topics, of which the second gives the values of the first."""
 
@@ -239,7 +284,10 @@ def _row(known: Flight, summary: Summary) -> Flight:
         damage=stream.damage,
         watched=math.fsum(one.watched_s for one in summary.story.stretches),
         episodes=len(declared),
-        declared=sum(len(step.channels) if step.state == "FAULTY" else step.state == "AMBIGUOUS" for step in steps),
+        declared=sum(
+            len(step.channels) if step.state == "FAULTY" else step.state == "AMBIGUOUS"
+            for step in steps
+        ),
         sets=sum(step.state == "AMBIGUOUS" for step in steps),
         degraded=monitor.degraded,
         channels=tuple(one.name for one in monitor.channels),
@@ -250,7 +298,11 @@ def _row(known: Flight, summary: Summary) -> Flight:
 
 def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
     """Return the row of an episode; `origin`: what its times count from, ns."""
-    sizes = [each.size for each in ([one.apart] if one.apart is not None else one.candidates) if each.size is not None]
+    sizes = [
+        each.size
+        for each in ([one.apart] if one.apart is not None else one.candidates)
+        if each.size is not None
+    ]
     largest = max(sizes, key=lambda size: abs(size.rad_s), default=None)
     return FlightEpisode(
         path=flight.path,

@@ -25,11 +25,23 @@ import pyarrow.parquet as parquet
 
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
-from fdi_ros.report.layout import Column, Section, Severity, Verdict, figures_of, html_table, number, page, told
+from fdi_ros.report.layout import (
+    Column,
+    Section,
+    Severity,
+    Verdict,
+    figures_of,
+    html_table,
+    number,
+    page,
+    told,
+)
 from fdi_ros.system.files import open_regular, plain, whole, write_text
 from fdi_ros.system.text import shown, storable
 
-Row = Mapping[str, Any]  # values of a row by the names of the columns; None where nothing can be said.
+Row = Mapping[
+    str, Any
+]  # values of a row by the names of the columns; None where nothing can be said.
 VERSION = 3  # of the columns: raised when one changes its name, type or meaning
 WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
 """The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
@@ -45,26 +57,50 @@ class Flight:
 
     path: str = _column("where the recording lies, whole path")
     vehicle: str = _column("folder in which it lies, whole path")
-    digest: str = _column("names, sizes and times of its files, hashed: with another one it is judged again")
+    digest: str = _column(
+        "names, sizes and times of its files, hashed: with another one it is judged again"
+    )
     error: str = _column("why it could not be judged; empty if it was", default="")
-    why: tuple[str, ...] = _column("why a person should look at it; empty: there is no need", default=())
+    why: tuple[str, ...] = _column(
+        "why a person should look at it; empty: there is no need", default=()
+    )
     config: str = _column("parameter file it was judged with", default="")
-    calibration: str = _column("'on itself', or why it could not be calibrated; empty: not asked", default="")
-    measured: bool | None = _column("false: mounts and axes are what fdi inspect assumes, not measured")
-    date: str | None = _column("of the first sample, UTC; null: its stamps count from a start, as of a log without GPS")
+    calibration: str = _column(
+        "'on itself', or why it could not be calibrated; empty: not asked", default=""
+    )
+    measured: bool | None = _column(
+        "false: mounts and axes are what fdi inspect assumes, not measured"
+    )
+    date: str | None = _column(
+        "of the first sample, UTC; null: its stamps count from a start, as of a log without GPS"
+    )
     duration: float | None = _column("from the first sample to the last", "s")
     damage: tuple[str, ...] | None = _column("what of it could not be read")
-    watched: float | None = _column("time that was judged while nothing stood declared", "s")
-    episodes: int | None = _column("faults declared, each from its first declaration to its end")
-    declared: int | None = _column("declarations: a channel faulty, or a set one of which is")
+    watched: float | None = _column(
+        "time that was judged while nothing stood declared", "s"
+    )
+    episodes: int | None = _column(
+        "faults declared, each from its first declaration to its end"
+    )
+    declared: int | None = _column(
+        "declarations: a channel faulty, or a set one of which is"
+    )
     sets: int | None = _column("of these, sets of several channels")
-    degraded: tuple[str, ...] | None = _column("what became worse than it should be without being declared")
-    channels: tuple[str, ...] | None = _column("names of the channels; the next three are in their order")
+    degraded: tuple[str, ...] | None = _column(
+        "what became worse than it should be without being declared"
+    )
+    channels: tuple[str, ...] | None = _column(
+        "names of the channels; the next three are in their order"
+    )
     unchecked: tuple[float, ...] | None = _column(
         "share of the samples in which nothing checked the channel, or it gave none"
     )
-    noise: tuple[float, ...] | None = _column("noise of each per sample, at the quietest", "rad/s")
-    bias: tuple[float, ...] | None = _column("bias of each at the end: given, learned and followed", "rad/s")
+    noise: tuple[float, ...] | None = _column(
+        "noise of each per sample, at the quietest", "rad/s"
+    )
+    bias: tuple[float, ...] | None = _column(
+        "bias of each at the end: given, learned and followed", "rad/s"
+    )
 
 
 @dataclass(frozen=True)
@@ -75,11 +111,17 @@ class FlightEpisode:
     vehicle: str = _column("folder in which it lies, whole path")
     date: str | None = _column("of its start, UTC; null: the flight has no date")
     state: str = _column("what it came to: FAULTY, AMBIGUOUS or STALE")
-    declares: bool = _column("whether a fault was declared; otherwise channels only gave nothing")
-    channels: tuple[str, ...] = _column("which are, or of which one is where it is AMBIGUOUS")
+    declares: bool = _column(
+        "whether a fault was declared; otherwise channels only gave nothing"
+    )
+    channels: tuple[str, ...] = _column(
+        "which are, or of which one is where it is AMBIGUOUS"
+    )
     start: float = _column("first declaration, from the first message", "s")
     end: float = _column("when nothing of it stood any more, or its stretch ended", "s")
-    size: float | None = _column("error by the others; between channels of one axis, how far apart", "rad/s")
+    size: float | None = _column(
+        "error by the others; between channels of one axis, how far apart", "rad/s"
+    )
     size_std: float | None = _column("standard error of that", "rad/s")
     words: str = _column("all in one sentence")
 
@@ -94,7 +136,9 @@ class Tables:
 
     def __init__(self, folder: Path, settings: Row, force: bool = False) -> None:
         decides = json.dumps([VERSION, __version__, settings], sort_keys=True)
-        self._settings = hashlib.sha256(decides.encode("utf-8", "surrogateescape")).hexdigest()
+        self._settings = hashlib.sha256(
+            decides.encode("utf-8", "surrogateescape")
+        ).hexdigest()
         self._folder = folder
         try:
             (folder / "configs").mkdir(parents=True, exist_ok=True)
@@ -105,13 +149,20 @@ class Tables:
         except BlockingIOError as error:
             raise BagError(f"another fdi fleet writes to {folder}") from error
         except OSError as error:
-            raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
+            raise BagError(
+                f"cannot write to {folder}: {error.strerror or error}"
+            ) from error
         try:
-            flights, episodes = self._read("flights", force), self._read("episodes", force)
+            flights, episodes = (
+                self._read("flights", force),
+                self._read("episodes", force),
+            )
         except (BagError, OSError):
             self.give_up()
             raise
-        self.flights: dict[str, Row] = {row["path"]: row for row in flights}  # rows by path
+        self.flights: dict[str, Row] = {
+            row["path"]: row for row in flights
+        }  # rows by path
         self._episodes: dict[str, list[Row]] = {path: [] for path in self.flights}
         for row in episodes:
             # Those whose flight was not written any more are of no use: it is judged again.
@@ -127,21 +178,34 @@ class Tables:
 
     def add(self, flight: Flight, episodes: Sequence[FlightEpisode]) -> None:
         """Take the rows of one more recording, with texts in Unicode, in place of its former ones."""
-        self.flights[flight.path], self._episodes[flight.path] = plain(flight), list(map(plain, episodes))
-        if time.monotonic() - self._written > max(WRITE_AFTER, self._took / WRITE_SHARE):
+        self.flights[flight.path], self._episodes[flight.path] = (
+            plain(flight),
+            list(map(plain, episodes)),
+        )
+        if time.monotonic() - self._written > max(
+            WRITE_AFTER, self._took / WRITE_SHARE
+        ):
             self.write()
 
     def write(self) -> None:
         """Write the tables, sorted by path: episodes first, so that every flight that is there has its own."""
         begun, paths = time.monotonic(), sorted(self.flights)
-        self._save("episodes", FlightEpisode, [row for path in paths for row in self._episodes[path]])
+        self._save(
+            "episodes",
+            FlightEpisode,
+            [row for path in paths for row in self._episodes[path]],
+        )
         self._save("flights", Flight, [self.flights[path] for path in paths])
         self._written = time.monotonic()
         self._took = self._written - begun
 
     def keep_config(self, text: str) -> str:
         """Keep a parameter file; return where it lies."""
-        path = self._folder / "configs" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.yaml"
+        path = (
+            self._folder
+            / "configs"
+            / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.yaml"
+        )
         if not path.exists():
             write_text(path, text)
         return storable(str(path))
@@ -155,25 +219,53 @@ class Tables:
             with open_regular(path) as file:
                 table = parquet.read_table(file)
         except arrow.ArrowException as error:
-            raise BagError(f"{path} is damaged: take it away, or give another --output") from error
+            raise BagError(
+                f"{path} is damaged: take it away, or give another --output"
+            ) from error
         about = table.schema.metadata or {}
         if b"fdi_ros" not in about:
-            raise BagError(f"{path} is no table of fdi fleet; it is not overwritten even with --force")
+            raise BagError(
+                f"{path} is no table of fdi fleet; it is not overwritten even with --force"
+            )
         same = about.get(b"settings") == self._settings.encode()
         if not same and not force:
-            raise BagError(f"{path} is of other settings or of another version; --force begins anew")
+            raise BagError(
+                f"{path} is of other settings or of another version; --force begins anew"
+            )
         rows: list[Row] = table.to_pylist() if same else []
         return rows
 
-    def _save(self, name: str, columns: type[Flight | FlightEpisode], rows: list[Row]) -> None:
-        types = {"str": arrow.string(), "int": arrow.int64(), "float": arrow.float64(), "bool": arrow.bool_()}
-        types |= {f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()}
+    def _save(
+        self, name: str, columns: type[Flight | FlightEpisode], rows: list[Row]
+    ) -> None:
+        types = {
+            "str": arrow.string(),
+            "int": arrow.int64(),
+            "float": arrow.float64(),
+            "bool": arrow.bool_(),
+        }
+        types |= {
+            f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()
+        }
         # As annotated: of what may be unknown, None too.
-        kinds = [(one, types[str(one.type).replace(" | None", "")]) for one in fields(columns)]
-        described = [arrow.field(one.name, kind, metadata=dict(one.metadata)) for one, kind in kinds]
-        about = {"fdi_ros": __version__, "columns": str(VERSION), "settings": self._settings}
+        kinds = [
+            (one, types[str(one.type).replace(" | None", "")])
+            for one in fields(columns)
+        ]
+        described = [
+            arrow.field(one.name, kind, metadata=dict(one.metadata))
+            for one, kind in kinds
+        ]
+        about = {
+            "fdi_ros": __version__,
+            "columns": str(VERSION),
+            "settings": self._settings,
+        }
         schema = arrow.schema(described, metadata=about)
-        with whole(self._folder / f"{name}.parquet") as scratch, scratch.open("wb") as file:
+        with (
+            whole(self._folder / f"{name}.parquet") as scratch,
+            scratch.open("wb") as file,
+        ):
             parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), file)
 
 
@@ -181,7 +273,10 @@ class Tables:
 
 
 MOST_ROWS = 2000  # flights in a table of the page; flights.parquet has all
-LOOKS, WHY = 10, 400  # flights that need a person in a terminal, and characters of what is said of each
+LOOKS, WHY = (
+    10,
+    400,
+)  # flights that need a person in a terminal, and characters of what is said of each
 
 
 class Fleet:
@@ -193,7 +288,9 @@ class Fleet:
             return sets - declared, -declared, not row["error"], row["path"]
 
         self.flights = sorted(flights, key=rank)
-        self.looks = [row for row in self.flights if row["why"]]  # those that need a person
+        self.looks = [
+            row for row in self.flights if row["why"]
+        ]  # those that need a person
         self.calm = [row for row in self.flights if not row["why"]]
         self.judged = [row for row in flights if not row["error"]]
 
@@ -215,11 +312,22 @@ class Fleet:
         count = _count(len(self.flights), "flight")
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
-        faulty = sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks)
+        faulty = sum(
+            any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks
+        )
         failed = sum(bool(row["error"]) for row in self.looks)
-        reasons = {"faulty": faulty, "not judged": failed, "cannot be told": len(self.looks) - faulty - failed}
-        words = ", ".join(f"{number} {reason}" for reason, number in reasons.items() if number)
-        return Verdict(Severity.BAD if faulty else Severity.UNKNOWN, f"LOOK AT {len(self.looks)} of {count}: {words}.")
+        reasons = {
+            "faulty": faulty,
+            "not judged": failed,
+            "cannot be told": len(self.looks) - faulty - failed,
+        }
+        words = ", ".join(
+            f"{number} {reason}" for reason, number in reasons.items() if number
+        )
+        return Verdict(
+            Severity.BAD if faulty else Severity.UNKNOWN,
+            f"LOOK AT {len(self.looks)} of {count}: {words}.",
+        )
 
     def lines(self) -> list[str]:
         """Say it all in sentences, the verdict first."""
@@ -237,8 +345,13 @@ class Fleet:
 
     def text(self) -> str:
         """Return the sentences, and the first flights that need a person, for a terminal."""
-        looks = [f"{shown(row['path'])}: {shown('; '.join(row['why']), WHY)}" for row in self.looks[:LOOKS]]
-        more = [f"and {len(self.looks) - LOOKS} more"] if len(self.looks) > LOOKS else []
+        looks = [
+            f"{shown(row['path'])}: {shown('; '.join(row['why']), WHY)}"
+            for row in self.looks[:LOOKS]
+        ]
+        more = (
+            [f"and {len(self.looks) - LOOKS} more"] if len(self.looks) > LOOKS else []
+        )
         return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
 
     def html(self, about: Mapping[str, str]) -> str:
@@ -246,10 +359,17 @@ class Fleet:
         hint = "Gyros declared faulty first, then sets, then what was not judged, and what was hardly checked."
         sections = [
             _section("Flights that need a look", hint, self.looks),
-            _section("All other flights", "Nothing was declared, and the channels were checked.", self.calm, "why"),
+            _section(
+                "All other flights",
+                "Nothing was declared, and the channels were checked.",
+                self.calm,
+                "why",
+            ),
             Section("What was run", "", about),
         ]
-        return page("fdi_ros: fleet", self.lines(), sections, severity=self.verdict.severity)
+        return page(
+            "fdi_ros: fleet", self.lines(), sections, severity=self.verdict.severity
+        )
 
 
 def columns_of(flights: Sequence[Row]) -> list[Column]:
@@ -258,26 +378,66 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
     def column(name: str, head: str, say: Any) -> Column:
         return Column(name, [row[name] for row in flights], (head,), say)
 
-    words = [("fdi", "replay", row["path"], "--config", row["config"], "--report", "flight.html") for row in flights]
-    commands = ["" if row["error"] else shlex.join(command) for row, command in zip(flights, words, strict=True)]
+    words = [
+        (
+            "fdi",
+            "replay",
+            row["path"],
+            "--config",
+            row["config"],
+            "--report",
+            "flight.html",
+        )
+        for row in flights
+    ]
+    commands = [
+        "" if row["error"] else shlex.join(command)
+        for row, command in zip(flights, words, strict=True)
+    ]
     return [
         column("path", "flight", lambda path: shown(path.rpartition("/")[2])),
         column("why", "why", lambda why: shown("; ".join(why), WHY) or "-"),
-        column("date", "date, UTC", lambda date: date[:16].replace("T", " ") if date else "-"),
+        column(
+            "date",
+            "date, UTC",
+            lambda date: date[:16].replace("T", " ") if date else "-",
+        ),
         column("vehicle", "vehicle", lambda path: shown(path.rpartition("/")[2])),
-        column("duration", "minutes", lambda seconds: number(seconds and seconds / 60, ".1f")),
-        column("unchecked", "not checked", lambda shares: number(max(shares or (), default=None), ".0%")),
+        column(
+            "duration",
+            "minutes",
+            lambda seconds: number(seconds and seconds / 60, ".1f"),
+        ),
+        column(
+            "unchecked",
+            "not checked",
+            lambda shares: number(max(shares or (), default=None), ".0%"),
+        ),
         column("declared", "declared", lambda count: number(count, "d")),
-        column("damage", "damage", lambda damage: shown("; ".join(damage or ()), WHY) or "-"),
+        column(
+            "damage",
+            "damage",
+            lambda damage: shown("; ".join(damage or ()), WHY) or "-",
+        ),
         Column("command", commands, ("to see it",), str),
     ]
 
 
-def _section(title: str, hint: str, flights: Sequence[Row], without: str = "") -> Section:
-    more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
-    columns = (column for column in columns_of(flights[:MOST_ROWS]) if column.name != without)
+def _section(
+    title: str, hint: str, flights: Sequence[Row], without: str = ""
+) -> Section:
+    more = (
+        f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
+    )
+    columns = (
+        column for column in columns_of(flights[:MOST_ROWS]) if column.name != without
+    )
     table = html_table(*told(columns), sort=True)
-    return Section(f"{title} ({len(flights)})", f"{hint}{more}", table if flights else "<p>None.</p>")
+    return Section(
+        f"{title} ({len(flights)})",
+        f"{hint}{more}",
+        table if flights else "<p>None.</p>",
+    )
 
 
 def _count(number: int, what: str) -> str:

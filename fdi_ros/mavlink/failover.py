@@ -38,21 +38,36 @@ from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.files import read_trusted, replacing
 
 YOUNG = NS  # a declaration is acted on up to this age, ns: with what is older the vehicle has flown, the pilot decides
-HEALED = 2 * NS  # so long an IMU that is out must have been well before it changes places with a faulty one, ns
-GROUNDED = 2 * NS  # disarmed is what all heartbeats have said for so long, ns: a single forged one is not enough
-RETRY, TRIES = 100 * MS, 10  # between two attempts to set a parameter, ns, and their number
+HEALED = (
+    2 * NS
+)  # so long an IMU that is out must have been well before it changes places with a faulty one, ns
+GROUNDED = (
+    2 * NS
+)  # disarmed is what all heartbeats have said for so long, ns: a single forged one is not enough
+RETRY, TRIES = (
+    100 * MS,
+    10,
+)  # between two attempts to set a parameter, ns, and their number
 AGAIN = 10 * NS  # an IMU that could not be put back is tried again after so long, ns
-SETTLED = 2 * NS  # what was sent so long ago has arrived, or never will, ns: what is heard later is the truth
+SETTLED = (
+    2 * NS
+)  # what was sent so long ago has arrived, or never will, ns: what is heard later is the truth
 
 
 class FailoverUnit(NamedTuple):
     """What is known of one IMU; times in ns."""
 
-    use: bool | None = None  # whether its parameter says that it is in use; None: the autopilot has not said of late.
+    use: bool | None = (
+        None  # whether its parameter says that it is in use; None: the autopilot has not said of late.
+    )
     heard: int = 0  # when the autopilot said so last
-    declared: int | None = None  # when the newest of its channels that are FAULTY by name was declared; None: none is.
+    declared: int | None = (
+        None  # when the newest of its channels that are FAULTY by name was declared; None: none is.
+    )
     ok: bool = False  # whether all its channels are OK: healthy and checked
-    well: int | None = None  # since when none of its channels is FAULTY, without data or excluded; None: one is.
+    well: int | None = (
+        None  # since when none of its channels is FAULTY, without data or excluded; None: one is.
+    )
     delivers: bool = False  # whether its samples come
 
 
@@ -60,10 +75,16 @@ class Known(NamedTuple):
     """What is known now."""
 
     units: tuple[FailoverUnit, ...]
-    linked: bool = False  # whether an ArduPilot is heard that sends each IMU under its own name
+    linked: bool = (
+        False  # whether an ArduPilot is heard that sends each IMU under its own name
+    )
     armed: bool = False
-    disarmed: int = 0  # for how long all its heartbeats have said that it is not armed, ns
-    monitored: bool = False  # whether the monitor, and nobody else in its place, reports
+    disarmed: int = (
+        0  # for how long all its heartbeats have said that it is not armed, ns
+    )
+    monitored: bool = (
+        False  # whether the monitor, and nobody else in its place, reports
+    )
     restore: bool = False  # an operator asks now for all to be put back
 
 
@@ -86,10 +107,16 @@ class Order(NamedTuple):
 class FailoverState:
     """What was decided before, by IMU."""
 
-    orders: dict[int, Order] = field(default_factory=dict)  # of those that are, or may be, out of use by our hand
+    orders: dict[int, Order] = field(
+        default_factory=dict
+    )  # of those that are, or may be, out of use by our hand
     seen: dict[int, bool] = field(default_factory=dict)  # what each parameter said last
-    left_alone: set[int] = field(default_factory=set)  # set by somebody else: left alone until it is disarmed
-    answered: dict[int, int] = field(default_factory=dict)  # declarations acted on, or refused: when made, ns
+    left_alone: set[int] = field(
+        default_factory=set
+    )  # set by somebody else: left alone until it is disarmed
+    answered: dict[int, int] = field(
+        default_factory=dict
+    )  # declarations acted on, or refused: when made, ns
 
     @classmethod
     def resumed(cls, ours: Iterable[int]) -> FailoverState:
@@ -112,7 +139,9 @@ def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
     one = known.units[unit]
     out = {k for k, order in state.orders.items() if k != unit and order.is_out}
     # One that we may have taken out is no reserve, though its parameter was last heard to say that it is in use.
-    reserves = [other for k, other in enumerate(known.units) if k != unit and k not in out]
+    reserves = [
+        other for k, other in enumerate(known.units) if k != unit and k not in out
+    ]
     checks = (
         (known.linked, "no ArduPilot that sends each IMU"),
         (known.armed, "not armed"),
@@ -121,19 +150,29 @@ def objection(state: FailoverState, known: Known, unit: int, limit: int) -> str:
         (all(other.use is not None for other in known.units), "INS_USE not known"),
         (one.use, "out already"),
         (unit not in state.left_alone, "set by others"),
-        (any(other.use and other.delivers and other.ok for other in reserves), "no other is healthy"),
+        (
+            any(other.use and other.delivers and other.ok for other in reserves),
+            "no other is healthy",
+        ),
         (len(out) < limit, "limit"),
     )
     return next((words for holds, words in checks if not holds), "")
 
 
-def decide(state: FailoverState, known: Known, now: int, limit: int = 1) -> tuple[FailoverState, list[Action]]:
+def decide(
+    state: FailoverState, known: Known, now: int, limit: int = 1
+) -> tuple[FailoverState, list[Action]]:
     """Return the next state, and what is to be done, in this order, at a time now, ns.
 
     ``state``: what was decided before, which stays as it is. ``limit``: at most so many IMUs are out of use by our
     hand, at most all but one.
     """
-    state = FailoverState(dict(state.orders), dict(state.seen), set(state.left_alone), dict(state.answered))
+    state = FailoverState(
+        dict(state.orders),
+        dict(state.seen),
+        set(state.left_alone),
+        dict(state.answered),
+    )
     actions: list[Action] = []
     for k, unit in enumerate(known.units):
         if unit.use is not None:
@@ -149,13 +188,19 @@ def decide(state: FailoverState, known: Known, now: int, limit: int = 1) -> tupl
     return state, actions
 
 
-def _notice(state: FailoverState, k: int, unit: FailoverUnit, actions: list[Action]) -> None:
+def _notice(
+    state: FailoverState, k: int, unit: FailoverUnit, actions: list[Action]
+) -> None:
     """Notice whether an order is confirmed, and what somebody else has set, or may have set."""
     assert unit.use is not None
     order, seen = state.orders.get(k), state.seen.get(k, unit.use)
     state.seen[k] = unit.use
     settled = order is not None and unit.heard - order.sent >= SETTLED
-    changed = unit.use != seen if order is None else unit.use and not order.use and order.confirmed and settled
+    changed = (
+        unit.use != seen
+        if order is None
+        else unit.use and not order.use and order.confirmed and settled
+    )
     if changed:
         actions.append(Action("changed", k))
         state.left_alone.add(k)
@@ -185,10 +230,19 @@ def _put_back(state: FailoverState, known: Known) -> None:
         state.left_alone.clear()
     # The autopilot is never left without an IMU by what was done here, whoever has taken out the others.
     if known.restore or grounded or all(unit.use is False for unit in known.units):
-        state.orders = {k: order if order.use else Order(True) for k, order in state.orders.items()}
+        state.orders = {
+            k: order if order.use else Order(True) for k, order in state.orders.items()
+        }
 
 
-def _answer(state: FailoverState, known: Known, k: int, now: int, limit: int, actions: list[Action]) -> None:
+def _answer(
+    state: FailoverState,
+    known: Known,
+    k: int,
+    now: int,
+    limit: int,
+    actions: list[Action],
+) -> None:
     """Answer a declaration: take the IMU out, make room for that, or say why not."""
     unit, why = known.units[k], objection(state, known, k, limit)
     assert unit.declared is not None
@@ -210,12 +264,25 @@ def _make_room(state: FailoverState, known: Known, now: int) -> None:
         if order.use and not order.confirmed:
             return
         unit = known.units[k]
-        if not order.use and unit.delivers and unit.ok and unit.well is not None and now - unit.well >= HEALED:
+        if (
+            not order.use
+            and unit.delivers
+            and unit.ok
+            and unit.well is not None
+            and now - unit.well >= HEALED
+        ):
             state.orders[k] = Order(True)
             return
 
 
-def _sent(state: FailoverState, known: Known, k: int, now: int, limit: int, actions: list[Action]) -> Order:
+def _sent(
+    state: FailoverState,
+    known: Known,
+    k: int,
+    now: int,
+    limit: int,
+    actions: list[Action],
+) -> Order:
     """Send an order once more if that is to be."""
     order = state.orders[k]
     # One that may no longer be taken out is not asked for again; it may be out all the same.
@@ -236,11 +303,21 @@ def _sent(state: FailoverState, known: Known, k: int, now: int, limit: int, acti
 
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
-OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}  # not used at all; suspects may be healthy
+OUT = {
+    ChannelState.FAULTY,
+    ChannelState.STALE,
+    ChannelState.EXCLUDED,
+}  # not used at all; suspects may be healthy
 _STEP = 20 * MS  # the policy is asked so often while a declaration is young, ns
 _BEFORE = NS + HEALED  # time of the policy at the start of a recording, ns
-READ_EVERY, FORGOTTEN = NS // 2, 10 * NS  # parameters are read in turn so often; what is older counts as not known
-SILENT, ABSENT = NS // 2, 5 * NS  # an IMU or a monitor without a sample, a monitor without a report, for so long, ns
+READ_EVERY, FORGOTTEN = (
+    NS // 2,
+    10 * NS,
+)  # parameters are read in turn so often; what is older counts as not known
+SILENT, ABSENT = (
+    NS // 2,
+    5 * NS,
+)  # an IMU or a monitor without a sample, a monitor without a report, for so long, ns
 TEXTS = {
     "out": (CRITICAL, "out of use"),
     "back": (INFO, "in use again"),
@@ -264,8 +341,12 @@ class Declarations:
     def __init__(self, count: int) -> None:
         self.heard = 0  # when the monitor was heard last, ns
         self.begun = 0  # since when it has been heard without a break, ns
-        self.channels: list[int | None] = [None] * (3 * count)  # when each that is FAULTY by name was declared, ns
-        self.units = [FailoverUnit()] * count  # of each IMU ``declared``, ``ok`` and ``well``
+        self.channels: list[int | None] = [None] * (
+            3 * count
+        )  # when each that is FAULTY by name was declared, ns
+        self.units = [
+            FailoverUnit()
+        ] * count  # of each IMU ``declared``, ``ok`` and ``well``
 
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at a time, ns."""
@@ -275,12 +356,19 @@ class Declarations:
         self.begun = now if is_new else self.begun
         self.heard = now
         for i, state in enumerate(states):
-            self.channels[i] = (self.channels[i] or declared) if state == ChannelState.FAULTY else None
+            self.channels[i] = (
+                (self.channels[i] or declared) if state == ChannelState.FAULTY else None
+            )
         for k, before in enumerate(self.units):
-            unit, stamps = set(states[3 * k : 3 * k + 3]), self.channels[3 * k : 3 * k + 3]
+            unit, stamps = (
+                set(states[3 * k : 3 * k + 3]),
+                self.channels[3 * k : 3 * k + 3],
+            )
             well = None if unit & OUT else now if is_new else before.well or now
             newest = max((at for at in stamps if at is not None), default=None)
-            self.units[k] = FailoverUnit(declared=newest, ok=unit == {ChannelState.OK}, well=well)
+            self.units[k] = FailoverUnit(
+                declared=newest, ok=unit == {ChannelState.OK}, well=well
+            )
 
 
 class Failover:
@@ -289,23 +377,38 @@ class Failover:
     ``channels``: three for each IMU. ``path``: file in which those out stand; `ConfigError` if it is not ours.
     """
 
-    def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
-        self._vehicle, self._channels, self._limit, self._path = vehicle, channels, limit, path
+    def __init__(
+        self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path
+    ) -> None:
+        self._vehicle, self._channels, self._limit, self._path = (
+            vehicle,
+            channels,
+            limit,
+            path,
+        )
         count = len(channels) // 3
-        self.errors: dict[str, float] = {}  # estimated error of each channel, as last reported, rad/s; NaN: none
+        self.errors: dict[
+            str, float
+        ] = {}  # estimated error of each channel, as last reported, rad/s; NaN: none
         self.reported = 0  # when the monitor last reported as a whole, of these IMUs, ns; 0: not, or of others since
         self.is_alone = False  # whether nobody but the monitor publishes what is taken for its declarations
         self.declarations = Declarations(count)
-        self._values: list[tuple[bool | None, int]] = [(None, 0)] * count  # what each parameter said last, and when
+        self._values: list[tuple[bool | None, int]] = [
+            (None, 0)
+        ] * count  # what each parameter said last, and when
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
-        self._system, self._saved = self._restore()  # which IMUs of which system are out of use by our hand, as saved
+        self._system, self._saved = (
+            self._restore()
+        )  # which IMUs of which system are out of use by our hand, as saved
         self._state = FailoverState.resumed(self._saved)
         self._save()
 
     @property
     def is_done(self) -> bool:
         """Whether nothing is to be put back now: none is out of use by our hand, or the vehicle is armed."""
-        return not self._state.orders or self._vehicle.armed or not self._vehicle.in_reach
+        return (
+            not self._state.orders or self._vehicle.armed or not self._vehicle.in_reach
+        )
 
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle, units = self._vehicle, []
@@ -314,14 +417,25 @@ class Failover:
         for k, (use, heard) in enumerate(self._values):
             delivers = k in vehicle.units and now - vehicle.units[k].last < SILENT
             use = use if ours and now - heard < FORGOTTEN else None
-            units.append(self.declarations.units[k]._replace(use=use, heard=heard, delivers=delivers))
-        reported = self.reported >= self.declarations.begun and now - self.reported < ABSENT
+            units.append(
+                self.declarations.units[k]._replace(
+                    use=use, heard=heard, delivers=delivers
+                )
+            )
+        reported = (
+            self.reported >= self.declarations.begun and now - self.reported < ABSENT
+        )
         return Known(
             units=tuple(units),
-            linked=vehicle.in_reach and vehicle.autopilot == ARDUPILOT and vehicle.kind == "SCALED_IMU" and ours,
+            linked=vehicle.in_reach
+            and vehicle.autopilot == ARDUPILOT
+            and vehicle.kind == "SCALED_IMU"
+            and ours,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
-            monitored=self.is_alone and now - self.declarations.heard < SILENT and reported,
+            monitored=self.is_alone
+            and now - self.declarations.heard < SILENT
+            and reported,
             restore=restore,
         )
 
@@ -345,7 +459,9 @@ class Failover:
 
     def restore(self, now: int) -> tuple[bool, str]:
         """Put all back that is out of use by our hand; return whether that was asked of the autopilot, and words."""
-        ours = ", ".join(format_imu(unit, self._channels) for unit in sorted(self._state.orders))
+        ours = ", ".join(
+            format_imu(unit, self._channels) for unit in sorted(self._state.orders)
+        )
         if not ours:
             return True, "no IMU is out of use by failover"
         if not self._known(now).linked:
@@ -382,7 +498,9 @@ class Failover:
         if declared[axis] is None:
             return ""
         size = self.errors.get(self._channels[3 * unit + axis], math.nan)
-        words = "" if math.isnan(size) else f" {size if axis == 0 else -size:+.2f} rad/s"
+        words = (
+            "" if math.isnan(size) else f" {size if axis == 0 else -size:+.2f} rad/s"
+        )
         return f" (gyro {'xyz'[axis]}{words})"
 
     def _restore(self) -> tuple[int, frozenset[int]]:
@@ -395,41 +513,83 @@ class Failover:
         except FileNotFoundError:
             return 0, frozenset()
         except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"failover_file {self._path} does not say which IMUs are out of use") from error
+            raise ConfigError(
+                f"failover_file {self._path} does not say which IMUs are out of use"
+            ) from error
         except OSError as error:
-            raise ConfigError(f"failover_file {self._path}: {error.strerror}") from error
+            raise ConfigError(
+                f"failover_file {self._path}: {error.strerror}"
+            ) from error
 
     def _save(self) -> None:
-        out = {"system_id": self._system, "out_of_use": [unit + 1 for unit in sorted(self._state.orders)]}
+        out = {
+            "system_id": self._system,
+            "out_of_use": [unit + 1 for unit in sorted(self._state.orders)],
+        }
         try:
             with replacing(self._path) as file:
                 file.write(json.dumps(out).encode())
         except OSError as error:
-            raise ConfigError(f"failover_file {self._path} cannot be written: {error.strerror}") from error
+            raise ConfigError(
+                f"failover_file {self._path} cannot be written: {error.strerror}"
+            ) from error
         self._saved = frozenset(self._state.orders)
 
     def status(self, now: int) -> tuple[Level, str]:
         """Return level and words for the diagnostics: what is out, or what would speak against taking one out."""
-        if out := [format_imu(k, self._channels) for k, order in self._state.orders.items() if order.is_out]:
-            unsaved = "" if self._state.orders.keys() == self._saved else "; failover_file is not written"
-            return Level.WARN, f"out of use: {', '.join(out)} of system {self._system}{unsaved}"
+        if out := [
+            format_imu(k, self._channels)
+            for k, order in self._state.orders.items()
+            if order.is_out
+        ]:
+            unsaved = (
+                ""
+                if self._state.orders.keys() == self._saved
+                else "; failover_file is not written"
+            )
+            return (
+                Level.WARN,
+                f"out of use: {', '.join(out)} of system {self._system}{unsaved}",
+            )
         known = self._known(now)
-        known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
-        against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]
-        return (Level.OK, "ready") if "" in against else (Level.WARN, f"no failover: {against[0]}")
+        known = known._replace(
+            armed=True, units=tuple(unit._replace(declared=now) for unit in known.units)
+        )
+        against = [
+            objection(self._state, known, k, self._limit)
+            for k in range(len(known.units))
+        ]
+        return (
+            (Level.OK, "ready")
+            if "" in against
+            else (Level.WARN, f"no failover: {against[0]}")
+        )
 
 
-def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[str]) -> str:
+def failover_text(
+    changes: Sequence[tuple[float, str, str]], channels: Sequence[str]
+) -> str:
     """Say what failover would have done in a flight, by its changes: s since the start, channel, new state."""
     count = len(channels) // 3
     if not 2 <= count <= len(PARAMETERS) or len(channels) % 3:
         return ""
-    declarations, states, state = Declarations(count), [float(ChannelState.UNCHECKED)] * len(channels), FailoverState()
+    declarations, states, state = (
+        Declarations(count),
+        [float(ChannelState.UNCHECKED)] * len(channels),
+        FailoverState(),
+    )
     use, done = [True] * count, []
-    waiting = deque((_BEFORE + round(at * NS), channel, name) for at, channel, name in changes)
+    waiting = deque(
+        (_BEFORE + round(at * NS), channel, name) for at, channel, name in changes
+    )
     # It is asked at every change, and while what was declared is young.
     asked = {at for at, _, _ in waiting}
-    asked |= {at + k * _STEP for at, _, name in waiting if name == "FAULTY" for k in range(YOUNG // _STEP + 3)}
+    asked |= {
+        at + k * _STEP
+        for at, _, name in waiting
+        if name == "FAULTY"
+        for k in range(YOUNG // _STEP + 3)
+    }
     for now in sorted(asked):
         # Between two changes the monitor was heard all the time.
         declarations.heard = now - 1
@@ -439,12 +599,19 @@ def failover_text(changes: Sequence[tuple[float, str, str]], channels: Sequence[
         declarations.hear(states, now)
         stale = [ChannelState.STALE in states[3 * k : 3 * k + 3] for k in range(count)]
         said = zip(declarations.units, use, stale, strict=True)
-        units = tuple(unit._replace(use=used, heard=now, delivers=not lost) for unit, used, lost in said)
-        state, actions = decide(state, Known(units, linked=True, armed=True, monitored=True), now)
+        units = tuple(
+            unit._replace(use=used, heard=now, delivers=not lost)
+            for unit, used, lost in said
+        )
+        state, actions = decide(
+            state, Known(units, linked=True, armed=True, monitored=True), now
+        )
         for action in actions:
             if action.kind == "set":
                 use[action.unit] = action.use
             else:
                 words = TEXTS[action.kind][1] + action.why
-                done.append(f"{format_imu(action.unit, channels)} {words} at {(now - _BEFORE) / NS:.1f} s")
+                done.append(
+                    f"{format_imu(action.unit, channels)} {words} at {(now - _BEFORE) / NS:.1f} s"
+                )
     return f"failover, if armed: {'; '.join(done) or 'nothing to do'}"

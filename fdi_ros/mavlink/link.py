@@ -30,10 +30,17 @@ from fdi_ros.system import require
 from fdi_ros.system.files import open_regular
 
 MOST_AT_ONCE = 1 << 15  # bytes that are read before others get their turn
-MOST_WAITING = 1 << 12  # bytes that wait to be sent: half a second of a slow line. What is more is dropped.
+MOST_WAITING = (
+    1 << 12
+)  # bytes that wait to be sent: half a second of a slow line. What is more is dropped.
 RETRY = NS  # between two attempts to open a link, ns
 _DATAGRAM = 1 << 11
-_UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN)
+_UNREACHABLE = (
+    errno.ECONNREFUSED,
+    errno.EHOSTUNREACH,
+    errno.ENETUNREACH,
+    errno.ENETDOWN,
+)
 _CLOSED = "the other side has closed the connection"
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
@@ -116,7 +123,9 @@ class Link:
         handles = [] if self._handle is None else [self._handle]
         try:
             # A connection that is made, or fails, can be written to.
-            select.select(handles, handles if self.trouble or self._waiting else [], [], seconds)
+            select.select(
+                handles, handles if self.trouble or self._waiting else [], [], seconds
+            )
         except (OSError, ValueError):
             self._lost("the descriptor is gone")
 
@@ -136,7 +145,9 @@ class Link:
 class Udp(Link):
     """UDP to an address; None: to whoever has sent."""
 
-    def __init__(self, url: str, make: Callable[[], Any], address: tuple[str, int] | None) -> None:
+    def __init__(
+        self, url: str, make: Callable[[], Any], address: tuple[str, int] | None
+    ) -> None:
         super().__init__(url, make)
         self._address = address
 
@@ -162,7 +173,9 @@ class Udp(Link):
 
 
 def _open_socket(kind: str, family: int, address: tuple[str, int]) -> socket.socket:
-    handle = socket.socket(family, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM)
+    handle = socket.socket(
+        family, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM
+    )
     handle.setblocking(False)
     if kind == "tcp":
         handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -187,20 +200,30 @@ def open_link(url: str) -> Link:
         from serial import Serial
 
         # Two programs that read one line each get half of it.
-        port = partial(Serial, place, number, timeout=0, write_timeout=0, exclusive=True)
+        port = partial(
+            Serial, place, number, timeout=0, write_timeout=0, exclusive=True
+        )
         return Link(url, port, "the device is gone")
     if kind not in ("udpin", "udpout", "tcp") or not place or not 0 < number < 1 << 16:
         raise FdiError(f"url is {url!r}, expected {_FORMS}")
     sort = socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM
     try:
-        family, _, _, _, address = socket.getaddrinfo(place.strip("[]"), number, type=sort)[0]
+        family, _, _, _, address = socket.getaddrinfo(
+            place.strip("[]"), number, type=sort
+        )[0]
     except OSError as error:
-        raise FdiError(f"url {url}: no address of {place!r}: {error.strerror}") from error
+        raise FdiError(
+            f"url {url}: no address of {place!r}: {error.strerror}"
+        ) from error
     except UnicodeError as error:
         raise FdiError(f"url {url}: {place!r} is no name of a host") from error
     to = (str(address[0]), int(address[1]))
     make = partial(_open_socket, kind, family, to)
-    return Link(url, make) if kind == "tcp" else Udp(url, make, None if kind == "udpin" else to)
+    return (
+        Link(url, make)
+        if kind == "tcp"
+        else Udp(url, make, None if kind == "udpin" else to)
+    )
 
 
 KEY_BYTES = 32
@@ -221,8 +244,13 @@ def read_key(path: str) -> bytes:
     try:
         with open_regular(path) as file:
             about = os.fstat(file.fileno())
-            if about.st_uid not in (0, os.geteuid()) or stat.S_IMODE(about.st_mode) & 0o077:
-                raise FdiError(f"signing_key {path} can be read by others: chmod 600 it, and let this user own it")
+            if (
+                about.st_uid not in (0, os.geteuid())
+                or stat.S_IMODE(about.st_mode) & 0o077
+            ):
+                raise FdiError(
+                    f"signing_key {path} can be read by others: chmod 600 it, and let this user own it"
+                )
             data = file.read(4096)
     except OSError as error:
         raise FdiError(f"cannot read signing_key {path}: {error.strerror}") from error
@@ -233,7 +261,9 @@ def read_key(path: str) -> bytes:
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES:
-        raise FdiError(f"signing_key {path} is no key: expected 32 bytes, or 64 hexadecimal digits")
+        raise FdiError(
+            f"signing_key {path} is no key: expected 32 bytes, or 64 hexadecimal digits"
+        )
     return key
 
 
@@ -242,7 +272,9 @@ class Verifier:
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._latest: dict[tuple[int, int, int], int] = {}  # time of the last message, by link id, system and component
+        self._latest: dict[
+            tuple[int, int, int], int
+        ] = {}  # time of the last message, by link id, system and component
         self.behind = 0.0  # s by which the last message was too old, though signed with the key; 0: it was not
 
     def accepts(self, message: bytes, system: int, component: int, now: int) -> bool:

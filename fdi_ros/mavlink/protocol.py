@@ -31,7 +31,9 @@ NS, MS = 1_000_000_000, 1_000_000  # a second and a millisecond, ns
 Vector = tuple[float, float, float]
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-GYRO_UPDATED = 0b111000  # bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new
+GYRO_UPDATED = (
+    0b111000  # bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new
+)
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT of a HEARTBEAT
 NO_AUTOPILOT = 8  # the same of a component that is none
 MOST_UNITS = 4
@@ -61,20 +63,40 @@ MESSAGES: dict[int, ImuMessage] = {
         ImuMessage("SCALED_IMU", 26, *_SCALED, unit=0),
         ImuMessage("SCALED_IMU2", 116, *_SCALED, unit=1),
         ImuMessage("SCALED_IMU3", 129, *_SCALED, unit=2),
-        ImuMessage("RAW_IMU", 27, "RAW_IMU", 29, struct.Struct("<Q6h"), 1, *_MILLI, unit_at=26),
         ImuMessage(
-            "HIGHRES_IMU", 105, "HIGHRES_IMU", 63, struct.Struct("<Q6f"), 1, 1.0, 1.0, unit_at=62, updated_at=60
+            "RAW_IMU", 27, "RAW_IMU", 29, struct.Struct("<Q6h"), 1, *_MILLI, unit_at=26
+        ),
+        ImuMessage(
+            "HIGHRES_IMU",
+            105,
+            "HIGHRES_IMU",
+            63,
+            struct.Struct("<Q6f"),
+            1,
+            1.0,
+            1.0,
+            unit_at=62,
+            updated_at=60,
         ),
     )
 }  # by message id
-RESOLUTION = {"HIGHRES_IMU": "single precision, 1 us", "RAW_IMU": "1 mrad/s, 1 us", "SCALED_IMU": "1 mrad/s, 1 ms"}
+RESOLUTION = {
+    "HIGHRES_IMU": "single precision, 1 us",
+    "RAW_IMU": "1 mrad/s, 1 us",
+    "SCALED_IMU": "1 mrad/s, 1 ms",
+}
 """Kinds of messages, the finest first, with the resolution of rate and time."""
-SCALED, RAW = 26, 27  # messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it
+SCALED, RAW = (
+    26,
+    27,
+)  # messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it
 
 
 def numbers(kind: str) -> tuple[int, ...]:
     """Return the ids of the messages of a kind, in the order of the units."""
-    return tuple(message.number for message in MESSAGES.values() if message.kind == kind)
+    return tuple(
+        message.number for message in MESSAGES.values() if message.kind == kind
+    )
 
 
 class ImuSample(NamedTuple):
@@ -94,14 +116,18 @@ def read(number: int, payload: bytes) -> ImuSample | None:
     if not any(values):
         return None
     if message.updated_at >= 0:
-        updated = int.from_bytes(data[message.updated_at : message.updated_at + 2], "little")
+        updated = int.from_bytes(
+            data[message.updated_at : message.updated_at + 2], "little"
+        )
         if updated & GYRO_UPDATED != GYRO_UPDATED:
             return None
     ax, ay, az, gx, gy, gz = values
     a, g = message.acceleration, message.gyro
     unit = message.unit if message.unit_at < 0 else data[message.unit_at]
     stamp = 1000 * message.microseconds * time
-    return ImuSample(unit, stamp, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
+    return ImuSample(
+        unit, stamp, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az)
+    )
 
 
 def understood(kind: str, autopilot: int) -> bool:
@@ -115,9 +141,20 @@ def understood(kind: str, autopilot: int) -> bool:
 DEFAULT_INTERVAL = 0
 PATIENCE = NS  # so long an acknowledgement is waited for, ns
 TRIES = 3
-AGAIN, AGAIN_REFUSED = 10 * NS, 60 * NS  # what comes too slowly, and what was refused, is asked for again after, ns
+AGAIN, AGAIN_REFUSED = (
+    10 * NS,
+    60 * NS,
+)  # what comes too slowly, and what was refused, is asked for again after, ns
 ENOUGH = 0.8  # of the rate asked for
-RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in progress", "cancelled")  # MAV_RESULT
+RESULTS = (
+    "accepted",
+    "refused for now",
+    "denied",
+    "unsupported",
+    "failed",
+    "in progress",
+    "cancelled",
+)  # MAV_RESULT
 _HOPEFUL = ("not asked yet", RESULTS[5])
 
 
@@ -139,7 +176,9 @@ class Streams:
 
     def __init__(self) -> None:
         self._wanted: dict[int, _Wanted] = {}
-        self._queue: list[int] = []  # messages to be asked for, in this order; the first may be under way
+        self._queue: list[
+            int
+        ] = []  # messages to be asked for, in this order; the first may be under way
 
     def want(self, messages: Iterable[int], interval: int) -> None:
         """Ask for messages, by id, at an interval in us, unless they are wanted so."""
@@ -150,7 +189,10 @@ class Streams:
 
     def refused(self, number: int) -> bool:
         """Whether a message was asked for in vain."""
-        return number in self._wanted and self._wanted[number].answer not in (*_HOPEFUL, RESULTS[0])
+        return number in self._wanted and self._wanted[number].answer not in (
+            *_HOPEFUL,
+            RESULTS[0],
+        )
 
     def ask_again(self) -> None:
         """Ask for all anew: the autopilot has."""
@@ -179,7 +221,9 @@ class Streams:
     def acknowledged(self, result: int) -> None:
         """Take an acknowledgement (MAV_RESULT) of the request under way."""
         if self._queue and (wanted := self._wanted[self._queue[0]]).tries:
-            wanted.answer = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
+            wanted.answer = (
+                RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
+            )
             if wanted.answer not in _HOPEFUL:
                 del self._queue[0]
 
@@ -194,20 +238,28 @@ class Streams:
 
     def answer_to(self, number: int | None) -> str:
         """Return what the autopilot says to the request of a message."""
-        return self._wanted[number].answer if number in self._wanted else "not asked for"
+        return (
+            self._wanted[number].answer if number in self._wanted else "not asked for"
+        )
 
 
 # By which clock ------------------------------------------------------------------------------------------------------
 
 
 DRIFT = 1e-4  # clocks drift from one another by less: 100 ppm
-SLEW = 1e-3  # so fast the offset in use follows a better one, so that stamps do not step
+SLEW = (
+    1e-3  # so fast the offset in use follows a better one, so that stamps do not step
+)
 STEP = 20 * MS  # a better offset further away than this is taken at once, ns
 GRAIN = MS  # step of the times in answers, at most, ns
 LONGEST = NS  # round trips that take longer say nothing, ns
 SURE = 3  # times or answers in a row that contradict what was known before they are believed: a single one may be wrong
 _KEPT = 64  # round trips, and requests under way, at most
-FIRST_FOR, FIRST_EVERY, THEN_EVERY = 20, NS // 10, NS // 2  # so many requests at an interval, then at another, ns
+FIRST_FOR, FIRST_EVERY, THEN_EVERY = (
+    20,
+    NS // 10,
+    NS // 2,
+)  # so many requests at an interval, then at another, ns
 
 
 class TimeSync:
@@ -222,13 +274,17 @@ class TimeSync:
 
     def __init__(self) -> None:
         self._sent: deque[int] = deque(maxlen=_KEPT)
-        self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)  # when it ended, offset, half the round trip; ns
+        self._trips: deque[tuple[int, int, int]] = deque(
+            maxlen=_KEPT
+        )  # when it ended, offset, half the round trip; ns
         self._best: tuple[int, int, int] | None = None
         self._odd = 0  # answers in a row that contradict those before
         self._requests = self._next = 0
         self._used: float | None = None
         self._used_at = 0
-        self._arrival: float | None = None  # highest difference of a stamp from its arrival, ns: offset less latency
+        self._arrival: float | None = (
+            None  # highest difference of a stamp from its arrival, ns: offset less latency
+        )
         self._arrival_at = 0
 
     def request(self, now: int) -> int | None:
@@ -249,12 +305,18 @@ class TimeSync:
         if not 0 <= trip <= LONGEST:
             return False
         offset, half = remote - (sent + trip // 2), trip // 2
-        far = [abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN for at, other, less in self._trips]
+        far = [
+            abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN
+            for at, other, less in self._trips
+        ]
         self._odd = self._odd + 1 if any(far) else 0
         if 0 < self._odd < SURE:
             return False
         # What so many in a row contradict is of before a step: of a simulation that stood still, or has another pace.
-        self._trips = deque((one for one, out in zip(self._trips, far, strict=True) if not out), maxlen=_KEPT)
+        self._trips = deque(
+            (one for one, out in zip(self._trips, far, strict=True) if not out),
+            maxlen=_KEPT,
+        )
         self._trips.append((now, offset, half))
         # Which one has the least error does not depend on the time that passes for all of them.
         self._best = min(self._trips, key=lambda trip: trip[2] - DRIFT * trip[0])
@@ -262,7 +324,11 @@ class TimeSync:
 
     def arrived(self, remote: int, now: int) -> None:
         """Take the time of a message that has just arrived, ns: without answers it is all there is."""
-        known = -math.inf if self._arrival is None else self._arrival - DRIFT * (now - self._arrival_at)
+        known = (
+            -math.inf
+            if self._arrival is None
+            else self._arrival - DRIFT * (now - self._arrival_at)
+        )
         self._arrival, self._arrival_at = max(float(remote - now), known), now
 
     @property
@@ -272,7 +338,11 @@ class TimeSync:
 
     def error(self, now: int) -> float | None:
         """Bound on the error of the offset, ns; None: nothing is known."""
-        return None if self._best is None else self._best[2] + DRIFT * (now - self._best[0])
+        return (
+            None
+            if self._best is None
+            else self._best[2] + DRIFT * (now - self._best[0])
+        )
 
     def offset(self, now: int) -> int | None:
         """Return the offset to be used, ns; None: nothing was heard yet."""
@@ -287,7 +357,10 @@ class TimeSync:
         return round(wanted)
 
 
-def system_ahead(monotonic: Callable[[], int] = time.monotonic_ns, system: Callable[[], int] = time.time_ns) -> int:
+def system_ahead(
+    monotonic: Callable[[], int] = time.monotonic_ns,
+    system: Callable[[], int] = time.time_ns,
+) -> int:
     """Return what the time of the system is ahead of the monotonic clock, ns, measured between interruptions."""
     tries = [(monotonic(), system(), monotonic()) for _ in range(5)]
     # Of several readings the one during which the least time has passed.
@@ -313,15 +386,21 @@ class BootClock:
         self._lead = 0  # by how much the times were ahead of those here at most, ns: with the least delay
         self._odd = 0
 
-    def unwrap(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
+    def unwrap(
+        self, time: int, now: int, milliseconds: bool, about: int | None = None
+    ) -> int | None:
         """Return a time that came at the time now here, about so much there, made whole, ns; None: not to be used."""
         if not 0 <= time < 1 << 61:
             return None
         reference = self._latest if about is None else about
         if milliseconds and reference is not None:
             # As many whole runs as bring it nearest.
-            time += max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
-        latest, lead = (time, time - now) if self._latest is None else (self._latest, self._lead)
+            time += (
+                max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
+            )
+        latest, lead = (
+            (time, time - now) if self._latest is None else (self._latest, self._lead)
+        )
         if latest - self.BACK <= time <= now + lead + self.AHEAD:
             self._odd = 0
             self._latest, self._lead = max(latest, time), max(lead, time - now)

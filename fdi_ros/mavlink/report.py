@@ -24,18 +24,33 @@ LOSSY = 0.05  # share of messages lost on the link that is worth a warning
 class Reporter:
     """Describes a link; what is counted is also told of the time since the last report."""
 
-    def __init__(self, link: Link, vehicle: Vehicle, names: Sequence[str], topics: Sequence[str]) -> None:
-        self._link, self._vehicle, self._names, self._topics = link, vehicle, names, topics
+    def __init__(
+        self, link: Link, vehicle: Vehicle, names: Sequence[str], topics: Sequence[str]
+    ) -> None:
+        self._link, self._vehicle, self._names, self._topics = (
+            link,
+            vehicle,
+            names,
+            topics,
+        )
         self._before: dict[str, int] = {}
 
     def lines(self, prefix: str, hardware: str, now: int) -> list[StatusLine]:
         """Return the statuses at the monotonic time now, ns; names begin with prefix."""
-        recent = {name: count - self._before.get(name, 0) for name, count in self._vehicle.counts.items()}
+        recent = {
+            name: count - self._before.get(name, 0)
+            for name, count in self._vehicle.counts.items()
+        }
         self._before = dict(self._vehicle.counts)
         rows = [("link", *self._format_link(recent, now), self._link_values(now))]
         for k, name in enumerate(self._names):
-            rows.append((f"unit {name}", *self._format_unit(k, now), self._unit_values(k, now)))
-        return [StatusLine(level, prefix + name, words, hardware, values) for name, level, words, values in rows]
+            rows.append(
+                (f"unit {name}", *self._format_unit(k, now), self._unit_values(k, now))
+            )
+        return [
+            StatusLine(level, prefix + name, words, hardware, values)
+            for name, level, words, values in rows
+        ]
 
     def _format_link(self, recent: dict[str, int], now: int) -> tuple[Level, str]:
         vehicle, link = self._vehicle, self._link
@@ -46,37 +61,69 @@ class Reporter:
             why = f"; {refused} messages without a valid signature" if refused else ""
             if recent.get("signed late"):
                 why = f"; rightly signed messages, but {vehicle.behind:.0f} s old by this computer's clock: set either"
-            wanted = f" of system {vehicle.settings.system}" if vehicle.settings.system else ""
+            wanted = (
+                f" of system {vehicle.settings.system}"
+                if vehicle.settings.system
+                else ""
+            )
             return Level.STALE, f"no heartbeat{wanted} yet on {link.url}{why}"
         who = f"{vehicle.name}, system {vehicle.system}"
         if not vehicle.in_reach:
-            return Level.STALE, f"nothing of {who} for {(now - vehicle.heard) / NS:.0f} s"
+            return (
+                Level.STALE,
+                f"nothing of {who} for {(now - vehicle.heard) / NS:.0f} s",
+            )
         words = []
-        if others := sorted(system for system, at in vehicle.others.items() if now - at < 10 * LOST):
-            words.append(f"other autopilots on the link, left aside: {', '.join(map(str, others))}")
+        if others := sorted(
+            system for system, at in vehicle.others.items() if now - at < 10 * LOST
+        ):
+            words.append(
+                f"other autopilots on the link, left aside: {', '.join(map(str, others))}"
+            )
         if not vehicle.sync.synchronised:
-            words.append("no answer to TIMESYNC: stamps are late by the unknown latency of the link")
+            words.append(
+                "no answer to TIMESYNC: stamps are late by the unknown latency of the link"
+            )
         lost, heard = recent.get("lost", 0), recent.get("messages", 0)
         if lost > LOSSY * (lost + heard):
             words.append(f"{lost} of {lost + heard} messages lost")
-        if more := [str(unit + 1) for unit in sorted(vehicle.units) if unit >= len(self._names)]:
+        if more := [
+            str(unit + 1) for unit in sorted(vehicle.units) if unit >= len(self._names)
+        ]:
             words.append(f"no topic for IMU {', '.join(more)} of the autopilot")
-        odd = {"bad": "pieces that are no message", "unsigned": "messages without a valid signature"}
-        words += [f"{recent[kind]} {text}" for kind, text in odd.items() if recent.get(kind)]
+        odd = {
+            "bad": "pieces that are no message",
+            "unsigned": "messages without a valid signature",
+        }
+        words += [
+            f"{recent[kind]} {text}" for kind, text in odd.items() if recent.get(kind)
+        ]
         return (Level.WARN if words else Level.OK), "; ".join([who, *words])
 
     def _link_values(self, now: int) -> tuple[tuple[str, str], ...]:
         vehicle, link = self._vehicle, self._link
         error = vehicle.sync.error(now)
         offset = vehicle.sync.offset(now)
-        counts = ("messages", "lost", "bad", "of others", "from elsewhere", "unsigned", "unknown", "without a gyro")
+        counts = (
+            "messages",
+            "lost",
+            "bad",
+            "of others",
+            "from elsewhere",
+            "unsigned",
+            "unknown",
+            "without a gyro",
+        )
         return (
             ("url", link.url),
             ("opened", str(link.opened)),
             ("signing", "on" if vehicle.settings.key else "off"),
             ("messages in use", vehicle.kind or "not chosen yet"),
             ("resolution", RESOLUTION.get(vehicle.kind, "not known yet")),
-            ("clock of the autopilot (s)", "none" if offset is None else f"{(now + offset) / NS:.3f}"),
+            (
+                "clock of the autopilot (s)",
+                "none" if offset is None else f"{(now + offset) / NS:.3f}",
+            ),
             ("stamps known to (ms)", "none" if error is None else f"{error / MS:.2f}"),
             ("restarts of the autopilot's time", str(vehicle.clock.restarts)),
             *((name, str(vehicle.counts[name])) for name in counts),
@@ -85,20 +132,39 @@ class Reporter:
 
     def _message(self, unit: int) -> int | None:
         """Return the id of the message that brings a unit; None: not known."""
-        return next((number for number in numbers(self._vehicle.kind) if MESSAGES[number].unit in (unit, -1)), None)
+        return next(
+            (
+                number
+                for number in numbers(self._vehicle.kind)
+                if MESSAGES[number].unit in (unit, -1)
+            ),
+            None,
+        )
 
     def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle
-        track, answer = vehicle.units.get(unit), vehicle.streams.answer_to(self._message(unit))
+        track, answer = (
+            vehicle.units.get(unit),
+            vehicle.streams.answer_to(self._message(unit)),
+        )
         if track is None and unit in vehicle.magnetometers:
-            return Level.ERROR, "the autopilot has no such IMU: only its magnetometer comes"
+            return (
+                Level.ERROR,
+                "the autopilot has no such IMU: only its magnetometer comes",
+            )
         if track is None:
-            return (Level.ERROR if vehicle.in_reach else Level.STALE), f"nothing of this unit yet; request: {answer}"
+            return (
+                Level.ERROR if vehicle.in_reach else Level.STALE
+            ), f"nothing of this unit yet; request: {answer}"
         rate, asked = track.rate(now), vehicle.settings.rate
         if not rate:
             return Level.STALE, f"silent for {(now - track.last) / NS:.1f} s"
         words = f"{rate:.1f} Hz of {asked:g} asked for"
-        return (Level.WARN, f"{words}; request: {answer}") if rate < ENOUGH * asked else (Level.OK, words)
+        return (
+            (Level.WARN, f"{words}; request: {answer}")
+            if rate < ENOUGH * asked
+            else (Level.OK, words)
+        )
 
     def _unit_values(self, unit: int, now: int) -> tuple[tuple[str, str], ...]:
         number, track = self._message(unit), self._vehicle.units.get(unit, UnitTrack())
@@ -136,7 +202,11 @@ def _format_whole(line: StatusLine) -> str:
         # At a start there is nothing yet that could be missed.
         return "" if line.message == "no sample yet" else "no samples"
     if line.message.startswith("no fused rate"):
-        return "" if line.message.startswith("no fused rate: the biases are being learned") else "no fused rate"
+        return (
+            ""
+            if line.message.startswith("no fused rate: the biases are being learned")
+            else "no fused rate"
+        )
     return NOTHING_SEEN if NOTHING_SEEN in line.message else ""
 
 
@@ -145,13 +215,18 @@ class Announcer:
 
     def __init__(self, channels: Sequence[str]) -> None:
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
-        self._now: dict[str, tuple[str, str]] = {**dict.fromkeys(channels, ("OK", "")), WHOLE: ("", "")}
+        self._now: dict[str, tuple[str, str]] = {
+            **dict.fromkeys(channels, ("OK", "")),
+            WHOLE: ("", ""),
+        }
         """State of each channel, with the set that it is one of, and what is wrong with the whole, empty: nothing."""
         self._said = dict(self._now)  # the same as the ground station knows it
         self._apart = dict.fromkeys(channels, "")
         """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
         self._heard = 0
-        self._changed: int | None = None  # when the first of what has changed since the last texts did, ns
+        self._changed: int | None = (
+            None  # when the first of what has changed since the last texts did, ns
+        )
         self._tokens, self._filled = float(AT_ONCE), 0
 
     def hear(self, lines: Sequence[StatusLine], now: int) -> None:
@@ -193,20 +268,29 @@ class Announcer:
         """Return what has changed, together where it stands alike: the channels of a set, those of a whole unit."""
         left = {name: now for name, now in self._now.items() if now != self._said[name]}
         groups = dict.fromkeys(now for now in left.values() if now[0] == "AMBIGUOUS")
-        found = [tuple(name for name in left if left[name] == group) for group in groups]
+        found = [
+            tuple(name for name in left if left[name] == group) for group in groups
+        ]
         for unit in self._units:
             states = {left.get(name, ("", "")) for name in unit}
             if len(unit) == 3 and len(states) == 1 and not states & {*groups, ("", "")}:
                 found.append(unit)
         together = {name for names in found for name in names}
         # What is wrong with the whole comes first of what is as grave.
-        return sorted(found + [(name,) for name in left if name not in together], key=lambda names: names != (WHOLE,))
+        return sorted(
+            found + [(name,) for name in left if name not in together],
+            key=lambda names: names != (WHOLE,),
+        )
 
     def _text(self, names: tuple[str, ...]) -> tuple[int, str]:
         """Return the text about channels that stand alike, or about the whole."""
         state, group = self._now[names[0]]
         if names == (WHOLE,):
-            return (CRITICAL, f"FDI: {state}") if state else (INFO, "FDI: all is judged again")
+            return (
+                (CRITICAL, f"FDI: {state}")
+                if state
+                else (INFO, "FDI: all is judged again")
+            )
         if state == "AMBIGUOUS":
             return CRITICAL, self._set_text(group)
         severity, words = _STATES.get(state, (INFO, "in use again"))
@@ -216,12 +300,19 @@ class Announcer:
     def _set_text(self, group: str) -> str:
         """Text for a set of channels, their names separated by commas; of whole units those are named."""
         names = set(group.split(", "))
-        units = [unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)]
+        units = [
+            unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)
+        ]
         if len(units) == 1 and len(names) == 3:
             return f"FDI: {units[0]} faulty (axis cannot be told apart)"[:LENGTH]
         if len(names) == 1:
             return f"FDI: {group} faulty"[:LENGTH]
-        texts = [f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"]
+        texts = [
+            f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
+        ]
         if len(names) == 2 and (size := self._apart.get(max(names))):
             texts.insert(0, f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s")
-        return next((text for text in texts if len(text) <= LENGTH), f"FDI: one faulty of {len(names)} channels")
+        return next(
+            (text for text in texts if len(text) <= LENGTH),
+            f"FDI: one faulty of {len(names)} channels",
+        )

@@ -44,17 +44,31 @@ from fdi_ros.system import require
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 AUTOPILOT_COMPONENT = 1
-GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128  # MAV_TYPE, MAV_STATE, a MAV_MODE_FLAG
+GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = (
+    6,
+    18,
+    4,
+    128,
+)  # MAV_TYPE, MAV_STATE, a MAV_MODE_FLAG
 REAL32 = 9  # MAV_PARAM_TYPE; ArduPilot takes any, and knows its own.
 LOST = 3 * NS  # an autopilot that says nothing for so long is lost, ns
-UNSYNCHRONISED = 2 * NS  # so long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns
+UNSYNCHRONISED = (
+    2 * NS
+)  # so long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns
 CHOICE = 3 * NS  # so long kinds of messages are looked at before one is chosen, ns
-OLDEST, NEWEST = 10 * NS, NS  # samples older than this when they come, or so far in the future, are refused, ns
-STAND_IN = 2 * NS  # without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns
+OLDEST, NEWEST = (
+    10 * NS,
+    NS,
+)  # samples older than this when they come, or so far in the future, are refused, ns
+STAND_IN = (
+    2 * NS
+)  # without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns
 WINDOW = 2 * NS  # time over which rates are measured, ns
 MOST_LATE = 8  # messages late in a row after which the count has begun anew
 _PEERS = 8  # addresses whose bytes are put together, at most
-_LEFT = 1 << 12  # bytes that pymavlink's parser may carry on; it frees them only when it has used the very last
+_LEFT = (
+    1 << 12
+)  # bytes that pymavlink's parser may carry on; it frees them only when it has used the very last
 LARGEST = 3.4e38  # of a float that a message holds
 
 
@@ -64,9 +78,13 @@ class VehicleSettings:
 
     system: int = 0  # system id; 0: that of the first autopilot that is heard and gives gyros, until it is lost
     component: int = 191  # own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER
-    kind: str = ""  # kind of messages to be used; empty: the one that shows the most units
+    kind: str = (
+        ""  # kind of messages to be used; empty: the one that shows the most units
+    )
     rate: float = 50.0  # Hz
-    key: bytes = b""  # for signing; empty: nothing is signed, and signatures are not looked at
+    key: bytes = (
+        b""  # for signing; empty: nothing is signed, and signatures are not looked at
+    )
 
 
 @dataclass
@@ -79,7 +97,9 @@ class UnitTrack:
     last: int = 0  # when the last sample came, ns
     time: int = -1  # time of the last sample on the autopilot's clock, ns
     stamp: int = -1  # of the last sample given out, ns: later ones have later stamps, also with a better offset
-    arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))  # when samples came, ns
+    arrivals: deque[int] = field(
+        default_factory=lambda: deque(maxlen=1024)
+    )  # when samples came, ns
 
     def rate(self, now: int) -> float:
         """Return the samples a second of late."""
@@ -106,16 +126,27 @@ class Vehicle:
     """
 
     def __init__(
-        self, settings: VehicleSettings, send: Callable[[bytes, Any], None], seconds: Callable[[], float]
+        self,
+        settings: VehicleSettings,
+        send: Callable[[bytes, Any], None],
+        seconds: Callable[[], float],
     ) -> None:
         self.settings = settings
-        self.system = settings.system or None  # system id in use; None: no autopilot was heard yet.
+        self.system = (
+            settings.system or None
+        )  # system id in use; None: no autopilot was heard yet.
         self.autopilot = NO_AUTOPILOT  # MAV_AUTOPILOT
-        self.others: dict[int, int] = {}  # other autopilots on the link: when each was last heard, ns, by system id
+        self.others: dict[
+            int, int
+        ] = {}  # other autopilots on the link: when each was last heard, ns, by system id
         self.counts: Counter[str] = Counter()
-        self.events: deque[str] = deque(maxlen=32)  # what has happened, in words, for the log
+        self.events: deque[str] = deque(
+            maxlen=32
+        )  # what has happened, in words, for the log
         self.armed = False  # whether its last heartbeat says so
-        self.disarmed = 0  # for how long all its heartbeats have said that it is not armed, ns
+        self.disarmed = (
+            0  # for how long all its heartbeats have said that it is not armed, ns
+        )
         self.begun = 0  # how often a conversation with it began: what it said of parameters before may no longer be so
         self.peer: Any = None
         self.behind = 0.0  # s by which the last signature that was too old was so
@@ -125,9 +156,14 @@ class Vehicle:
         self._verifier = Verifier(settings.key) if settings.key else None
         self._parsers: dict[Any, Any] = {}
         # What is sent before an autopilot was heard comes from system 1.
-        self._out = self._mavlink.MAVLink(None, settings.system or 1, settings.component)
+        self._out = self._mavlink.MAVLink(
+            None, settings.system or 1, settings.component
+        )
         if settings.key:
-            self._out.signing.secret_key, self._out.signing.sign_outgoing = settings.key, True
+            self._out.signing.secret_key, self._out.signing.sign_outgoing = (
+                settings.key,
+                True,
+            )
             self._out.signing.timestamp = now_in_steps(seconds())
         self._beat = 0  # when the last heartbeat was sent, ns
         self._scaled_at = 0  # when SCALED_IMU of IMU 1 came last, or was asked for, ns
@@ -146,9 +182,13 @@ class Vehicle:
         self.magnetometers: set[int] = set()  # units of which only a magnetometer came
         self.heard = 0  # when it was last heard, ns; 0: never
         self.gives_gyros = False  # whether it has sent any
-        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)  # what it has said of them, to be taken out
+        self.parameters: deque[tuple[str, float]] = deque(
+            maxlen=64
+        )  # what it has said of them, to be taken out
         self._found = self._first_imu = 0
-        self._seen: set[tuple[str, int]] = set()  # kinds and units of which samples came, until a kind is chosen
+        self._seen: set[tuple[str, int]] = (
+            set()
+        )  # kinds and units of which samples came, until a kind is chosen
 
     # What comes in ------------------------------------------------------------------------------------------------
 
@@ -192,7 +232,9 @@ class Vehicle:
             if number == TIMESYNC:
                 self.sync.answer(message.ts1, message.tc1, now)
             elif number == PARAM_VALUE and is_new:
-                self.parameters.append((message.param_id.partition("\0")[0], message.param_value))
+                self.parameters.append(
+                    (message.param_id.partition("\0")[0], message.param_value)
+                )
             elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
                 self.streams.acknowledged(message.result)
         return None
@@ -209,7 +251,9 @@ class Vehicle:
             del self._parsers[next(one for one in self._parsers if one != self.peer)]
         try:
             messages = parser.parse_buffer(data) or []
-        except Exception:  # pymavlink lets through what goes wrong with the bytes of others.
+        except (
+            Exception
+        ):  # pymavlink lets through what goes wrong with the bytes of others.
             self.counts["bad"] += 1
             del self._parsers[peer]
             return []
@@ -217,12 +261,28 @@ class Vehicle:
             parser.buf, parser.buf_index = parser.buf[parser.buf_index :], 0
         return list(messages)
 
-    def _is_ours(self, message: Any, number: int, system: int, component: int, peer: Any, now: int) -> bool:
+    def _is_ours(
+        self,
+        message: Any,
+        number: int,
+        system: int,
+        component: int,
+        peer: Any,
+        now: int,
+    ) -> bool:
         """Whether a message comes from the autopilot in use, at the address in use; takes one into use."""
         is_autopilot = component == AUTOPILOT_COMPONENT
         beats = is_autopilot and number == HEARTBEAT
-        beats = beats and message.autopilot != NO_AUTOPILOT and message.type != GROUND_STATION
-        if is_autopilot and system != self.system and self._may_change_to(system, beats, number, now):
+        beats = (
+            beats
+            and message.autopilot != NO_AUTOPILOT
+            and message.type != GROUND_STATION
+        )
+        if (
+            is_autopilot
+            and system != self.system
+            and self._may_change_to(system, beats, number, now)
+        ):
             # It is taken into use with its next heartbeat.
             self.system, self.begun = system, self.begun + 1
             self._know_nothing()
@@ -230,10 +290,17 @@ class Vehicle:
             self.counts["of others"] += 1
             if beats:
                 if system not in self.others:
-                    self.events.append(f"another autopilot on the link, system {system}: left aside")
+                    self.events.append(
+                        f"another autopilot on the link, system {system}: left aside"
+                    )
                 self.others[system] = now
             return False
-        if peer != self.peer and self.heard and now - self.heard <= LOST and self.peer is not None:
+        if (
+            peer != self.peer
+            and self.heard
+            and now - self.heard <= LOST
+            and self.peer is not None
+        ):
             self.counts["from elsewhere"] += 1
             return False
         if not self.heard or self._lost or peer != self.peer:
@@ -244,7 +311,10 @@ class Vehicle:
             self._begin_with(message, peer, now)
         self.heard = now
         if beats:
-            self.autopilot, self.armed = message.autopilot, bool(message.base_mode & ARMED)
+            self.autopilot, self.armed = (
+                message.autopilot,
+                bool(message.base_mode & ARMED),
+            )
             self._disarmed_at = None if self.armed else self._disarmed_at or now
             self.disarmed = now - (self._disarmed_at or now)
         return True
@@ -261,7 +331,12 @@ class Vehicle:
     def _begin_with(self, message: Any, peer: Any, now: int) -> None:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
-        self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
+        self.peer, self.autopilot, self._found, self._lost = (
+            peer,
+            message.autopilot,
+            now,
+            False,
+        )
         self.begun, self._disarmed_at = self.begun + 1, None
         self._behind_from = None
         self._out.srcSystem = self.system
@@ -271,7 +346,12 @@ class Vehicle:
             self.streams.ask_again()
         else:
             kinds = [self.kind] if self.kind else list(RESOLUTION)
-            wanted = [number for kind in kinds if understood(kind, self.autopilot) for number in numbers(kind)]
+            wanted = [
+                number
+                for kind in kinds
+                if understood(kind, self.autopilot)
+                for number in numbers(kind)
+            ]
             self.streams.want(wanted, self._interval)
 
     def _count_lost(self, sequence: int) -> bool:
@@ -302,20 +382,30 @@ class Vehicle:
             kind = kind if self.kind == kind else MESSAGES[SCALED].kind
         if not self.kind and not self._choose(kind, sample.unit, now):
             return None
-        return self._timed(sample, message.microseconds > 1, now) if kind == self.kind else None
+        return (
+            self._timed(sample, message.microseconds > 1, now)
+            if kind == self.kind
+            else None
+        )
 
-    def _timed(self, sample: ImuSample, milliseconds: bool, now: int) -> ImuSample | None:
+    def _timed(
+        self, sample: ImuSample, milliseconds: bool, now: int
+    ) -> ImuSample | None:
         """Return a sample with its stamp by the monotonic clock here, if it is new and its time can be."""
         track = self.units.setdefault(sample.unit, UnitTrack())
         self.magnetometers.discard(sample.unit)
         restarts, offset = self.clock.restarts, self.sync.offset(now)
-        time = self.clock.unwrap(sample.stamp, now, milliseconds, None if offset is None else now + offset)
+        time = self.clock.unwrap(
+            sample.stamp, now, milliseconds, None if offset is None else now + offset
+        )
         if self.clock.restarts != restarts:
             self.sync, self._found, self.begun = TimeSync(), now, self.begun + 1
             for other in self.units.values():
                 other.time = -1
             self.streams.ask_again()
-            self.events.append("the time of the autopilot has stepped: it has started anew, or its clock was set")
+            self.events.append(
+                "the time of the autopilot has stepped: it has started anew, or its clock was set"
+            )
         if time is None:
             track.impossible += 1
             return None
@@ -341,7 +431,9 @@ class Vehicle:
         self._seen.add((kind, unit))
         if now - self._first_imu < CHOICE:
             return False
-        self.kind = max(RESOLUTION, key=lambda kind: sum(seen == kind for seen, _ in self._seen))
+        self.kind = max(
+            RESOLUTION, key=lambda kind: sum(seen == kind for seen, _ in self._seen)
+        )
         for other in RESOLUTION:
             if other != self.kind and understood(other, self.autopilot):
                 self.streams.want(numbers(other), DEFAULT_INTERVAL)
@@ -357,7 +449,9 @@ class Vehicle:
             self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
         if self._found and not self._lost and now - self.heard > LOST:
             self._lost = True
-            self.events.append(f"nothing of {self.name}, system {self.system}, for {LOST // NS} s")
+            self.events.append(
+                f"nothing of {self.name}, system {self.system}, for {LOST // NS} s"
+            )
         if not self.in_reach:
             return
         if (sent := self.sync.request(now)) is not None:
@@ -376,7 +470,11 @@ class Vehicle:
             unit = MESSAGES[number].unit
             if unit not in self.magnetometers:
                 brought = [unit] if unit >= 0 else list(self.units) or [0]
-                self.streams.check(number, min(self.units.get(k, UnitTrack()).rate(now) for k in brought), now)
+                self.streams.check(
+                    number,
+                    min(self.units.get(k, UnitTrack()).rate(now) for k in brought),
+                    now,
+                )
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
@@ -384,21 +482,32 @@ class Vehicle:
 
     def read_parameter(self, name: str) -> None:
         """Ask for a parameter; what it says comes in `parameters`."""
-        self._say("param_request_read", self.system, AUTOPILOT_COMPONENT, name.encode(), -1)
+        self._say(
+            "param_request_read", self.system, AUTOPILOT_COMPONENT, name.encode(), -1
+        )
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter; it says so to all."""
-        self._say("param_set", self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32)
+        self._say(
+            "param_set", self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32
+        )
 
     def send_value(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""
         time = (now + (self.sync.offset(now) or 0)) // MS & 0xFFFFFFFF
-        self._say("named_value_float", time, name.encode("ascii")[:10], min(max(value, -LARGEST), LARGEST))
+        self._say(
+            "named_value_float",
+            time,
+            name.encode("ascii")[:10],
+            min(max(value, -LARGEST), LARGEST),
+        )
 
     def _say(self, name: str, *fields: Any) -> None:
         """Send a message of the dialect."""
         out = self._out
-        out.signing.timestamp = max(out.signing.timestamp, now_in_steps(self._seconds()))
+        out.signing.timestamp = max(
+            out.signing.timestamp, now_in_steps(self._seconds())
+        )
         data = getattr(out, f"{name}_encode")(*fields).pack(out)
         out.seq = (out.seq + 1) % 256
         # One whose time of signatures is behind is told ours by what is sent: MAVLink has it take over later times.
@@ -412,4 +521,6 @@ class Vehicle:
     @property
     def name(self) -> str:
         """Name of the flight stack."""
-        return {ARDUPILOT: "ArduPilot", PX4: "PX4"}.get(self.autopilot, f"autopilot {self.autopilot}")
+        return {ARDUPILOT: "ArduPilot", PX4: "PX4"}.get(
+            self.autopilot, f"autopilot {self.autopilot}"
+        )

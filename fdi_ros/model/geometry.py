@@ -26,7 +26,9 @@ MIN_NORM, MAX_NORM = 0.5, 2.0
 SAME_DIRECTION = 0.999  # |rho| above which two channels have one parity direction for every practical purpose
 ROUNDING = 1e-9  # relative: double precision leaves 1e-16 of values, which products of matrices multiply
 MIN_SINGULAR_RATIO = 0.02  # axes whose smallest singular value is a smaller share of the largest do not span space
-MIN_SENSITIVITY = 0.03  # sqrt(S_ii) below which a fault of channel i does not reach the parity vector
+MIN_SENSITIVITY = (
+    0.03  # sqrt(S_ii) below which a fault of channel i does not reach the parity vector
+)
 
 
 def spans_space(axes: Array) -> bool:
@@ -57,16 +59,26 @@ class Geometry:
     """
 
     def __init__(
-        self, axes: ArrayLike, channel_names: Sequence[str] | None = None, units: Sequence[str] | None = None
+        self,
+        axes: ArrayLike,
+        channel_names: Sequence[str] | None = None,
+        units: Sequence[str] | None = None,
     ) -> None:
         self.axes: Array = np.array(axes, dtype=np.float64)
         _check_axes(self.axes)
         self.axes.flags.writeable = False
         self.n = len(self.axes)
         names = tuple(channel_names or (f"g{i + 1}" for i in range(self.n)))
-        self.unit_of = tuple(name.rpartition(".")[0] for name in names) if units is None else tuple(units)
+        self.unit_of = (
+            tuple(name.rpartition(".")[0] for name in names)
+            if units is None
+            else tuple(units)
+        )
         """Unit of each channel; empty for one that belongs to none."""
-        for count, called in ((len(names), "channel names"), (len(self.unit_of), "names of units")):
+        for count, called in (
+            (len(names), "channel names"),
+            (len(self.unit_of), "names of units"),
+        ):
             if count != self.n:
                 raise GeometryError(f"{count} {called} for {self.n} axes")
         if len(set(names)) != self.n:
@@ -77,13 +89,23 @@ class Geometry:
         return f"Geometry({self.n} channels: {', '.join(self.channel_names)})"
 
     def _repr_html_(self) -> str:
-        rows = zip(self.channel_names, self.axes.tolist(), self.sensitivity.tolist(), strict=True)
-        cells = [[name, *(f"{part:.4f}" for part in axis), f"{seen:.3f}"] for name, axis, seen in rows]
+        rows = zip(
+            self.channel_names,
+            self.axes.tolist(),
+            self.sensitivity.tolist(),
+            strict=True,
+        )
+        cells = [
+            [name, *(f"{part:.4f}" for part in axis), f"{seen:.3f}"]
+            for name, axis, seen in rows
+        ]
         head = ("channel", "axis x", "y", "z", "share of a fault that is seen")
         return html_table(f"{self.n} gyro channels", head, cells)
 
     @classmethod
-    def from_axes(cls, axes: ArrayLike, channel_names: Sequence[str] | None = None) -> Geometry:
+    def from_axes(
+        cls, axes: ArrayLike, channel_names: Sequence[str] | None = None
+    ) -> Geometry:
         """Geometry of given sensitivity axes (n, 3)."""
         return cls(axes, channel_names)
 
@@ -93,23 +115,37 @@ class Geometry:
         r = np.sqrt(3.0)
         a, b = (r + 1) / 2, (r - 1) / 2
         upper = np.array([[1, -1, -1], [1, a, -b], [1, -b, a]])
-        return cls(np.vstack([upper, upper * [-1, 1, 1]]) / r, units=3 * ["triad_1"] + 3 * ["triad_2"])
+        return cls(
+            np.vstack([upper, upper * [-1, 1, 1]]) / r,
+            units=3 * ["triad_1"] + 3 * ["triad_2"],
+        )
 
     @classmethod
     def dodecahedron(cls) -> Geometry:
         """Six axes normal to the faces of a dodecahedron: 63.4 deg between any two."""
         golden = (1 + np.sqrt(5.0)) / 2
-        rows = [[0, 1, golden], [0, -1, golden], [1, golden, 0], [-1, golden, 0], [golden, 0, 1], [golden, 0, -1]]
+        rows = [
+            [0, 1, golden],
+            [0, -1, golden],
+            [1, golden, 0],
+            [-1, golden, 0],
+            [golden, 0, 1],
+            [golden, 0, -1],
+        ]
         return cls(np.array(rows) / np.hypot(1, golden))
 
     @classmethod
     def cone(cls, n: int) -> Geometry:
         """Build n axes evenly spread on a cone of half-angle arccos(1/sqrt 3) about body z."""
         azimuth, c, s = 2 * np.pi * np.arange(n) / n, 1 / np.sqrt(3.0), np.sqrt(2 / 3)
-        return cls(np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)]))
+        return cls(
+            np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)])
+        )
 
     @classmethod
-    def from_triads(cls, mounts: Sequence[ArrayLike], channel_names: Sequence[str] | None = None) -> Geometry:
+    def from_triads(
+        cls, mounts: Sequence[ArrayLike], channel_names: Sequence[str] | None = None
+    ) -> Geometry:
         """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) per unit.
 
         Channels are named imu_1.x, imu_1.y, ... unless names are given.
@@ -120,7 +156,9 @@ class Geometry:
             If a mount is not a rotation matrix.
         """
         rotations = [_rotation(mount, k) for k, mount in enumerate(mounts)]
-        names = channel_names or [f"imu_{k + 1}.{axis}" for k in range(len(rotations)) for axis in "xyz"]
+        names = channel_names or [
+            f"imu_{k + 1}.{axis}" for k in range(len(rotations)) for axis in "xyz"
+        ]
         return cls(np.vstack([rotation.T for rotation in rotations]), names)
 
     @cached_property
@@ -170,7 +208,12 @@ class Geometry:
     @cached_property
     def group_matrix(self) -> NDArray[np.bool_]:
         """(n, n): row i marks the channels that cannot be told apart from channel i, itself included."""
-        number = np.array([next(k for k, group in enumerate(self.groups) if i in group) for i in range(self.n)])
+        number = np.array(
+            [
+                next(k for k, group in enumerate(self.groups) if i in group)
+                for i in range(self.n)
+            ]
+        )
         return np.asarray(number[:, None] == number)
 
     @cached_property
@@ -183,13 +226,17 @@ class Geometry:
     def units(self) -> tuple[tuple[int, ...], ...]:
         """Channels of each unit; units of one channel left out."""
         names = dict.fromkeys(filter(None, self.unit_of))
-        members = (tuple(i for i in range(self.n) if self.unit_of[i] == name) for name in names)
+        members = (
+            tuple(i for i in range(self.n) if self.unit_of[i] == name) for name in names
+        )
         return tuple(unit for unit in members if len(unit) > 1)
 
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
         """Covariance (3, 3) of the least-squares rate for channel variances, scalar or (n,), (rad/s)^2."""
         gain = self.least_squares
-        return (gain * np.broadcast_to(np.asarray(variance, dtype=np.float64), self.n)) @ gain.T
+        return (
+            gain * np.broadcast_to(np.asarray(variance, dtype=np.float64), self.n)
+        ) @ gain.T
 
     @cached_property
     def gdop(self) -> float:
@@ -199,19 +246,28 @@ class Geometry:
     def subset(self, mask: ArrayLike) -> Geometry:
         """Geometry of the channels marked in mask (n,) bool; `GeometryError` if they are too few, or in a plane."""
         kept = np.flatnonzero(np.asarray(mask, dtype=bool))
-        return Geometry(self.axes[kept], *([names[i] for i in kept] for names in (self.channel_names, self.unit_of)))
+        return Geometry(
+            self.axes[kept],
+            *([names[i] for i in kept] for names in (self.channel_names, self.unit_of)),
+        )
 
 
 def _check_axes(axes: Array) -> None:
     if axes.ndim != 2 or axes.shape[1] != 3:
         raise GeometryError(f"axes have shape {axes.shape}, expected (n, 3)")
     if not MIN_CHANNELS <= len(axes) <= MAX_CHANNELS:
-        raise GeometryError(f"{len(axes)} channels, expected {MIN_CHANNELS} to {MAX_CHANNELS}")
+        raise GeometryError(
+            f"{len(axes)} channels, expected {MIN_CHANNELS} to {MAX_CHANNELS}"
+        )
     for row, norm in enumerate(np.linalg.norm(axes, axis=1)):
         if not np.isfinite(axes[row]).all():
-            raise GeometryError(f"axis of channel {row + 1} is not finite: {axes[row].tolist()}")
+            raise GeometryError(
+                f"axis of channel {row + 1} is not finite: {axes[row].tolist()}"
+            )
         if not MIN_NORM <= norm <= MAX_NORM:
-            raise GeometryError(f"axis of channel {row + 1} has norm {norm:.4g}, expected {MIN_NORM} to {MAX_NORM:g}")
+            raise GeometryError(
+                f"axis of channel {row + 1} has norm {norm:.4g}, expected {MIN_NORM} to {MAX_NORM:g}"
+            )
     if not spans_space(axes):
         singular = np.linalg.svd(axes, compute_uv=False)
         raise GeometryError(
@@ -223,14 +279,20 @@ def _check_axes(axes: Array) -> None:
 def _rotation(mount: ArrayLike, index: int) -> Array:
     rotation = np.asarray(mount, dtype=np.float64)
     if rotation.shape != (3, 3):
-        raise GeometryError(f"mount of unit {index + 1} has shape {rotation.shape}, expected (3, 3)")
+        raise GeometryError(
+            f"mount of unit {index + 1} has shape {rotation.shape}, expected (3, 3)"
+        )
     if not np.isfinite(rotation).all():
         raise GeometryError(f"mount of unit {index + 1} is not finite")
     deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if deviation > 1e-3:
-        raise GeometryError(f"mount of unit {index + 1} is no rotation: |R R' - I| is {deviation:.3g}, at most 0.001")
+        raise GeometryError(
+            f"mount of unit {index + 1} is no rotation: |R R' - I| is {deviation:.3g}, at most 0.001"
+        )
     if np.linalg.det(rotation) < 0:
-        raise GeometryError(f"mount of unit {index + 1} is a reflection: det R is -1, expected +1")
+        raise GeometryError(
+            f"mount of unit {index + 1} is a reflection: det R is -1, expected +1"
+        )
     return rotation
 
 
@@ -250,7 +312,11 @@ def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
 
 def lone_pairs(geometry: Geometry) -> list[tuple[int, int]]:
     """Pairs of channels that alone measure one axis: of these no evidence tells which is wrong."""
-    pairs = [pair for pair in combinations(range(geometry.n), 2) if are_parallel(geometry, pair)]
+    pairs = [
+        pair
+        for pair in combinations(range(geometry.n), 2)
+        if are_parallel(geometry, pair)
+    ]
     often = np.bincount(np.ravel(pairs).astype(np.intp), minlength=geometry.n)
     return [pair for pair in pairs if (often[list(pair)] == 1).all()]
 
@@ -259,7 +325,11 @@ def whole_units(geometry: Geometry, channels: Sequence[int]) -> list[str]:
     """Names of the units that a set of channels consists of; empty if it consists of other than whole units."""
     inside = [unit for unit in geometry.units if set(channels).issuperset(unit)]
     whole = sum(map(len, inside)) == len(channels)
-    return [geometry.channel_names[unit[0]].rpartition(".")[0] for unit in inside] if whole else []
+    return (
+        [geometry.channel_names[unit[0]].rpartition(".")[0] for unit in inside]
+        if whole
+        else []
+    )
 
 
 def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
@@ -275,15 +345,23 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
         if all(unit and axis == parts[0][2] for unit, _, axis in parts):
             return f"the {parts[0][2]} axis of {_listed([unit for unit, *_ in parts])}"
         return f"{_listed(names)}, which measure one axis,"
-    others = [name for i, name in enumerate(geometry.channel_names) if i not in channels]
+    others = [
+        name for i, name in enumerate(geometry.channel_names) if i not in channels
+    ]
     if len(names) > _FEW:
-        return f"any channel but {_listed(others)}" if len(others) <= _FEW else f"any of {len(names)} channels"
+        return (
+            f"any channel but {_listed(others)}"
+            if len(others) <= _FEW
+            else f"any of {len(names)} channels"
+        )
     return _listed(names)
 
 
 def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     """Say which channels all are meant: `imu_2.y`, `imu_2`, `imu_2.x and imu_2.y`."""
-    names = whole_units(geometry, channels) or [geometry.channel_names[i] for i in channels]
+    names = whole_units(geometry, channels) or [
+        geometry.channel_names[i] for i in channels
+    ]
     return _listed(names, "and")
 
 

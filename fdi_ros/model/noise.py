@@ -62,7 +62,9 @@ class NoiseModel:
         self.noise_std = _checked("noise_std", noise_std, "rad/s", above=True)
         self.scale_std = _checked("scale_std", scale_std, "", 1.0)
         self.timing_std = _checked("timing_std", timing_std, "s", 1.0)
-        self.bound = None if bound is None else _checked("bound", bound, "rad/s", above=True)
+        self.bound = (
+            None if bound is None else _checked("bound", bound, "rad/s", above=True)
+        )
         self.bias_std = _checked("bias_std", bias_std, "rad/s")
 
     def __repr__(self) -> str:
@@ -75,15 +77,25 @@ class NoiseModel:
 
     def for_channels(self, n: int) -> NoiseModel:
         """Return the same model with one value per channel; `ConfigError` if one has them for another number than n."""
-        return NoiseModel(**{name: _spread(name, v, n) for name, v in vars(self).items() if v is not None})
+        return NoiseModel(
+            **{
+                name: _spread(name, v, n)
+                for name, v in vars(self).items()
+                if v is not None
+            }
+        )
 
     def subset(self, mask: ArrayLike) -> NoiseModel:
         """Return the model of the channels marked in mask (n,) bool."""
         kept = np.asarray(mask, dtype=bool)
         full = vars(self.for_channels(len(kept)))
-        return NoiseModel(**{name: value[kept] for name, value in full.items() if value is not None})
+        return NoiseModel(
+            **{name: value[kept] for name, value in full.items() if value is not None}
+        )
 
-    def variance(self, geometry: Geometry, rate: Array, acceleration: Array | None = None) -> Array:
+    def variance(
+        self, geometry: Geometry, rate: Array, acceleration: Array | None = None
+    ) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.
 
         ``rate``: of the body, (N, 3) rad/s; ``acceleration``: angular, (N, 3) rad/s^2, None is zero.
@@ -96,18 +108,26 @@ class NoiseModel:
 
 def _spread(name: str, value: Array, n: int) -> Array:
     if value.ndim == 1 and len(value) not in (1, n):
-        raise ConfigError(f"noise.{name} has {len(value)} values, expected 1 or {n} (one per channel)")
+        raise ConfigError(
+            f"noise.{name} has {len(value)} values, expected 1 or {n} (one per channel)"
+        )
     return np.broadcast_to(value, n).copy()
 
 
-def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above: bool = False) -> Array:
+def _checked(
+    name: str, value: ArrayLike, unit: str, high: float = np.inf, above: bool = False
+) -> Array:
     """Return a value from 0 on, or above 0, up to a limit."""
     array = np.array(value, dtype=np.float64)
     within = (array > 0 if above else array >= 0) & (array <= high) & np.isfinite(array)
     if array.ndim > 1 or array.size == 0 or not within.all():
         wrong = array if array.ndim > 1 or array.size == 0 else array[~within].flat[0]
-        bounds = ("> 0" if above else ">= 0") + ("" if high == np.inf else f" and <= {high:g}")
-        raise ConfigError(f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bounds}")
+        bounds = ("> 0" if above else ">= 0") + (
+            "" if high == np.inf else f" and <= {high:g}"
+        )
+        raise ConfigError(
+            f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bounds}"
+        )
     array.flags.writeable = False
     return array
 
@@ -115,7 +135,9 @@ def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above
 MUCH_NOISIER = 3.0  # times all channels of other units; vibration of the body, however mounted, makes up to sqrt(3)
 
 
-def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int, float]]:
+def much_noisier(
+    noise: Array, units: Sequence[Sequence[int]]
+) -> list[tuple[int, float]]:
     """Find channels that are much noisier than every channel of all other units, with the noisiest of these, rad/s.
 
     ``noise`` (n,) of each channel, rad/s; what is not finite is not compared. ``units``: numbers of the channels of
@@ -125,12 +147,20 @@ def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int
     for k, unit in enumerate(units):
         others = noise[[i for j, other in enumerate(units) if j != k for i in other]]
         beside = float(others[np.isfinite(others)].max(initial=0.0))
-        found += [(int(i), beside) for i in unit if beside > 0.0 and noise[i] > MUCH_NOISIER * beside]
+        found += [
+            (int(i), beside)
+            for i in unit
+            if beside > 0.0 and noise[i] > MUCH_NOISIER * beside
+        ]
     return found
 
 
 def noisier_words(
-    names: Sequence[str], noise: Array, units: Sequence[Sequence[int]], unit: str = "rad/s", factor: float = 1.0
+    names: Sequence[str],
+    noise: Array,
+    units: Sequence[Sequence[int]],
+    unit: str = "rad/s",
+    factor: float = 1.0,
 ) -> str:
     """Say which channels are much noisier than the others, with figures; empty: none is.
 
@@ -168,44 +198,79 @@ class FalseAlarmRate:
     sample_rate: float | None = None  # Hz, > 0
 
     def __post_init__(self) -> None:
-        given = [name for name, value in vars(self).items() if value is not None and name != "sample_rate"]
+        given = [
+            name
+            for name, value in vars(self).items()
+            if value is not None and name != "sample_rate"
+        ]
         if len(given) > 1:
             raise ConfigError(f"give {' or '.join(given)}, not both")
         if self.false_alarms_per_hour is not None:
-            if not self.false_alarms_per_hour > 0 or not math.isfinite(self.false_alarms_per_hour):
-                raise ConfigError(f"false_alarms_per_hour is {self.false_alarms_per_hour:g}, expected > 0")
-            if self.sample_rate is None or not self.sample_rate > 0 or not math.isfinite(self.sample_rate):
-                raise ConfigError(f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {self.sample_rate}")
+            if not self.false_alarms_per_hour > 0 or not math.isfinite(
+                self.false_alarms_per_hour
+            ):
+                raise ConfigError(
+                    f"false_alarms_per_hour is {self.false_alarms_per_hour:g}, expected > 0"
+                )
+            if (
+                self.sample_rate is None
+                or not self.sample_rate > 0
+                or not math.isfinite(self.sample_rate)
+            ):
+                raise ConfigError(
+                    f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {self.sample_rate}"
+                )
 
     def per_sample(self) -> float:
         """Probability of a false alarm in one sample; `ConfigError` if it is not between 0 and 1."""
-        probability = DEFAULT_PROBABILITY if self.false_alarm_probability is None else self.false_alarm_probability
+        probability = (
+            DEFAULT_PROBABILITY
+            if self.false_alarm_probability is None
+            else self.false_alarm_probability
+        )
         if self.false_alarms_per_hour is not None and self.sample_rate is not None:
             probability = self.false_alarms_per_hour / (3600.0 * self.sample_rate)
         elif self.run_length is not None:
             probability = 1 / self.mean_run_length()
         if not 0 < probability < 1:
-            raise ConfigError(f"false-alarm probability per sample is {probability:g}, expected between 0 and 1")
+            raise ConfigError(
+                f"false-alarm probability per sample is {probability:g}, expected between 0 and 1"
+            )
         return probability
 
     def mean_run_length(self) -> float:
         """Mean samples to a false alarm; `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`."""
         samples = DEFAULT_RUN_LENGTH if self.run_length is None else self.run_length
-        if self.false_alarms_per_hour is not None or self.false_alarm_probability is not None:
+        if (
+            self.false_alarms_per_hour is not None
+            or self.false_alarm_probability is not None
+        ):
             samples = 1 / self.per_sample()
         if not MIN_RUN_LENGTH <= samples <= MAX_RUN_LENGTH:
-            raise ConfigError(f"run_length is {samples:g} samples, expected {MIN_RUN_LENGTH:g} to {MAX_RUN_LENGTH:g}")
+            raise ConfigError(
+                f"run_length is {samples:g} samples, expected {MIN_RUN_LENGTH:g} to {MAX_RUN_LENGTH:g}"
+            )
         return samples
 
-    def as_options(self, accepted: Collection[str] = BY_PROBABILITY) -> dict[str, float]:
+    def as_options(
+        self, accepted: Collection[str] = BY_PROBABILITY
+    ) -> dict[str, float]:
         """Return those of the options accepted, of a detector, that state the same.
 
         One that takes a run length and no probability gets the run length.
         """
         options, probability = dict(vars(self)), self.false_alarm_probability
-        if probability is not None and "run_length" in accepted and "false_alarm_probability" not in accepted:
+        if (
+            probability is not None
+            and "run_length" in accepted
+            and "false_alarm_probability" not in accepted
+        ):
             options["run_length"] = max(1 / probability, MIN_RUN_LENGTH)
-        return {name: value for name, value in options.items() if value is not None and name in accepted}
+        return {
+            name: value
+            for name, value in options.items()
+            if value is not None and name in accepted
+        }
 
 
 def erfc(x: Array) -> Array:
@@ -228,7 +293,9 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
         terms = [half**k / math.factorial(k) for k in range(dof // 2)]
         return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
     terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
-    return np.asarray(erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
+    return np.asarray(
+        erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64
+    )
 
 
 def chi2_isf(probability: float, dof: int) -> float:
@@ -259,7 +326,9 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
 def _sphere_tail(directions: Array) -> Callable[[float], float]:
     points, weights = _half_sphere(directions.shape[1])
     largest = np.abs(points @ directions.T).max(axis=1)
-    inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
+    inverse = np.divide(
+        1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3
+    )
     return lambda t: float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
 
 
@@ -276,7 +345,11 @@ def _half_sphere(m: int) -> tuple[Array, Array]:
     nodes, weights = np.polynomial.legendre.leggauss(48)
     height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(128) + 0.5) / 128
     radius = np.sqrt(1 - height**2)
-    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, np.ones(128))]
+    points = [
+        np.outer(radius, np.cos(azimuth)),
+        np.outer(radius, np.sin(azimuth)),
+        np.outer(height, np.ones(128)),
+    ]
     return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / 128, 128)
 
 
@@ -294,7 +367,11 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
     def tail(t: float) -> float:
         single = math.erfc(t / math.sqrt(2))
         # 257 quantiles and straight lines between them: within 1e-5, and all draws at once.
-        along = np.interp(log_levels, nodes, [normal_isf(math.exp(node) * single / 2) for node in nodes])
+        along = np.interp(
+            log_levels,
+            nodes,
+            [normal_isf(math.exp(node) * single / 2) for node in nodes],
+        )
         total = 0.0
         for i in range(n):
             w = (along - white[:, i])[:, None] * correlation[i]
@@ -323,12 +400,16 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
     return newer
 
 
-DETECTION = 0.99  # probability with which the smallest detectable error is seen in one sample
+DETECTION = (
+    0.99  # probability with which the smallest detectable error is seen in one sample
+)
 IN_PLANE = 0.1  # third singular value below which directions are in one plane: mounts are known no better
 MOST_SETS = 4  # sets of channels that are listed
 
 
-def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
+def smallest_detectable(
+    geometry: Geometry, noise: NoiseModel, probability: float
+) -> Array:
     """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
 
     The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
@@ -339,9 +420,13 @@ def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: floa
     gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
     root = np.linalg.cholesky(inverse)
     directions = (root.T @ V).T[geometry.detectable]
-    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
+    threshold = max_normal_threshold(
+        directions / np.linalg.norm(directions, axis=1)[:, None], probability
+    )
     with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
+        return np.where(
+            geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf
+        )
 
 
 def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
@@ -349,9 +434,13 @@ def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
 
     Their directions in parity space lie in a plane: three parallel gyros, for one, which have two differences.
     """
-    directions = geometry.parity / np.maximum(np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY)
+    directions = geometry.parity / np.maximum(
+        np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY
+    )
     sets: list[set[int]] = []
-    triples = np.array(list(combinations(np.flatnonzero(geometry.isolable), 3)), dtype=np.int64).reshape(-1, 3)
+    triples = np.array(
+        list(combinations(np.flatnonzero(geometry.isolable), 3)), dtype=np.int64
+    ).reshape(-1, 3)
     third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
     for triple in triples[third < IN_PLANE].tolist():
         # Two directions make a plane.
@@ -367,8 +456,14 @@ def assumption_words(geometry: Geometry) -> str:
     """Say what no data can tell and every name rests on (docs/integrity.md); empty: nothing of this kind."""
     names = geometry.channel_names
     sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
-    shown = ", ".join(sets[:MOST_SETS]) + (f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else "")
-    return f"no two failing alike of {shown}: they would look like a fault of the third" if sets else ""
+    shown = ", ".join(sets[:MOST_SETS]) + (
+        f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else ""
+    )
+    return (
+        f"no two failing alike of {shown}: they would look like a fault of the third"
+        if sets
+        else ""
+    )
 
 
 def summary_line(
@@ -384,9 +479,15 @@ def summary_line(
     ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the errors, and how much of it is 1
     rad/s. ``agree``: the channels are not known to contradict each other; else nothing is said of what can be named.
     """
-    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
+    smallest = smallest_detectable(
+        geometry, noise.for_channels(geometry.n), probability
+    )
     seen = smallest[np.isfinite(smallest)]
-    ends = dict.fromkeys(f"{value * factor:.3g}" for value in (seen.min(), seen.max())) if len(seen) else {}
+    ends = (
+        dict.fromkeys(f"{value * factor:.3g}" for value in (seen.min(), seen.max()))
+        if len(seen)
+        else {}
+    )
     span = f"{' to '.join(ends)} {unit}" if ends else "none"
     isolable, n = int(geometry.isolable.sum()), geometry.n
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
@@ -395,5 +496,7 @@ def summary_line(
     groups = [group for group in geometry.groups if len(group) > 1]
     if isolable == n:
         return f"{words}; any single fault can be isolated"
-    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
+    alike = "; ".join(
+        " or ".join(geometry.channel_names[i] for i in group) for group in groups
+    )
     return f"{words}; {isolable} of {n} single faults can be isolated, not told apart: {alike or 'faults never seen'}"

@@ -30,7 +30,9 @@ class Block:
         If the arrays do not fit each other.
     """
 
-    stamp: NDArray[np.int64]  #: time of each sample, (N,) int64 nanoseconds, strictly increasing
+    stamp: NDArray[
+        np.int64
+    ]  #: time of each sample, (N,) int64 nanoseconds, strictly increasing
     z: NDArray[np.float64]  #: measured channels, (N, n) float64 rad/s
     received: NDArray[np.bool_] | None = None
     """(N, n) bool: the channel delivered a value for this sample, whatever the value. None: all did. A value that
@@ -40,26 +42,40 @@ class Block:
     def __post_init__(self) -> None:
         stamp, z = np.asarray(self.stamp), np.asarray(self.z)
         if z.ndim != 2 or z.dtype.kind not in "fiu":
-            raise ConfigError(f"samples have shape {z.shape} of {z.dtype}, expected (N, n) real numbers")
+            raise ConfigError(
+                f"samples have shape {z.shape} of {z.dtype}, expected (N, n) real numbers"
+            )
         if stamp.shape != z.shape[:1] or stamp.dtype.kind not in "iu":
             raise ConfigError(
                 f"stamps have shape {stamp.shape} of {stamp.dtype}, expected ({len(z)},) whole numbers, ns"
             )
         received = None if self.received is None else np.asarray(self.received)
-        if received is not None and (received.shape != z.shape or received.dtype != np.bool_):
-            raise ConfigError(f"received has shape {received.shape} of {received.dtype}, expected {z.shape} bool")
+        if received is not None and (
+            received.shape != z.shape or received.dtype != np.bool_
+        ):
+            raise ConfigError(
+                f"received has shape {received.shape} of {received.dtype}, expected {z.shape} bool"
+            )
 
     def __len__(self) -> int:
         return len(self.stamp)
 
     def __repr__(self) -> str:
-        span = f", {(int(self.stamp[-1]) - int(self.stamp[0])) / 1e9:.3f} s" if len(self) else ""
+        span = (
+            f", {(int(self.stamp[-1]) - int(self.stamp[0])) / 1e9:.3f} s"
+            if len(self)
+            else ""
+        )
         return f"Block({len(self)} samples of {np.shape(self.z)[1]} channels{span})"
 
     @property
     def delivered(self) -> NDArray[np.bool_]:
         """`received`, spelled out, (N, n)."""
-        return np.ones(self.z.shape, dtype=bool) if self.received is None else self.received
+        return (
+            np.ones(self.z.shape, dtype=bool)
+            if self.received is None
+            else self.received
+        )
 
     def __getitem__(self, rows: slice) -> Block:
         received = None if self.received is None else self.received[rows]

@@ -30,7 +30,9 @@ INPUT = "input "  # what the name of the line about an input topic begins with, 
 FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
 OLD = 86400.0  # stamps that far behind the clock are of a recording, most likely, s
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN = 4.0  # a delay between units is reported from so many of its standard deviations on
+CERTAIN = (
+    4.0  # a delay between units is reported from so many of its standard deviations on
+)
 LEAST_DELAY = 0.001  # and from so much on, s: less is usual between drivers, and 0.01 rad/s in turns of 10 rad/s^2
 NEARLY = 0.8  # a bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault
 
@@ -83,9 +85,15 @@ class InputStatus:
     arrives: bool = False  # whether messages arrive, of use or not
     lag: float = 0.0  # how far its stamps stay behind those of the other inputs, s
     max_lag: float = math.inf  # what is still one instant, s
-    offset: float | None = None  # clock of the monitor minus its last stamp, s; None: its messages carry no stamp.
-    counts: Mapping[str, int] = field(default_factory=dict)  # all that was not taken as it came, by kind
-    recent: Mapping[str, int] = field(default_factory=dict)  # the same since the last regular report
+    offset: float | None = (
+        None  # clock of the monitor minus its last stamp, s; None: its messages carry no stamp.
+    )
+    counts: Mapping[str, int] = field(
+        default_factory=dict
+    )  # all that was not taken as it came, by kind
+    recent: Mapping[str, int] = field(
+        default_factory=dict
+    )  # the same since the last regular report
     error: str = ""  # why the last malformed message was refused
     unstamped: bool = False  # whether its headers have no stamp
     parted: bool = False  # whether its clock and that of the only other input that delivers went apart
@@ -138,14 +146,24 @@ def describe(
         level, message = max(level, Level.WARN), f"{message}; {warning}"
     rows = [(WHOLE, level, message, (*_whole_values(status), *figures))]
     for k, channel in enumerate(status.channels):
-        values = _channel_values(channel, status, k, since[k] if since else channel.since)
+        values = _channel_values(
+            channel, status, k, since[k] if since else channel.since
+        )
         rows.append((channel.name, *_channel_message(channel, status, worse), values))
     if silent is not None:
-        words = f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
+        words = (
+            f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
+        )
         rows = [(name, Level.STALE, words, values) for name, _, _, values in rows]
-    rows += [(f"{INPUT}{line.name}", *_input_message(line), _input_values(line)) for line in inputs]
+    rows += [
+        (f"{INPUT}{line.name}", *_input_message(line), _input_values(line))
+        for line in inputs
+    ]
     hardware = status.config.hardware_id
-    return [StatusLine(level, prefix + name, message, hardware, values) for name, level, message, values in rows]
+    return [
+        StatusLine(level, prefix + name, message, hardware, values)
+        for name, level, message, values in rows
+    ]
 
 
 def degraded(status: Status) -> dict[str, str]:
@@ -159,19 +177,30 @@ def degraded(status: Status) -> dict[str, str]:
 
 def _find_worse(status: Status) -> dict[str, list[str]]:
     """Say the same without the name; what is worse of no channel and no unit has no entry."""
-    found = {one.name: _channel_worse(one, status) for one in status.channels if not one.is_left_out}
+    found = {
+        one.name: _channel_worse(one, status)
+        for one in status.channels
+        if not one.is_left_out
+    }
     for unit in status.units:
         if abs(unit.delay) > max(CERTAIN * unit.delay_std, LEAST_DELAY):
-            side, off = "late" if unit.delay > 0 else "early", ", taken off" if unit.taken_off else ""
+            side, off = (
+                "late" if unit.delay > 0 else "early",
+                ", taken off" if unit.taken_off else "",
+            )
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"
-            found[unit.name] = [f"its stamps are {size} {side} against {unit.against}'s{off}"]
+            found[unit.name] = [
+                f"its stamps are {size} {side} against {unit.against}'s{off}"
+            ]
     return {name: words for name, words in found.items() if words}
 
 
 def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
     words, bias = [], status.config.bias
     if channel.noisy:
-        times = f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
+        times = (
+            f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
+        )
         words.append(f"noise {times} times noise_std and above the others'")
     if abs(channel.drift) > NEARLY * bias.max_drift > 0:
         limit = f"a fault beyond {bias.max_drift:g} (bias.max_drift)"
@@ -184,17 +213,28 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
     return words
 
 
-def _whole_message(status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
+def _whole_message(
+    status: Status, worse: Mapping[str, Sequence[str]]
+) -> tuple[Level, str]:
     total = len(status.channels)
     healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
     about = [channel.name for channel in status.channels if channel.name in worse]
-    words = [status.note, *_format_units(status, worse), f"degraded: {', '.join(about)}" if about else ""]
-    count, note = f"{healthy} of {total} channels healthy", "".join(f"; {one}" for one in words if one)
+    words = [
+        status.note,
+        *_format_units(status, worse),
+        f"degraded: {', '.join(about)}" if about else "",
+    ]
+    count, note = (
+        f"{healthy} of {total} channels healthy",
+        "".join(f"; {one}" for one in words if one),
+    )
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     odd = worse or status.copies or any(unit.frozen for unit in status.units)
     complete = healthy == total and len(status.can_isolate) == total and not odd
-    level = Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
+    level = (
+        Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
+    )
     return level, f"{count}; {_reach(status)}{note}"
 
 
@@ -215,9 +255,19 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
             for before, unit in zip(set_now, status.units, strict=True)
         ]
         words[-1] += f" (to take it off from the start: imus.delays: {delays})"
-    faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
-    words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
-    groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
+    faulty = {
+        channel.name
+        for channel in status.channels
+        if channel.state == ChannelState.FAULTY
+    }
+    words += [
+        f"{unit.name} as a whole is faulty"
+        for unit in status.units
+        if faulty.issuperset(unit.channels)
+    ]
+    groups = dict.fromkeys(
+        channel.group for channel in status.channels if channel.group
+    )
     words += filter(None, (_format_unit_set(group, status.units) for group in groups))
     return words if status.apart is None else [*words, str(status.apart)]
 
@@ -242,7 +292,11 @@ def _why_no_rate(status: Status) -> str:
         return "withheld, as channels under doubt cannot be left out; "
     if status.bias_state == "learning":
         return "the biases are being learned, at rest; "
-    return f"biases not learned: {status.bias_state}; " if status.bias_state.startswith("refused") else ""
+    return (
+        f"biases not learned: {status.bias_state}; "
+        if status.bias_state.startswith("refused")
+        else ""
+    )
 
 
 def _reach(status: Status) -> str:
@@ -251,11 +305,19 @@ def _reach(status: Status) -> str:
     if not detect:
         return "no further fault would be seen"
     if any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels):
-        return "while it is undecided which is faulty, no further fault would be isolated"
+        return (
+            "while it is undecided which is faulty, no further fault would be isolated"
+        )
     if isolate == alive:
         return "a further fault would be isolated"
-    seen = "a further fault would be seen" if detect == alive else f"a fault would be seen on {detect} of {alive}"
-    return f"{seen} " + (f"and isolated on {isolate} of {alive}" if isolate else "but not isolated")
+    seen = (
+        "a further fault would be seen"
+        if detect == alive
+        else f"a fault would be seen on {detect} of {alive}"
+    )
+    return f"{seen} " + (
+        f"and isolated on {isolate} of {alive}" if isolate else "but not isolated"
+    )
 
 
 def _whole_values(status: Status) -> Values:
@@ -269,7 +331,10 @@ def _whole_values(status: Status) -> Values:
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),
         ("names rest on", status.names_rest_on or "one fault at a time"),
         ("protection level (rad/s)", " ".join(map(_figure, status.protection_level))),
-        ("protection level after one more loss (rad/s)", " ".join(map(_figure, status.protection_level_after_loss))),
+        (
+            "protection level after one more loss (rad/s)",
+            " ".join(map(_figure, status.protection_level_after_loss)),
+        ),
         ("bias", status.bias_state),
         *((f"{unit.name}: stamps late (ms)", _late(unit)) for unit in status.units),
         ("note", status.note),
@@ -284,22 +349,41 @@ def _late(unit: UnitStatus) -> str:
     return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
 
 
-def _channel_message(channel: ChannelStatus, status: Status, worse: Mapping[str, Sequence[str]]) -> tuple[Level, str]:
+def _channel_message(
+    channel: ChannelStatus, status: Status, worse: Mapping[str, Sequence[str]]
+) -> tuple[Level, str]:
     """Say how a channel stands, with that in which it is worse than it should be."""
-    wrong = [*map(_format_frozen, _frozen_units(channel, status)), *worse.get(channel.name, ())]
-    unusual = [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
-    level = max(_LEVELS.get(channel.state, Level.WARN), Level.WARN if wrong else Level.OK)
+    wrong = [
+        *map(_format_frozen, _frozen_units(channel, status)),
+        *worse.get(channel.name, ()),
+    ]
+    unusual = [
+        str(error)
+        for error in status.errors
+        if error.owner == channel.name and error.is_unusual
+    ]
+    level = max(
+        _LEVELS.get(channel.state, Level.WARN), Level.WARN if wrong else Level.OK
+    )
     return level, "; ".join([_format_state(channel, status), *wrong, *unusual])
 
 
 def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
-    return [unit for unit in status.units if unit.frozen and channel.name in unit.channels]
+    return [
+        unit for unit in status.units if unit.frozen and channel.name in unit.channels
+    ]
 
 
 def _format_state(channel: ChannelStatus, status: Status) -> str:
     # No sample has changed the state that a channel starts in.
     ago = max(0, status.stamp - channel.since) / 1e9
-    lasting = "since the start" if not channel.since else f"for {_seconds(ago)}" if ago else "from this sample on"
+    lasting = (
+        "since the start"
+        if not channel.since
+        else f"for {_seconds(ago)}"
+        if ago
+        else "from this sample on"
+    )
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
@@ -323,20 +407,42 @@ def _format_set(channel: ChannelStatus, status: Status) -> str:
         return f"{pair}: one of the two is faulty, the evidence cannot tell which"
     if len(channel.group) == 1:
         return "most likely faulty, the only one left in question: to be confirmed"
-    one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
-    return (_format_unit_set(channel.group, status.units) or one_of) + (f"; seen on {pair}" if pair else "")
+    one_of = (
+        f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
+    )
+    return (_format_unit_set(channel.group, status.units) or one_of) + (
+        f"; seen on {pair}" if pair else ""
+    )
 
 
-def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) -> Values:
-    ago = f"{_seconds((status.stamp - channel.last_received) / 1e9)} ago" if channel.last_received else "never"
+def _channel_values(
+    channel: ChannelStatus, status: Status, k: int, since: int
+) -> Values:
+    ago = (
+        f"{_seconds((status.stamp - channel.last_received) / 1e9)} ago"
+        if channel.last_received
+        else "never"
+    )
     pair = status.apart
-    scales = [error for error in status.errors if error.owner == channel.name and error.kind.startswith("scale")]
+    scales = [
+        error
+        for error in status.errors
+        if error.owner == channel.name and error.kind.startswith("scale")
+    ]
     return (
         ("state", channel.state.name),
         ("reason", channel.reason.value),
         ("state since (stamp, s)", f"{since // 10**9}.{since % 10**9:09d}"),
-        ("one of", ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else ""),
-        ("apart (rad/s)", plus_minus(pair.size, pair.std) if pair and channel.name in pair.channels else ""),
+        (
+            "one of",
+            ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else "",
+        ),
+        (
+            "apart (rad/s)",
+            plus_minus(pair.size, pair.std)
+            if pair and channel.name in pair.channels
+            else "",
+        ),
         ("residual (rad/s)", _figure(channel.residual)),
         ("estimated error (rad/s)", _figure(channel.error)),
         ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
@@ -344,10 +450,16 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("bias known to (rad/s)", _figure(channel.bias_std)),
         (
             "scale and misalignment (1)",
-            ", ".join(f"{one.kind[-1]} {one.value:+.4f} +- {one.std:.4f}" for one in scales) or "none",
+            ", ".join(
+                f"{one.kind[-1]} {one.value:+.4f} +- {one.std:.4f}" for one in scales
+            )
+            or "none",
         ),
         ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
-        ("repeats for (s)", "".join(_figure(unit.frozen) for unit in _frozen_units(channel, status))),
+        (
+            "repeats for (s)",
+            "".join(_figure(unit.frozen) for unit in _frozen_units(channel, status)),
+        ),
         ("last value", ago),
         *((kind, str(count)) for kind, count in channel.counts.items()),
     )
@@ -359,14 +471,22 @@ def _input_values(line: InputStatus) -> Values:
         ("received", str(line.received)),
         ("rate (Hz)", f"{line.rate:.1f}"),
         ("behind the other inputs (s)", _figure(line.lag)),
-        *([] if line.offset is None else [("behind the clock (s)", _figure(line.offset))]),
+        *(
+            []
+            if line.offset is None
+            else [("behind the clock (s)", _figure(line.offset))]
+        ),
         *((kind, str(count)) for kind, count in line.counts.items()),
         *([("last malformed", line.error)] if line.error else []),
     )
 
 
 def _input_message(line: InputStatus) -> tuple[Level, str]:
-    odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in ODD.items() if line.recent.get(kind)]
+    odd = [
+        f"{kind_in_words} ({line.recent[kind]})"
+        for kind, kind_in_words in ODD.items()
+        if line.recent.get(kind)
+    ]
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.unstamped:
@@ -376,13 +496,19 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         why = OLD_WORDS if line.offset > OLD else ""
         odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")
     if line.parted:
-        odd.append("the clocks of the two inputs went apart, and nothing tells which is right: neither is used")
+        odd.append(
+            "the clocks of the two inputs went apart, and nothing tells which is right: neither is used"
+        )
     if line.sources:
         odd.append(line.sources)
     if line.silent is None:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
-        silence = "gives nothing that can be used" if line.arrives else f"silent for {_seconds(line.silent)}"
+        silence = (
+            "gives nothing that can be used"
+            if line.arrives
+            else f"silent for {_seconds(line.silent)}"
+        )
         return Level.STALE, "; ".join([silence, *odd])
     return (Level.WARN if odd else Level.OK), "; ".join(odd) or "delivers"
 
@@ -402,12 +528,20 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> bytes:
     """Encode diagnostics, stamped at the clock time now, ns; what no header can hold is moved to its end."""
     # A simulator may say any time.
-    out = bytearray(struct.pack("<4BiI", 0, 1, 0, 0, *divmod(min(max(now, 0), LAST_STAMP), 1_000_000_000)))
+    out = bytearray(
+        struct.pack(
+            "<4BiI", 0, 1, 0, 0, *divmod(min(max(now, 0), LAST_STAMP), 1_000_000_000)
+        )
+    )
 
     def add(content: str | int) -> None:
         data = b"" if isinstance(content, int) else content.encode() + b"\0"
         # The 4 bytes of encapsulation do not change what is aligned to 4.
-        out.extend(bytes(-len(out) % 4) + struct.pack("<I", content if isinstance(content, int) else len(data)) + data)
+        out.extend(
+            bytes(-len(out) % 4)
+            + struct.pack("<I", content if isinstance(content, int) else len(data))
+            + data
+        )
 
     add("")
     add(len(lines))

@@ -41,7 +41,9 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 class ProtectionLevel:
     """What holds for one set of fused channels."""
 
-    level: Array  # (3,) protection level of the body axes, rad/s; inf: none can be given
+    level: (
+        Array  # (3,) protection level of the body axes, rad/s; inf: none can be given
+    )
     limit: Array
     """(n,) largest residual of each channel that passes the separation test, rad/s; inf for channels not fused, and
     where the others say nothing of it."""
@@ -55,7 +57,9 @@ class _Modes(NamedTuple):
     sigma: Array  # (h, 3) standard deviation of the rate without them, rad/s
     sigma_share: Array  # (h, 3, k) share of its square that is due to each channel
     limit: Array  # (h, 3) largest separation that passes the test, rad/s; inf where the rest gives no rate
-    limit_share: Array  # (h, 3, k) part of that which is due to each channel's variance, rad/s
+    limit_share: (
+        Array  # (h, 3, k) part of that which is due to each channel's variance, rad/s
+    )
 
 
 class Integrity:
@@ -66,18 +70,26 @@ class Integrity:
     """
 
     def __init__(
-        self, settings: IntegrityConfig, alarm_probability: float, geometry: Geometry, noise: NoiseModel
+        self,
+        settings: IntegrityConfig,
+        alarm_probability: float,
+        geometry: Geometry,
+        noise: NoiseModel,
     ) -> None:
         noise = noise.for_channels(geometry.n)
         self.risk, self.alarm_probability = settings.risk, alarm_probability
-        unnoticed = [-math.expm1(-rate * settings.exposure) for rate in settings.fault_rate]
+        unnoticed = [
+            -math.expm1(-rate * settings.exposure) for rate in settings.fault_rate
+        ]
         self.prior: Array = np.broadcast_to(np.array(unnoticed), geometry.n)
         """(n,) probability that a channel is faulty unnoticed."""
         self._axes, self._noise = geometry.axes, noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale = noise.scale_std * norm * settings.max_rate
         timing = noise.timing_std * norm * settings.max_acceleration
-        greatest: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
+        greatest: Array = (
+            self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
+        )
         self.scale = math.sqrt(float((greatest / self._noise).max()))
         """By how much the errors of the channels exceed noise_std in the greatest motion."""
 
@@ -87,7 +99,11 @@ class Integrity:
         for mask in masks:
             if not subsets["has_level"][mask]:
                 known, subset = self.of(flags_of(mask, n)), subsets[mask]
-                subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
+                subset["level"], subset["limit"][:n], subset["share"][:n] = (
+                    known.level,
+                    known.limit,
+                    known.share,
+                )
                 subset["has_level"] = True
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
@@ -108,7 +124,10 @@ class Integrity:
         """Level when exactly the channels marked in mask (n,) are fused; variances (n,), (rad/s)^2, or noise_std^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
-        axes, variance = self._axes[kept], (self._noise if variances is None else variances)[kept]
+        axes, variance = (
+            self._axes[kept],
+            (self._noise if variances is None else variances)[kept],
+        )
         nothing = ProtectionLevel(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
             return nothing
@@ -123,9 +142,18 @@ class Integrity:
         if self.risk <= 0:
             return nothing
         prior = self.prior[kept]
-        sets = [np.array(list(combinations(range(len(kept)), size)), dtype=np.intp) for size in (1, 2)]
-        test_parts = parts * (test / np.maximum(spread, MIN_SPREAD * np.sqrt(variance)) ** 2)[:, None]
-        alike = [_modes(chosen, prior, gain, residual, variance, test_parts) for chosen in sets]
+        sets = [
+            np.array(list(combinations(range(len(kept)), size)), dtype=np.intp)
+            for size in (1, 2)
+        ]
+        test_parts = (
+            parts
+            * (test / np.maximum(spread, MIN_SPREAD * np.sqrt(variance)) ** 2)[:, None]
+        )
+        alike = [
+            _modes(chosen, prior, gain, residual, variance, test_parts)
+            for chosen in sets
+        ]
         modes = _Modes(*map(np.concatenate, zip(*alike, strict=True)))
         sigma = np.sqrt((gain**2 * variance).sum(axis=1))
         level = _solve(sigma, prior, modes, self.risk)
@@ -136,7 +164,12 @@ class Integrity:
 
 
 def _modes(
-    sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test_parts: Array
+    sets: NDArray[np.intp],
+    prior: Array,
+    gain: Array,
+    residual: Array,
+    variance: Array,
+    test_parts: Array,
 ) -> _Modes:
     """Fault modes of the sets (h, l), from gain (3, k), residual matrix (k, k) and variance (k,).
 
@@ -144,7 +177,9 @@ def _modes(
     """
     inner = residual[sets[:, :, None], sets[:, None, :]]
     possible = np.linalg.svd(inner, compute_uv=False)[:, -1] >= MIN_LEFT
-    inverse = np.linalg.inv(np.where(possible[:, None, None], inner, np.eye(sets.shape[1])))
+    inverse = np.linalg.inv(
+        np.where(possible[:, None, None], inner, np.eye(sets.shape[1]))
+    )
     separation = gain[:, sets].transpose(1, 0, 2) @ inverse
     without = gain - separation @ residual[sets]
     limit_share = np.abs(separation) @ test_parts[sets]
@@ -161,9 +196,13 @@ def _modes(
 
 def _share(level: Array, share: Array, modes: _Modes) -> Array:
     """Largest share (k, 3) of each variance in the square of the level (3,); given that of the rate alone, (k, 3)."""
-    for at, limit_share, sigma_share in zip(modes.limit, modes.limit_share, modes.sigma_share, strict=True):
+    for at, limit_share, sigma_share in zip(
+        modes.limit, modes.limit_share, modes.sigma_share, strict=True
+    ):
         held = (at <= level)[:, None]
-        total = (limit_share + (level - np.where(held[:, 0], at, 0.0))[:, None] * sigma_share) / level[:, None]
+        total = (
+            limit_share + (level - np.where(held[:, 0], at, 0.0))[:, None] * sigma_share
+        ) / level[:, None]
         share = np.maximum(share, np.where(held, total, 0.0))
     return np.asarray(share.T, dtype=np.float64)
 
@@ -182,11 +221,16 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     priors, sigmas, limits = priors[covered, None], sigmas[covered], limits[covered]
 
     def missed(level: Array) -> Array:
-        faulty = np.where(level < limits, 1.0, _tail((level - limits) / sigmas)) + _tail(level / sigma)
+        faulty = np.where(
+            level < limits, 1.0, _tail((level - limits) / sigmas)
+        ) + _tail(level / sigma)
         return 2 * none * _tail(level / sigma) + (priors * faulty).sum(axis=0)
 
     reach = normal_isf(min(budget / 2, 0.5))
-    low, high = np.zeros(3), np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0)
+    low, high = (
+        np.zeros(3),
+        np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0),
+    )
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         above = missed(middle) > budget

@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.decision import REASONS, ChannelState, Reason
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, fill_imu, fill_integrity
+from fdi_ros.core.messages import (
+    ChannelsTemplate,
+    ImuTemplate,
+    fill_imu,
+    fill_integrity,
+)
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
 from fdi_ros.system import require
@@ -25,7 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ChannelState", "Event", "Output", "Reason"]
 
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the nine entries of a (3, 3) matrix are in its upper triangle
+_FULL = np.array(
+    [0, 1, 2, 1, 3, 4, 2, 4, 5]
+)  # where the nine entries of a (3, 3) matrix are in its upper triangle
 _FLAG = np.dtype(np.bool_)
 
 
@@ -48,7 +55,9 @@ class Event:
     before: ChannelState
     after: ChannelState
     reason: Reason
-    group: tuple[int, ...]  #: AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone.
+    group: tuple[
+        int, ...
+    ]  #: AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone.
     error: float  #: Estimated error of the channel, rad/s; 0 where the reason is neither disagreement nor drift.
 
     row: int = field(default=0, compare=False)  #: Row of that sample in its output.
@@ -69,7 +78,11 @@ def format_reason(event: Event, names: Sequence[str]) -> str:
     """Say why a channel changed its state; without names channels are numbered."""
     size = f" by {abs(event.error):.3g} rad/s" if event.error else ""
     group = ", ".join(names[i] if names else f"channel {i}" for i in event.group)
-    return event.reason.value + size + (f"; one of {group}" if len(event.group) > 1 else "")
+    return (
+        event.reason.value
+        + size
+        + (f"; one of {group}" if len(event.group) > 1 else "")
+    )
 
 
 def _cells(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
@@ -119,20 +132,37 @@ class Output:
 
     stamp: NDArray[np.int64] = _column("stamp", "(N,) ns.")
     instant: NDArray[np.int64] = _column(
-        "instant", "(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."
+        "instant",
+        "(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late.",
     )
-    rate: Array = _column("rate", "(N, 3) fused body rate, rad/s; NaN where there is none: never to be published.")
-    statistic: Array = _column("statistic", "(N,) the detector's; NaN where the sample could not be judged.")
-    threshold: Array = _column("threshold", "(N,) the detector's; NaN where the sample could not be judged.")
-    level: Array = _column("level", "(N, 3) protection level of the fused rate, rad/s; inf where there is none.")
+    rate: Array = _column(
+        "rate",
+        "(N, 3) fused body rate, rad/s; NaN where there is none: never to be published.",
+    )
+    statistic: Array = _column(
+        "statistic", "(N,) the detector's; NaN where the sample could not be judged."
+    )
+    threshold: Array = _column(
+        "threshold", "(N,) the detector's; NaN where the sample could not be judged."
+    )
+    level: Array = _column(
+        "level",
+        "(N, 3) protection level of the fused rate, rad/s; inf where there is none.",
+    )
 
     def __init__(
-        self, rows: NDArray[Any], n: int, events: Sequence[Event] = (), channel_names: Sequence[str] = ()
+        self,
+        rows: NDArray[Any],
+        n: int,
+        events: Sequence[Event] = (),
+        channel_names: Sequence[str] = (),
     ) -> None:
         self.rows = rows
         self.n = n
         self.events = events
-        self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
+        self.channel_names = tuple(channel_names) or tuple(
+            f"g{i + 1}" for i in range(n)
+        )
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -166,7 +196,11 @@ class Output:
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 
     def _repr_html_(self) -> str:
-        return html_table(repr(self), _HEAD, (_cells(event, self.channel_names) for event in self.events))
+        return html_table(
+            repr(self),
+            _HEAD,
+            (_cells(event, self.channel_names) for event in self.events),
+        )
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with one row a sample; needs pandas.
@@ -186,13 +220,21 @@ class Output:
         std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         vectors = {"rate": self.rate, "std": std, "level": self.level}
         columns: dict[str, Any] = {
-            f"{name}_{axis}": values[:, k] for name, values in vectors.items() for k, axis in enumerate("xyz")
+            f"{name}_{axis}": values[:, k]
+            for name, values in vectors.items()
+            for k, axis in enumerate("xyz")
         }
-        columns |= {"statistic": self.statistic, "threshold": self.threshold, "alarm": self.alarm}
+        columns |= {
+            "statistic": self.statistic,
+            "threshold": self.threshold,
+            "alarm": self.alarm,
+        }
         names = [state.name for state in ChannelState]
         for i, channel in enumerate(self.channel_names):
             columns[f"{channel}.residual"] = self.residual[:, i]
-            columns[f"{channel}.state"] = pandas.Categorical.from_codes(self.state[:, i], names)
+            columns[f"{channel}.state"] = pandas.Categorical.from_codes(
+                self.state[:, i], names
+            )
         return pandas.DataFrame(columns, index=time_index(self.stamp))
 
     def __len__(self) -> int:
@@ -214,7 +256,9 @@ class SampleOutput:
     """What is said of each sample on a topic of its own."""
 
     topic: Topic
-    make: Callable[[str, int], Template]  # a message to be filled, from the frame_id of the rate and n channels
+    make: Callable[
+        [str, int], Template
+    ]  # a message to be filled, from the frame_id of the rate and n channels
     fill: Callable[[Template, Any, int, int], None]
     """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
     needs_rate: bool = False  # whether it is of samples with a fused rate alone
@@ -224,7 +268,9 @@ class SampleOutput:
 FUSED = SampleOutput(
     Topic("fused", "sensor_msgs/msg/Imu"),
     lambda frame_id, n: ImuTemplate(frame_id),
-    lambda out, row, n, shift: fill_imu(out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]),
+    lambda out, row, n, shift: fill_imu(
+        out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]
+    ),
     needs_rate=True,
 )
 INTEGRITY = SampleOutput(
@@ -247,7 +293,9 @@ class Encoder:
         """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
         output.fill(self.templates[output], row, self.n, shift)
 
-    def encode(self, results: Output, shift: int = 0) -> Iterator[tuple[Topic, int, bytes]]:
+    def encode(
+        self, results: Output, shift: int = 0
+    ) -> Iterator[tuple[Topic, int, bytes]]:
         """Encode what is said of samples: topic, stamp of the sample, ns, and bytes, in which shift is taken off it."""
         for row in results.rows:
             for output, template in self.templates.items():

@@ -26,7 +26,14 @@ from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.output import FUSED, INTEGRITY, Encoder, Event, SampleOutput, events_of
+from fdi_ros.monitor.output import (
+    FUSED,
+    INTEGRITY,
+    Encoder,
+    Event,
+    SampleOutput,
+    events_of,
+)
 from fdi_ros.monitor.pipeline import Pipeline
 
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
@@ -69,7 +76,9 @@ class SampleRateCheck:
     def __init__(self, configured: float) -> None:
         self.words = ""  # what is wrong, for people; empty: nothing is known to be
         self._configured = configured
-        self._points: deque[tuple[int, int]] = deque(maxlen=RATE_WINDOWS + 1)  # numbers of samples, with their stamps
+        self._points: deque[tuple[int, int]] = deque(
+            maxlen=RATE_WINDOWS + 1
+        )  # numbers of samples, with their stamps
 
     def check(self, count: int, stamp: int) -> None:
         """Take the number of samples so far and the stamp of the last one, ns."""
@@ -77,7 +86,10 @@ class SampleRateCheck:
         if points and (count <= points[-1][0] or stamp <= points[-1][1]):
             points.clear()
         points.append((count, stamp))
-        rates = [1e9 * (now[0] - before[0]) / (now[1] - before[1]) for before, now in pairwise(points)]
+        rates = [
+            1e9 * (now[0] - before[0]) / (now[1] - before[1])
+            for before, now in pairwise(points)
+        ]
         if len(rates) < RATE_WINDOWS or max(rates) > (1 + RATE_TOLERANCE) * min(rates):
             return
         rate, self.words = sum(rates) / RATE_WINDOWS, ""
@@ -100,14 +112,24 @@ class Receiver:
         self.source = source_of(config)
         self.alignment = Alignment(*self.source.alignment)
         self.live = allocate(Live)  # record of what was received, (1,)
-        self.errors = [""] * len(self.source.topics)  # why the last malformed message of each topic was refused
+        self.errors = [""] * len(
+            self.source.topics
+        )  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
-        fused, integrity = (self.encoder.templates[output] for output in (FUSED, INTEGRITY))
+        fused, integrity = (
+            self.encoder.templates[output] for output in (FUSED, INTEGRITY)
+        )
         self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
         self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
-        self._records = (self.alignment.rows, self.live, self._events, fused.bytes, integrity.bytes)
+        self._records = (
+            self.alignment.rows,
+            self.live,
+            self._events,
+            fused.bytes,
+            integrity.bytes,
+        )
         pipeline.prepare()
         self.warm(self.source)
 
@@ -115,7 +137,9 @@ class Receiver:
         """Take in a message of an input topic; stamp: when it arrived, ns; 0: not known."""
         # Bytes: arrays of what can be written would be compiled once more.
         message = np.frombuffer(bytes(data), dtype=np.uint8)
-        flags = self.source.receive(self.alignment.rows, self.live, inlet, message, stamp)
+        flags = self.source.receive(
+            self.alignment.rows, self.live, inlet, message, stamp
+        )
         return self.go_on() if flags & MORE else flags
 
     def go_on(self) -> int:
@@ -185,12 +209,16 @@ def warm_detector(name: str) -> None:
         if isinstance(one, Callback):
             _ = one.address
     geometry = Geometry.cone(_FEW) if method.refuses(6) else Geometry.two_triad_cone()
-    create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(np.zeros((1, geometry.n)))
+    create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(
+        np.zeros((1, geometry.n))
+    )
 
 
 def warm_path() -> None:
     """Compile or load what takes samples through any monitor, in blocks and in messages, and what messages need."""
-    pipeline = Pipeline(Config.from_parameters({"detector.name": next(iter(DETECTORS))}))
+    pipeline = Pipeline(
+        Config.from_parameters({"detector.name": next(iter(DETECTORS))})
+    )
     # Nothing is prepared for a set of channels that lacks two.
     z = np.zeros((2, pipeline.geometry.n))
     z[1, :2] = np.nan

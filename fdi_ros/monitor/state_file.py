@@ -43,7 +43,11 @@ RETRY = 1.0  # what could not be saved is tried again after so long, s
 
 def configuration_hash(config: Config) -> str:
     """Digest of all settings that stay as they are while the monitor runs."""
-    fixed = {name: value for name, value in config.parameters().items() if not PARAMETERS[name].runtime}
+    fixed = {
+        name: value
+        for name, value in config.parameters().items()
+        if not PARAMETERS[name].runtime
+    }
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -51,20 +55,36 @@ class RefusalError(Exception):
     """Why a state is not taken over, in words; what is merely damaged shows as one of `DAMAGED`."""
 
 
-DAMAGED = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+DAMAGED = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+)
 
 
 def _content(pipeline: Pipeline) -> dict[str, Any]:
     """Return what outlives a monitor, in the fields of the file, with channels by name; biases in rad/s."""
     core, names = pipeline.core[0], pipeline.channel_names
-    bias, decision, learned = core["bias"], core["decision"], not core["bias"]["learning"]
+    bias, decision, learned = (
+        core["bias"],
+        core["decision"],
+        not core["bias"]["learning"],
+    )
     return {
-        "bias": dict(zip(names, bias["value"][: len(names)].tolist(), strict=True)) if learned else None,
+        "bias": dict(zip(names, bias["value"][: len(names)].tolist(), strict=True))
+        if learned
+        else None,
         "errors": _errors(pipeline.detector) if learned else None,
         "in_motion": bool(bias["outcome"] == IN_MOTION),  # biases as given
         "known": [names[i] for i in members(int(bias["known"]))],
         "declared": {
-            "faulty": {names[i]: WHY[decision["why"][i]] for i in members(int(decision["faulty"]))},
+            "faulty": {
+                names[i]: WHY[decision["why"][i]]
+                for i in members(int(decision["faulty"]))
+            },
             "ambiguous": [names[i] for i in members(int(decision["ambiguous"]))],
         },
     }
@@ -74,7 +94,10 @@ def _errors(detector: Detector) -> dict[str, Array] | None:
     """Return what a detector has estimated of ``ERROR_KINDS``, (N,), (N, N), and delays taken off, s; None: nothing."""
     if not detector.takes_any or not detector.states[0]["begun"]:
         return None
-    estimator, count = detector.states[0]["estimator"], int(detector.constants[0]["layout"]["count"])
+    estimator, count = (
+        detector.states[0]["estimator"],
+        int(detector.constants[0]["layout"]["count"]),
+    )
     x, p = estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count]
     late = estimator["late"][: len(detector.geometry.units)]
     return {"value": x.copy(), "covariance": p.copy(), "late": late.copy()}
@@ -88,24 +111,44 @@ def _as_json(figures: Array) -> list[float]:
 
 def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
     """Whether a state is to be saved, with another one kept: estimated errors always change a little."""
-    if kept is None or any(state[name] != kept[name] for name in state.keys() - {"errors"}):
+    if kept is None or any(
+        state[name] != kept[name] for name in state.keys() - {"errors"}
+    ):
         return True
     now, then = state["errors"], kept["errors"]
     if now is None or then is None:
         return now is not then
     std, std_then = (np.sqrt(np.diag(errors["covariance"])) for errors in (now, then))
     moved = np.abs(now["value"] - then["value"]) > MOVED * std
-    return bool((moved | (std_then > MOVED * std)).any() or (now["late"] != then["late"]).any())
+    return bool(
+        (moved | (std_then > MOVED * std)).any() or (now["late"] != then["late"]).any()
+    )
 
 
 def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
     """State from what a file holds, if it fits and is plausible; else a refusal, or one of `DAMAGED`."""
-    names, detector, settings = pipeline.channel_names, pipeline.detector, pipeline.config.bias
-    faulty, ambiguous = dict(saved["declared"]["faulty"]), list(saved["declared"]["ambiguous"])
-    sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *saved["known"]}.issubset(names)
+    names, detector, settings = (
+        pipeline.channel_names,
+        pipeline.detector,
+        pipeline.config.bias,
+    )
+    faulty, ambiguous = (
+        dict(saved["declared"]["faulty"]),
+        list(saved["declared"]["ambiguous"]),
+    )
+    sane = faulty.keys().isdisjoint(ambiguous) and {
+        *faulty,
+        *ambiguous,
+        *saved["known"],
+    }.issubset(names)
     if not sane or not all(why and why in WHY for why in faulty.values()):
         raise ValueError
-    state = {"bias": None, "errors": None, "known": saved["known"], "in_motion": saved["in_motion"] is True}
+    state = {
+        "bias": None,
+        "errors": None,
+        "known": saved["known"],
+        "in_motion": saved["in_motion"] is True,
+    }
     state["declared"] = {"faulty": faulty, "ambiguous": ambiguous}
     if saved["bias"] is None:
         return state
@@ -122,31 +165,57 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
         )
     if detector.takes_any:
         n = len(names)
-        _check(state["errors"] or {"value": np.zeros(n), "covariance": np.zeros((n, n))}, detector, off, settings)
+        _check(
+            state["errors"] or {"value": np.zeros(n), "covariance": np.zeros((n, n))},
+            detector,
+            off,
+            settings,
+        )
     return state
 
 
 def _parsed_errors(saved: Any, detector: Detector) -> dict[str, Array]:
     """Errors from what a file holds; one of `DAMAGED` if they are none, or not of this detector."""
-    count, units = int(detector.constants[0]["layout"]["count"]), len(detector.geometry.units)
-    value, triangle, late = (np.array(saved[name], dtype=np.float64) for name in ("value", "covariance", "late"))
-    if value.shape != (count,) or triangle.shape != (count * (count + 1) // 2,) or late.shape != (units,):
+    count, units = (
+        int(detector.constants[0]["layout"]["count"]),
+        len(detector.geometry.units),
+    )
+    value, triangle, late = (
+        np.array(saved[name], dtype=np.float64)
+        for name in ("value", "covariance", "late")
+    )
+    if (
+        value.shape != (count,)
+        or triangle.shape != (count * (count + 1) // 2,)
+        or late.shape != (units,)
+    ):
         raise ValueError
     covariance = np.zeros((count, count))
     covariance[np.tril_indices(count)] = triangle
     covariance += np.tril(covariance, -1).T
-    if not np.isfinite([*value, *triangle]).all() or not (np.abs(late) <= LONGEST_DELAY).all():
+    if (
+        not np.isfinite([*value, *triangle]).all()
+        or not (np.abs(late) <= LONGEST_DELAY).all()
+    ):
         raise ValueError
     # Rounding may leave a covariance a little short of one.
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    if (np.diag(covariance) < 0).any() or np.linalg.eigvalsh(covariance / np.outer(std, std)).min() <= -1e-6:
+    if (np.diag(covariance) < 0).any() or np.linalg.eigvalsh(
+        covariance / np.outer(std, std)
+    ).min() <= -1e-6:
         raise ValueError
     return {"value": value, "covariance": covariance, "late": late}
 
 
-def _check(errors: dict[str, Array], detector: Detector, bias: Array, settings: BiasConfig) -> None:
+def _check(
+    errors: dict[str, Array], detector: Detector, bias: Array, settings: BiasConfig
+) -> None:
     """Refuse errors that are not plausible beside biases (n,) at the start, rad/s."""
-    geometry, layout, value = detector.geometry, detector.constants[0]["layout"], errors["value"]
+    geometry, layout, value = (
+        detector.geometry,
+        detector.constants[0]["layout"],
+        errors["value"],
+    )
     n, count, turn_on = geometry.n, len(value), settings.turn_on_std
     prior = layout["prior"][:count].copy()
     prior[:n] = turn_on
@@ -156,32 +225,58 @@ def _check(errors: dict[str, Array], detector: Detector, bias: Array, settings: 
     limit[delays[delays < count]] = LONGEST_DELAY
     worst = int(np.argmax(np.abs(value) / np.maximum(limit, 1e-300)))
     if abs(value[worst]) > limit[worst]:
-        raise RefusalError(f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}")
-    common, most = float(np.abs(geometry.least_squares @ (bias + value[:n])).max()), PLAUSIBLE * turn_on
+        raise RefusalError(
+            f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"
+        )
+    common, most = (
+        float(np.abs(geometry.least_squares @ (bias + value[:n])).max()),
+        PLAUSIBLE * turn_on,
+    )
     if common > most:
-        raise RefusalError(f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}")
+        raise RefusalError(
+            f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}"
+        )
 
 
 def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
     """Write a state, which is so many seconds old, into the records of a monitor."""
     core, names, n = pipeline.core[0], pipeline.channel_names, pipeline.geometry.n
-    settings, faulty, ambiguous = core["settings"], state["declared"]["faulty"], state["declared"]["ambiguous"]
+    settings, faulty, ambiguous = (
+        core["settings"],
+        state["declared"]["faulty"],
+        state["declared"]["ambiguous"],
+    )
     if state["bias"] is not None:
         bias = core["bias"]
         bias["value"][:n] = list(state["bias"].values())
-        bias["known"], bias["learning"] = mask_of(map(names.index, state["known"])), False
+        bias["known"], bias["learning"] = (
+            mask_of(map(names.index, state["known"])),
+            False,
+        )
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
         std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]
-        core["sample"]["bias_std"][:n] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
+        core["sample"]["bias_std"][:n] = np.sqrt(
+            std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age
+        )
         core["remaining"][:n] = core["sample"]["bias_std"][:n]
     if state["errors"] is not None:
         # Known as well as their walk since then leaves them.
-        detector, (value, covariance, late) = pipeline.detector, state["errors"].values()
+        detector, (value, covariance, late) = (
+            pipeline.detector,
+            state["errors"].values(),
+        )
         detector.states["restored"] = True
         estimator, count = detector.states["estimator"][0], len(value)
         estimator["late"][: len(late)] = late
-        estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count] = value, covariance
-        predict(detector.constants[0]["layout"], detector.states["estimator"]["states"][0], age)
+        estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count] = (
+            value,
+            covariance,
+        )
+        predict(
+            detector.constants[0]["layout"],
+            detector.states["estimator"]["states"][0],
+            age,
+        )
         core["sample"]["estimate"]["bias"][:n] = value[:n]
     decision = core["decision"]
     decision["faulty"] = mask_of(map(names.index, faulty))
@@ -200,14 +295,18 @@ class StateFile:
         if path.is_dir() or not path.name:
             raise ConfigError(f"state_file is {str(path)!r}, a folder, expected a file")
         if not path.parent.is_dir():
-            raise ConfigError(f"state_file is {str(path)!r}, but there is no folder {str(path.parent)!r}")
+            raise ConfigError(
+                f"state_file is {str(path)!r}, but there is no folder {str(path.parent)!r}"
+            )
         if not max_age > 0:
             raise ConfigError(f"state_max_age is {max_age:g} s, expected > 0 s")
         self.path = path
         self.max_age = max_age
         self.words = "not read yet"  # what became of the file, for people
         self.is_rejected = False  # whether there is a file that was not taken over; the next save moves it aside
-        self.failed = False  # whether the state could not be saved when that was last tried
+        self.failed = (
+            False  # whether the state could not be saved when that was last tried
+        )
         self._kept: dict[str, Any] | None = None
         self._not_before = 0.0
 
@@ -217,7 +316,9 @@ class StateFile:
         self._check_ours(self._old)
         self.is_rejected = True
         try:
-            self._restore_from(json.loads(read_trusted(self.path, MAX_BYTES).decode()), pipeline)
+            self._restore_from(
+                json.loads(read_trusted(self.path, MAX_BYTES).decode()), pipeline
+            )
         except FileNotFoundError:
             self.is_rejected = False
             self.words = f"no state taken from {self.path}: there is none yet"
@@ -245,7 +346,9 @@ class StateFile:
         with contextlib.suppress(OSError):
             kind = path.lstat().st_mode
             if not stat.S_ISREG(kind) and not stat.S_ISLNK(kind):
-                raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
+                raise ConfigError(
+                    f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file"
+                )
             with open_regular(path, links=False) as file:
                 begin = file.read(64)
             if begin and not BEGIN.match(begin):
@@ -259,16 +362,25 @@ class StateFile:
         state = _content(pipeline)
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False
-        about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
+        about = {
+            "format": FORMAT,
+            "configuration": configuration_hash(pipeline.config),
+            "saved": time.time(),
+        }
         try:
             with replacing(self.path) as file:
-                file.write(json.dumps({**about, **state}, indent=1, default=_as_json).encode())
+                file.write(
+                    json.dumps({**about, **state}, indent=1, default=_as_json).encode()
+                )
                 if self.is_rejected:
                     with contextlib.suppress(FileNotFoundError):
                         self.path.replace(self._old)
                     self.is_rejected = False
         except OSError as error:
-            self.words, self.failed = f"state cannot be saved to {self.path}: {error.strerror}", True
+            self.words, self.failed = (
+                f"state cannot be saved to {self.path}: {error.strerror}",
+                True,
+            )
             self._not_before = time.monotonic() + RETRY
         else:
             self._kept, self.failed = state, False
@@ -284,13 +396,21 @@ class StateFile:
         if not math.isfinite(age):
             raise ValueError
         if age < 0:
-            raise RefusalError(f"saved {-age:.0f} s ahead of the clock, which was set back")
+            raise RefusalError(
+                f"saved {-age:.0f} s ahead of the clock, which was set back"
+            )
         if age > self.max_age:
-            raise RefusalError(f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)")
+            raise RefusalError(
+                f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
+            )
         state = _parsed(saved, pipeline)
         _restore(state, pipeline, age)
         restored = ["biases"] if state["bias"] is not None else []
-        restored += [f"{name} {kind.upper()}" for kind, names in state["declared"].items() for name in names]
+        restored += [
+            f"{name} {kind.upper()}"
+            for kind, names in state["declared"].items()
+            for name in names
+        ]
         what = ", ".join(restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
         self._kept = _content(pipeline)

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
+from fdi_ros.core.bias import (
+    FIXED,
+    IN_MOTION,
+    LEARNED,
+    LEARNING,
+    LEAST_ROWS,
+    RESTORED,
+    TOO_FEW,
+)
 from fdi_ros.core.decision import REASONS, ChannelState, Reason
 from fdi_ros.core.records import Condition
 from fdi_ros.core.subsets import flags_of, is_in, mask_of, members
@@ -46,13 +54,17 @@ class ChannelStatus:
     error: float  #: Estimated error when declared or suspected, rad/s.
     residual: float  #: Of the last sample, rad/s; NaN where missing.
     last_received: int  #: Stamp of the last sample it delivered, ns; 0 if none.
-    counts: Mapping[str, int]  #: ``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``.
-    delivers: float = 1.0  #: Share of the samples that it has lately given a finite number for.
+    counts: Mapping[
+        str, int
+    ]  #: ``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``.
+    #: Share of the recent samples in which the channel gave a finite value.
+    delivers: float = 1.0
     drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
-    start_bias: float = 0.0  #: What was learned of its bias at the start, beyond ``bias.fixed``, rad/s.
-    bias_std: float = (
-        math.nan
-    )  #: Of what is unknown of its bias, but for what passes for rate, rad/s; NaN: not followed.
+    #: Bias learned at the start, beyond ``bias.fixed``, rad/s.
+    start_bias: float = 0.0
+    #: Standard deviation of the bias without the part common to all channels, rad/s;
+    #: NaN: not estimated.
+    bias_std: float = math.nan
     noise: float = 0.0  #: Lately, in noise_std; 0: not measured.
     noisy: bool = False  #: Whether that is much, and more than the others show.
 
@@ -71,7 +83,9 @@ class UnitStatus:
     delay: float  # by how much its stamps are late against those of another unit, s; negative: early; NaN: not measured
     delay_std: float  # standard deviation of that, s
     against: str  # the other unit: of two units the first, of more the one in the middle; itself for that one
-    taken_off: bool = False  # whether that is taken off the stamps, but for what is not sure
+    taken_off: bool = (
+        False  # whether that is taken off the stamps, but for what is not sure
+    )
     frozen: float = 0.0
     """For how long all its values have repeated while the others measure motion, s; 0: shorter than
     ``health.stuck_time``."""
@@ -104,13 +118,15 @@ class ErrorStatus:
     @property
     def is_unusual(self) -> bool:
         """Whether it is for certain larger than what was expected."""
-        return abs(self.value) > UNUSUAL * self.prior and abs(self.value) - UNUSUAL * self.prior > 2.0 * self.std
+        return (
+            abs(self.value) > UNUSUAL * self.prior
+            and abs(self.value) - UNUSUAL * self.prior > 2.0 * self.std
+        )
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        return (
-            f"{self.kind} {self.value:.2g} +- {self.std:.1g}{unit}, {abs(self.value) / self.prior:.1f} times its prior"
-        )
+        size = f"{self.kind} {self.value:.2g} +- {self.std:.1g}{unit}"
+        return f"{size}, {abs(self.value) / self.prior:.1f} times its prior"
 
 
 @dataclass(frozen=True)
@@ -129,7 +145,9 @@ class Status:
     all_repeat: bool  #: Whether all channels repeat their values.
     can_detect: tuple[str, ...]  #: Channels whose fault would be seen.
     can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
-    bias: tuple[float, ...]  #: Subtracted from each channel, rad/s: from the start, and what was followed in flight.
+    bias: tuple[
+        float, ...
+    ]  #: Subtracted from each channel, rad/s: from the start, and what was followed in flight.
     bias_state: str  #: Words: fixed, learned, learning, refused and why, followed from a start in motion.
     note: str  #: Why checking is limited, in words; empty if it is not.
     protection_level: tuple[float, float, float] = (math.inf,) * 3
@@ -137,28 +155,49 @@ class Status:
     protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
     """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
     units: tuple[UnitStatus, ...] = ()  #: Units of several channels, in their order.
-    delays: tuple[float, ...] = ()  #: By how much each unit is late against the first, s; empty: not measured.
+    delays: tuple[
+        float, ...
+    ] = ()  #: By how much each unit is late against the first, s; empty: not measured.
     delay_std: tuple[float, ...] = ()  #: Standard deviation of each, s.
-    errors: tuple[ErrorStatus, ...] = ()  #: Of the sensors, in the order of ``ERROR_KINDS``.
+    errors: tuple[
+        ErrorStatus, ...
+    ] = ()  #: Of the sensors, in the order of ``ERROR_KINDS``.
     names_rest_on: str = ""  #: What no data can tell, and every name rests on; empty: one fault at a time.
     copies: tuple[tuple[str, str], ...] = ()
     """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
-    apart: ApartStatus | None = None  #: Where a set is declared: the pair in it that surely differs.
+    apart: ApartStatus | None = (
+        None  #: Where a set is declared: the pair in it that surely differs.
+    )
 
     def is_far(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
-        return not channel.is_left_out and abs(channel.start_bias) > MAX_START_BIAS * self.config.bias.turn_on_std > 0
+        return (
+            not channel.is_left_out
+            and abs(channel.start_bias)
+            > MAX_START_BIAS * self.config.bias.turn_on_std
+            > 0
+        )
 
 
-def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: Integrity, config: Config) -> Status:
+def status_of(
+    core: Any,
+    subsets: NDArray[Any],
+    detector: Detector,
+    integrity: Integrity,
+    config: Config,
+) -> Status:
     """Snapshot of a monitor after its last sample, from its record and what every set of channels can do, (2^n,)."""
     geometry = detector.geometry
     names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
     begun, state = bool(core["samples"]), core["state"][:n]
     repeated = flags_of(int(core["copies"]["channels"]), n)
-    detectable, isolable, note, rests_on = _capability(detector, ~(np.isin(state, LOST) | repeated))
+    detectable, isolable, note, rests_on = _capability(
+        detector, ~(np.isin(state, LOST) | repeated)
+    )
     seen = detectable & (state != ChannelState.UNCHECKED)
-    well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
+    well = mask_of(
+        np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED))
+    )
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
     late, late_std = _delays(detector, begun)
@@ -175,11 +214,17 @@ def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: I
         all_repeat=begun and bool(now["all_repeat"]),
         can_detect=_named(names, seen),
         can_isolate=_named(names, isolable & seen),
-        bias=tuple((core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n].tolist()),
+        bias=tuple(
+            (core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n].tolist()
+        ),
         bias_state=_format_bias(core["bias"], names, config.bias.turn_on_std),
         note=note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
-        protection_level_after_loss=integrity.after_loss(subsets, int(now["fused"]) & well) if valid else NO_LEVEL,
+        protection_level_after_loss=integrity.after_loss(
+            subsets, int(now["fused"]) & well
+        )
+        if valid
+        else NO_LEVEL,
         units=_units(core, detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
@@ -192,20 +237,28 @@ def status_of(core: Any, subsets: NDArray[Any], detector: Detector, integrity: I
 
 def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     health, state = core["health"], ChannelState(core["state"][i])
-    count, begun, followed = health["counts"][:, i], bool(core["samples"]), bool(core["settings"]["estimates"])
+    count, begun, followed = (
+        health["counts"][:, i],
+        bool(core["samples"]),
+        bool(core["settings"]["estimates"]),
+    )
     return ChannelStatus(
         name=names[i],
         state=state,
         reason=REASONS[core["reason"][i]],
         since=int(core["since"][i]),
-        group=tuple(names[k] for k in members(int(core["group"]))) if state == ChannelState.AMBIGUOUS else (),
+        group=tuple(names[k] for k in members(int(core["group"])))
+        if state == ChannelState.AMBIGUOUS
+        else (),
         error=float(core["error"][i]),
         residual=float(core["last"]["residual"][i]) if begun else math.nan,
         last_received=int(health["received_stamp"][i]) if health["samples"][i] else 0,
         counts={
             "samples": int(health["samples"][i]),
             "missing": int(count[Condition.MISSING] + count[Condition.SILENT]),
-            "non-finite": int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
+            "non-finite": int(
+                count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]
+            ),
             "out of range": int(count[Condition.OUT_OF_RANGE]),
             "stuck": int(health["stuck"][i] + count[Condition.FROZEN]),
         },
@@ -234,9 +287,16 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     if method is None:
         return detectable, isolable, detector.refusals[bits], ""
     detectable[mask], isolable[mask] = reduced.detectable, method.isolable
-    limits = ((mask & ~detectable, "not be seen"), (detectable & ~isolable, "be seen but not isolated"))
+    limits = (
+        (mask & ~detectable, "not be seen"),
+        (detectable & ~isolable, "be seen but not isolated"),
+    )
     names = detector.geometry.channel_names
-    notes = [f"a fault of {', '.join(_named(names, marked))} would {words}" for marked, words in limits if marked.any()]
+    notes = [
+        f"a fault of {', '.join(_named(names, marked))} would {words}"
+        for marked, words in limits
+        if marked.any()
+    ]
     return detectable, isolable, "; ".join(notes), assumption_words(reduced)
 
 
@@ -264,11 +324,17 @@ def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
     value, covariance = estimator["late"][:units].copy(), np.zeros((units, units))
     value[1:] += estimator["states"]["x"][places]
     covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
-    variance = np.add.outer(np.diag(covariance), np.diag(covariance)) - covariance - covariance.T
+    variance = (
+        np.add.outer(np.diag(covariance), np.diag(covariance))
+        - covariance
+        - covariance.T
+    )
     return np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
 
 
-def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
+def _units(
+    core: Any, detector: Detector, late: Array, late_std: Array
+) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
     geometry, measured = detector.geometry, len(late) > 0
     names = _unit_names(geometry)
@@ -291,63 +357,119 @@ def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple
 def _frozen(core: Any, channels: Sequence[int]) -> float:
     """For how long a unit has given old values for certain, s; 0: it does not."""
     unit, now = mask_of(channels), core["now"]
-    seconds = float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max()) / 1e9
+    seconds = (
+        float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max())
+        / 1e9
+    )
     is_old = int(now["repeated"]) & unit == unit and not now["all_repeat"]
-    return seconds if is_old and seconds >= core["settings"]["stuck_time"] / 1e9 > 0 else 0.0
+    return (
+        seconds
+        if is_old and seconds >= core["settings"]["stuck_time"] / 1e9 > 0
+        else 0.0
+    )
 
 
 def _errors(detector: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
     if not detector.takes_any or not begun:
         return ()
-    estimator, layout, names = detector.states[0]["estimator"], detector.constants[0]["layout"], detector.geometry
+    estimator, layout, names = (
+        detector.states[0]["estimator"],
+        detector.constants[0]["layout"],
+        detector.geometry,
+    )
     states, units, found = estimator["states"], _unit_names(names), []
-    prior = np.sqrt(layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"]))
+    prior = np.sqrt(
+        layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"])
+    )
     for kind in ERROR_KINDS:
         owners = units[1:] if kind.per_unit else names.channel_names
-        for owner, places in zip(owners, places_of(kind.name, names.n, len(units)), strict=True):
-            parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [f" {k + 1}" for k in range(len(places))]
+        for owner, places in zip(
+            owners, places_of(kind.name, names.n, len(units)), strict=True
+        ):
+            parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [
+                f" {k + 1}" for k in range(len(places))
+            ]
             for place, part in zip(places, parts, strict=True):
-                value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
-                found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
+                value, std = (
+                    float(states["x"][place]),
+                    float(np.sqrt(states["p"][place, place])),
+                )
+                found.append(
+                    ErrorStatus(
+                        owner,
+                        kind.name + part,
+                        kind.unit,
+                        value,
+                        std,
+                        float(prior[place]),
+                    )
+                )
     return tuple(found)
 
 
 def _apart(detector: Detector, core: Any) -> ApartStatus | None:
     """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
     geometry, group = detector.geometry, set(members(int(core["group"])))
-    case, found, largest = detector.states[0]["case"] if detector.takes_any else None, None, 0.0
+    case, found, largest = (
+        detector.states[0]["case"] if detector.takes_any else None,
+        None,
+        0.0,
+    )
     for a, b in lone_pairs(geometry) if group else ():
         if not group.issuperset((a, b)):
             continue
         size, std = abs(float(core["error"][b])), math.nan
         if case is not None and case["open"]:
             # What the detector explains: the mean since the onset, with all that is not known of it.
-            axes, mean, covariance = geometry.axes, case["inference"]["y"], case["inference"]["covariance"]
+            axes, mean, covariance = (
+                geometry.axes,
+                case["inference"]["y"],
+                case["inference"]["covariance"],
+            )
             share = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
             size = abs(float(mean[a] - share * mean[b]))
-            std = math.sqrt(max(covariance[a, a] + share**2 * covariance[b, b] - 2 * share * covariance[a, b], 0.0))
+            std = math.sqrt(
+                max(
+                    covariance[a, a]
+                    + share**2 * covariance[b, b]
+                    - 2 * share * covariance[a, b],
+                    0.0,
+                )
+            )
         elif len(group) > 2:
             continue
         certainty = size / std if std > 0.0 else math.inf
         if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
             names = geometry.channel_names[a], geometry.channel_names[b]
-            found, largest = ApartStatus(names, one_of_words(geometry, (a, b)), size, std), certainty
+            found, largest = (
+                ApartStatus(names, one_of_words(geometry, (a, b)), size, std),
+                certainty,
+            )
     return found
 
 
-def _copies(core: Any, geometry: Geometry, config: Config) -> tuple[tuple[str, str], ...]:
+def _copies(
+    core: Any, geometry: Geometry, config: Config
+) -> tuple[tuple[str, str], ...]:
     names = _unit_names(geometry)
     if config.has_units:
-        names = [f"{name} ({topic})" for name, topic in zip(names, config.topics, strict=True)]
+        names = [
+            f"{name} ({topic})"
+            for name, topic in zip(names, config.topics, strict=True)
+        ]
     original = core["copies"]["original"][: len(names)].tolist()
-    return tuple((names[first - 1], names[unit]) for unit, first in enumerate(original) if first)
+    return tuple(
+        (names[first - 1], names[unit]) for unit, first in enumerate(original) if first
+    )
 
 
 def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
     outcome = int(bias["outcome"])
     if outcome in (LEARNED, RESTORED):
-        missed = [name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))]
+        missed = [
+            name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))
+        ]
         words = "learned" if outcome == LEARNED else "restored from the state file"
         return f"{words}, but not of {', '.join(missed)}" if missed else words
     known = {
@@ -360,12 +482,22 @@ def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
 
 
 def _format_refusal(bias: Any, names: Sequence[str]) -> str:
-    heard, restless = int(bias["heard"]).bit_count(), list(members(int(bias["restless"])))
+    heard, restless = (
+        int(bias["heard"]).bit_count(),
+        list(members(int(bias["restless"]))),
+    )
     if bias["outcome"] == TOO_FEW:
         return f": {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
-    mean, std, max_mean, max_std = bias["average"], bias["scatter"], bias["max_rate"], bias["max_std"]
+    mean, std, max_mean, max_std = (
+        bias["average"],
+        bias["scatter"],
+        bias["max_rate"],
+        bias["max_std"],
+    )
     if len(restless) > 1:
-        worst = max(restless, key=lambda i: abs(mean[i]) / max_mean + std[i] / max_std[i])
+        worst = max(
+            restless, key=lambda i: abs(mean[i]) / max_mean + std[i] / max_std[i]
+        )
         return (
             f", not at rest: {names[worst]} had mean {mean[worst]:.3g} rad/s (at most {max_mean:g})"
             f" and standard deviation {std[worst]:.3g} rad/s (at most {max_std[worst]:.3g})"

@@ -26,13 +26,19 @@ HOLE = 1.0  # no fault is injected into a longer time without a sample, and no c
 
 def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
     """Return the rows of stamps (N,), ns, in pieces without an interval longer than this, s."""
-    edges = [0, *(np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist(), len(stamp)]
+    edges = [
+        0,
+        *(np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist(),
+        len(stamp),
+    ]
     return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
 DECLARED = ("FAULTY", "AMBIGUOUS")
 """States of an episode in which a fault was declared; in one that is STALE channels gave nothing."""
-Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
+Course = Literal[
+    "steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"
+]
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,12 @@ class Size:
     along the axis; gone before the end."""
     last_rad_s: float  # in the last batch
     slope_rad_s2: float | None = None  # of what grows or shrinks
-    share_of_rate: float | None = None  # of what is proportional to the rate: an error of the scale factor
-    gone_s: float | None = None  # since when it has stayed away, s from the first message
+    share_of_rate: float | None = (
+        None  # of what is proportional to the rate: an error of the scale factor
+    )
+    gone_s: float | None = (
+        None  # since when it has stayed away, s from the first message
+    )
 
 
 @dataclass(frozen=True)
@@ -83,9 +93,13 @@ class RateMeanwhile:
     """What the fused rate did during an episode."""
 
     published: float  # share of the samples with a rate
-    std_before_rad_s: float | None  # root of the trace of its covariance half a second before; None: there was no rate.
+    std_before_rad_s: (
+        float | None
+    )  # root of the trace of its covariance half a second before; None: there was no rate.
     std_rad_s: float | None  # the same on average during the episode
-    level_rad_s: float | None  # largest protection level of an axis meanwhile; None: there was a sample without one.
+    level_rad_s: (
+        float | None
+    )  # largest protection level of an axis meanwhile; None: there was a sample without one.
 
 
 @dataclass(frozen=True)
@@ -93,7 +107,9 @@ class Evidence:
     """What the declaration rests on."""
 
     reason: str
-    ratio: float | None  # largest statistic, as a share of its threshold; None: no sample was judged.
+    ratio: (
+        float | None
+    )  # largest statistic, as a share of its threshold; None: no sample was judged.
     alarms: int  # samples with an alarm
     last_alarm_s: float | None  # last sample with an alarm, s from the first message
 
@@ -104,7 +120,9 @@ class Episode:
 
     stretch: int  # number of the stretch it lies in, from 1
     state: str  # what it came to: FAULTY, AMBIGUOUS or STALE
-    channels: tuple[str, ...]  # all that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went.
+    channels: tuple[
+        str, ...
+    ]  # all that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went.
     who: str  # the channels in words
     start_s: float
     since_s: float  # since when it has been these channels, in this state
@@ -152,7 +170,9 @@ class Story:
     """All that happened in a recording."""
 
     stretches: tuple[Stretch, ...]
-    episodes: tuple[Episode, ...]  # in the order of time; the first ones where there are very many
+    episodes: tuple[
+        Episode, ...
+    ]  # in the order of time; the first ones where there are very many
     more: int = 0  # episodes beyond these
 
     @property
@@ -163,7 +183,10 @@ class Story:
     @property
     def gaps(self) -> list[tuple[float, float]]:
         """Begin and end of what lies between the stretches, s from the first message."""
-        return [(a.end_s, b.start_s) for a, b in zip(self.stretches, self.stretches[1:], strict=False)]
+        return [
+            (a.end_s, b.start_s)
+            for a, b in zip(self.stretches, self.stretches[1:], strict=False)
+        ]
 
 
 NOTHING_HAPPENED = Story((), ())  # of a recording without samples
@@ -204,7 +227,11 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     about, before = _about(one, unit), _before(one)
     if one.apart is not None:
-        where = "" if one.apart.channels == one.channels else f"seen on {one.apart.who.removesuffix(',')}: "
+        where = (
+            ""
+            if one.apart.channels == one.channels
+            else f"seen on {one.apart.who.removesuffix(',')}: "
+        )
         about = f", {where}{about}"
     elif about:
         about = f" ({about})"
@@ -216,17 +243,50 @@ def _about(one: Episode, unit: Unit) -> str:
         return one.evidence.reason
     if one.apart is not None:
         # Which of both reads more is no matter where one of them is wrong.
-        apart = replace(one.apart.size, rad_s=abs(one.apart.size.rad_s), last_rad_s=abs(one.apart.size.last_rad_s))
-        return size_words(apart, unit).removeprefix("+").replace(unit.name, f"{unit.name} apart", 1)
-    sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates if candidate.size]
-    disagrees = one.evidence.reason.startswith(("disagrees", "has drifted")) or not one.evidence.reason
+        apart = replace(
+            one.apart.size,
+            rad_s=abs(one.apart.size.rad_s),
+            last_rad_s=abs(one.apart.size.last_rad_s),
+        )
+        return (
+            size_words(apart, unit)
+            .removeprefix("+")
+            .replace(unit.name, f"{unit.name} apart", 1)
+        )
+    sizes = [
+        (candidate.channel, size_words(candidate.size, unit))
+        for candidate in one.candidates
+        if candidate.size
+    ]
+    disagrees = (
+        one.evidence.reason.startswith(("disagrees", "has drifted"))
+        or not one.evidence.reason
+    )
     if one.state == "FAULTY":
-        size = "; ".join(words if len(one.channels) == 1 else f"{name} {words}" for name, words in sizes)
-        return "; ".join(part for part in ("" if disagrees else one.evidence.reason, size if disagrees else "") if part)
+        size = "; ".join(
+            words if len(one.channels) == 1 else f"{name} {words}"
+            for name, words in sizes
+        )
+        return "; ".join(
+            part
+            for part in (
+                "" if disagrees else one.evidence.reason,
+                size if disagrees else "",
+            )
+            if part
+        )
     if len(one.channels) <= FEW_CHANNELS:
         return "; ".join(f"{words} if it is {name}" for name, words in sizes)
-    known = [abs(candidate.size.rad_s) for candidate in one.candidates if candidate.size is not None]
-    span = f"{_figure(min(known), unit)} to {_figure(max(known), unit)} {unit.name}" if known else ""
+    known = [
+        abs(candidate.size.rad_s)
+        for candidate in one.candidates
+        if candidate.size is not None
+    ]
+    span = (
+        f"{_figure(min(known), unit)} to {_figure(max(known), unit)} {unit.name}"
+        if known
+        else ""
+    )
     return f"{span}, by which of them it is" if span else ""
 
 
@@ -235,7 +295,10 @@ def _before(one: Episode) -> str:
     # A channel that was the only one left, and not yet surely it, is the one that it came to.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
     words, alone = [], one.state == "FAULTY" and len(one.channels) == 1
-    for step in [*earlier[:1], *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS)]:
+    for step in [
+        *earlier[:1],
+        *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS),
+    ]:
         others = [name for name in step.channels if name not in one.channels]
         few = alone and len(others) <= FEW_CHANNELS and len(others) < len(step.channels)
         who = f"it or {' or '.join(others)}" if few else step.who
@@ -243,18 +306,29 @@ def _before(one: Episode) -> str:
     return ", ".join(words)
 
 
-def detail_words(one: Episode, unit: Unit = RADIANS, scored: bool = False) -> list[tuple[str, str]]:
+def detail_words(
+    one: Episode, unit: Unit = RADIANS, scored: bool = False
+) -> list[tuple[str, str]]:
     """Tell the rest of an episode, each line under its title; scored: faults were injected."""
-    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
-    lines = [("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")]
+    injected = (
+        [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+    )
+    lines = [
+        ("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")
+    ]
     if one.declares:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
         if 0 < len(axes) <= FEW_CHANNELS:
             lines.append(("axis", f"{', '.join(axes)} of the body"))
-        growing = [words for candidate in one.candidates if (words := _growth(candidate, unit))]
+        growing = [
+            words for candidate in one.candidates if (words := _growth(candidate, unit))
+        ]
         if growing and len(one.channels) <= FEW_CHANNELS:
             lines.append(("size", "; ".join(growing)))
-        lines += [("evidence", _evidence(one)), ("what else explains it", _rivals(one, unit))]
+        lines += [
+            ("evidence", _evidence(one)),
+            ("what else explains it", _rivals(one, unit)),
+        ]
     return [*lines, ("fused rate meanwhile", _rate(one, unit)), *injected]
 
 
@@ -263,7 +337,10 @@ def _growth(one: Candidate, unit: Unit) -> str:
     size = one.size
     if size is None or not size.slope_rad_s2:
         return ""
-    first, last, slope = (f"{value * unit.factor:+.3g}" for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2))
+    first, last, slope = (
+        f"{value * unit.factor:+.3g}"
+        for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2)
+    )
     return f"{one.channel} {size.course}: {slope} {unit.name} a second, from {first} to {last} {unit.name}"
 
 
@@ -272,7 +349,11 @@ def _evidence(one: Episode) -> str:
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
         words.append(f"{one.evidence.ratio:.3g} x its threshold")
-    if one.state == "AMBIGUOUS" and one.evidence.last_alarm_s is not None and one.evidence.last_alarm_s < one.end_s:
+    if (
+        one.state == "AMBIGUOUS"
+        and one.evidence.last_alarm_s is not None
+        and one.evidence.last_alarm_s < one.end_s
+    ):
         words.append(f"last above it at {one.evidence.last_alarm_s:.3f} s")
     return ", ".join(words)
 
@@ -280,11 +361,20 @@ def _evidence(one: Episode) -> str:
 def _rivals(one: Episode, unit: Unit) -> str:
     """Say which other channels would explain it as well."""
     if one.state == "FAULTY":
-        return "no other channel by itself" if len(one.channels) == 1 else "no channel by itself"
+        return (
+            "no other channel by itself"
+            if len(one.channels) == 1
+            else "no channel by itself"
+        )
     if len(one.channels) > FEW_CHANNELS:
         return f"an error of any of {', '.join(one.channels)}"
-    sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates]
-    return "; or ".join(f"{name} wrong by {words}" if words else name for name, words in sizes)
+    sizes = [
+        (candidate.channel, size_words(candidate.size, unit))
+        for candidate in one.candidates
+    ]
+    return "; or ".join(
+        f"{name} wrong by {words}" if words else name for name, words in sizes
+    )
 
 
 def _rate(one: Episode, unit: Unit) -> str:
@@ -292,12 +382,26 @@ def _rate(one: Episode, unit: Unit) -> str:
     rate = one.rate
     if rate.published == 0.0:
         return "none was published"
-    share = "published throughout" if rate.published == 1.0 else f"published in {100 * rate.published:.3g} % of samples"
+    share = (
+        "published throughout"
+        if rate.published == 1.0
+        else f"published in {100 * rate.published:.3g} % of samples"
+    )
     words = [share]
     if rate.std_rad_s is not None:
-        before = "" if rate.std_before_rad_s is None else f" ({_figure(rate.std_before_rad_s, unit)} before)"
-        words.append(f"its standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}")
-    level = "" if rate.level_rad_s is None else f"protection level up to {_figure(rate.level_rad_s, unit)} {unit.name}"
+        before = (
+            ""
+            if rate.std_before_rad_s is None
+            else f" ({_figure(rate.std_before_rad_s, unit)} before)"
+        )
+        words.append(
+            f"its standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}"
+        )
+    level = (
+        ""
+        if rate.level_rad_s is None
+        else f"protection level up to {_figure(rate.level_rad_s, unit)} {unit.name}"
+    )
     return ", ".join([*words, level or "no protection level at times"])
 
 
@@ -310,7 +414,9 @@ def stretch_words(story: Story) -> list[str]:
         own = sum(episode.stretch == number for episode in story.declared)
         share = f"{100 * one.judged / max(1, one.samples):.3g} % judged"
         count = f"{own} episode{'s' if own != 1 else ''}" if own else "nothing declared"
-        lines.append(f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}")
+        lines.append(
+            f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}"
+        )
     return lines
 
 

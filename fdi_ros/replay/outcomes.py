@@ -24,7 +24,10 @@ from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.episodes import DECLARED
 
-ALONE = (ChannelState.FAULTY, ChannelState.STALE)  # states by which a channel is declared by itself
+ALONE = (
+    ChannelState.FAULTY,
+    ChannelState.STALE,
+)  # states by which a channel is declared by itself
 STANDING = (*ALONE, ChannelState.AMBIGUOUS)
 
 
@@ -32,13 +35,17 @@ class OutcomeKind(str, Enum):
     """What came of one injected fault; the values are the words of the files that hold outcomes."""
 
     ISOLATED = "named"  # the faulty channel was declared by itself
-    AMBIGUOUS = "in a set"  # it was one of an ambiguity group, and not declared by itself
+    AMBIGUOUS = (
+        "in a set"  # it was one of an ambiguity group, and not declared by itself
+    )
     MISSED = "silent"  # nothing was declared
     FALSE_GROUP = "false set"  # only groups without it were declared
     FALSE_ISOLATION = "wrong"  # a healthy channel was declared by itself
 
 
-def outcome_of(false_isolation: bool, isolated: bool, in_set: bool, false_group: bool) -> OutcomeKind:
+def outcome_of(
+    false_isolation: bool, isolated: bool, in_set: bool, false_group: bool
+) -> OutcomeKind:
     """Return what came of a fault: a healthy channel that was declared counts more than that it was found."""
     if false_isolation:
         return OutcomeKind.FALSE_ISOLATION
@@ -53,16 +60,24 @@ class Scored(NamedTuple):
     """What came of one fault, and when."""
 
     outcome: OutcomeKind
-    isolated_after: float  # until the channel was declared by itself, s; inf: it was not
-    detected_after: float  # until it was declared by itself or in a group, s; inf: it was not
+    isolated_after: (
+        float  # until the channel was declared by itself, s; inf: it was not
+    )
+    detected_after: (
+        float  # until it was declared by itself or in a group, s; inf: it was not
+    )
 
 
 def standing(output: Output) -> tuple[Mask, Mask]:
     """(N, n) whether a channel stands declared by itself, or silent; and whether it stands in an ambiguity group."""
-    return np.isin(output.state, ALONE), np.asarray(output.state == ChannelState.AMBIGUOUS)
+    return np.isin(output.state, ALONE), np.asarray(
+        output.state == ChannelState.AMBIGUOUS
+    )
 
 
-def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: float = np.inf) -> Scored:
+def score(
+    alone: Mask, among: Mask, channel: int | None, since: Array, within: float = np.inf
+) -> Scored:
     """Say what came of a fault of a channel (None: none is faulty); ``alone`` and ``among`` (N, n) as of `standing`.
 
     ``since`` (N,) s from the start of the fault. It is isolated, or in a group, if it is so ``within`` so many s; a
@@ -70,9 +85,17 @@ def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: f
     """
     own = [] if channel is None else [channel]
     others, soon = np.delete(alone, own, axis=1), since <= within
-    isolated, detected = _first(alone[:, own], since), _first(alone[:, own] | among[:, own], since)
+    isolated, detected = (
+        _first(alone[:, own], since),
+        _first(alone[:, own] | among[:, own], since),
+    )
     found = isolated <= within and isolated < np.inf
-    outcome = outcome_of(bool(others.any()), found, bool(among[:, own][soon].any()), bool(among[soon].any()))
+    outcome = outcome_of(
+        bool(others.any()),
+        found,
+        bool(among[:, own][soon].any()),
+        bool(among[soon].any()),
+    )
     return Scored(outcome, isolated, detected)
 
 
@@ -84,7 +107,10 @@ def _first(declared: Mask, since: Array) -> float:
 # Changes of state, and what they make of each fault ------------------------------------------------------------------
 
 
-UNCHECKED_STATES = ("STALE", "UNCHECKED")  # states of a channel that nothing checks, and that no fault was declared of
+UNCHECKED_STATES = (
+    "STALE",
+    "UNCHECKED",
+)  # states of a channel that nothing checks, and that no fault was declared of
 
 
 @dataclass(frozen=True)
@@ -97,7 +123,9 @@ class Outcome:
     size: float | None  # In the unit of the kind's option; None: the kind has no size.
     start_s: float
     stop_s: float | None  # None: it lasts to the end.
-    detected_at_s: float | None = None  # Of the first declaration that names one of its channels.
+    detected_at_s: float | None = (
+        None  # Of the first declaration that names one of its channels.
+    )
     delay_s: float | None = None  # From its start to its detection, s.
     detected_as: str | None = None  # State that the first declaration brought.
     isolated: bool = False  # All its channels were declared, each by itself.
@@ -107,7 +135,9 @@ class Outcome:
     """Named by its first declaration, and those of its channels that were named by themselves later."""
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
-    outcome: str = OutcomeKind.MISSED.value  # As a sweep has it: one of `fdi_ros.replay.outcomes.OutcomeKind`.
+    outcome: str = (
+        OutcomeKind.MISSED.value
+    )  # As a sweep has it: one of `fdi_ros.replay.outcomes.OutcomeKind`.
 
     @property
     def other_channels(self) -> list[str]:
@@ -124,8 +154,12 @@ class StateChange:
     state: str  # After the change.
     before: str
     reason: str
-    group: tuple[str, ...]  # Channels of which one is faulty; the channel itself where it is declared by itself.
-    error: float | None  # Estimated error of the channel, rad/s; None: the method gives none.
+    group: tuple[
+        str, ...
+    ]  # Channels of which one is faulty; the channel itself where it is declared by itself.
+    error: (
+        float | None
+    )  # Estimated error of the channel, rad/s; None: the method gives none.
 
     @property
     def declares(self) -> bool:
@@ -135,7 +169,11 @@ class StateChange:
     @property
     def named(self) -> tuple[str, ...]:
         """The channels that it is about: the one, or all of the set."""
-        return tuple(dict.fromkeys((self.channel, *self.group))) if self.state == "AMBIGUOUS" else (self.channel,)
+        return (
+            tuple(dict.fromkeys((self.channel, *self.group)))
+            if self.state == "AMBIGUOUS"
+            else (self.channel,)
+        )
 
 
 @dataclass(frozen=True)
@@ -181,24 +219,43 @@ class Scores:
 
 GRACE = 1.0  # a declaration this long after the stop of a fault is attributed to it, s
 SQUARED = 1e150  # squares of anything smaller are finite, and so are sums of very many
-_UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES])
+_UNCHECKED = np.isin(
+    np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES]
+)
 """By state, whether nothing checks a channel."""
 
 
 class Followed:
     """One injected fault, the numbers of the channels that it is injected into, and what has become of it so far."""
 
-    def __init__(self, fault: Fault, channels: Sequence[int], names: Sequence[str]) -> None:
+    def __init__(
+        self, fault: Fault, channels: Sequence[int], names: Sequence[str]
+    ) -> None:
         self.fault, self.channels, self.begun = fault, channels, False
         struck = tuple(names[i] for i in channels)
-        self.outcome = Outcome(fault.channel, struck, fault.kind.name, fault.size, fault.start, finite(fault.stop))
-        self.detected_stamp: int | None = None  # of the first declaration that names one of its channels, ns
-        self._declared: dict[str, bool] = {}  # channels that were declared, and whether by themselves
-        self.false: set[str] = set()  # states in which healthy channels were declared while it lasted
+        self.outcome = Outcome(
+            fault.channel,
+            struck,
+            fault.kind.name,
+            fault.size,
+            fault.start,
+            finite(fault.stop),
+        )
+        self.detected_stamp: int | None = (
+            None  # of the first declaration that names one of its channels, ns
+        )
+        self._declared: dict[
+            str, bool
+        ] = {}  # channels that were declared, and whether by themselves
+        self.false: set[str] = (
+            set()
+        )  # states in which healthy channels were declared while it lasted
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
         """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
-        return self.is_active(since) and not set(channels).isdisjoint(self.outcome.channels)
+        return self.is_active(since) and not set(channels).isdisjoint(
+            self.outcome.channels
+        )
 
     def is_active(self, since: float) -> bool:
         """Whether what is declared at a time, s, may come of the fault."""
@@ -206,24 +263,36 @@ class Followed:
 
     def add(self, stamp: int, change: StateChange) -> None:
         """Take in a declaration that this fault explains."""
-        own, at, delay = self.outcome, change.at_s, round(change.at_s - self.fault.start, 9)
+        own, at, delay = (
+            self.outcome,
+            change.at_s,
+            round(change.at_s - self.fault.start, 9),
+        )
         if self.detected_stamp is None:
             self.detected_stamp = stamp
-            own = replace(own, detected_at_s=at, delay_s=delay, detected_as=change.state)
+            own = replace(
+                own, detected_at_s=at, delay_s=delay, detected_as=change.state
+            )
         for name in change.named:
             # Other channels that are named later have reasons of their own.
             if stamp == self.detected_stamp or name in own.channels:
                 self._declared.setdefault(name, False)
         if change.state != "AMBIGUOUS":
             self._declared[change.channel] = True
-            if not own.isolated and all(self._declared.get(name) for name in own.channels):
-                own = replace(own, isolated=True, isolated_at_s=at, isolation_delay_s=delay)
+            if not own.isolated and all(
+                self._declared.get(name) for name in own.channels
+            ):
+                own = replace(
+                    own, isolated=True, isolated_at_s=at, isolation_delay_s=delay
+                )
         self.outcome = replace(own, declared_channels=tuple(self._declared))
 
     def result(self) -> Outcome:
         """Return what has become of it."""
         false, found = self.false, self.detected_stamp is not None
-        kind = outcome_of("FAULTY" in false, self.outcome.isolated, found, "AMBIGUOUS" in false)
+        kind = outcome_of(
+            "FAULTY" in false, self.outcome.isolated, found, "AMBIGUOUS" in false
+        )
         return replace(self.outcome, outcome=kind.value)
 
 
@@ -234,11 +303,18 @@ class Evaluation:
         self.injector = injector
         self.names = geometry.channel_names
         pairs = zip(injector.faults, injector.channels, strict=True)
-        self.faults = [Followed(fault, channels, self.names) for fault, channels in pairs]
+        self.faults = [
+            Followed(fault, channels, self.names) for fault, channels in pairs
+        ]
         self.events: list[StateChange] = []
-        self.samples, self._counts = 0, np.zeros(3, dtype=np.int64)  # those judged, with a rate, with an alarm
+        self.samples, self._counts = (
+            0,
+            np.zeros(3, dtype=np.int64),
+        )  # those judged, with a rate, with an alarm
         self._unexplained: list[StateChange] = []
-        self._unchecked = np.zeros(geometry.n)  # samples in which nothing checked the channel
+        self._unchecked = np.zeros(
+            geometry.n
+        )  # samples in which nothing checked the channel
         self._residuals = np.zeros((2, geometry.n))
         """Of each channel while it is OK: sum of the squared residuals, and their number."""
         self._least_squares = geometry.least_squares
@@ -258,10 +334,17 @@ class Evaluation:
             return
         judged = np.isfinite(output.threshold)
         self.samples += len(output)
-        self._counts += int(judged.sum()), int(output.valid.sum()), int(output.alarm.sum())
+        self._counts += (
+            int(judged.sum()),
+            int(output.valid.sum()),
+            int(output.alarm.sum()),
+        )
         self._unchecked += (_UNCHECKED[output.state] | ~judged[:, None]).sum(axis=0)
         fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
-        self._residuals += (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0), fine.sum(axis=0)
+        self._residuals += (
+            (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0),
+            fine.sum(axis=0),
+        )
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self.last = int(output.stamp[-1])
         for event in output.events:
@@ -274,7 +357,9 @@ class Evaluation:
             active = self.injector.active(output.stamp)
             for one, rows in zip(self.faults, active.T, strict=True):
                 if not one.outcome.declared_before:
-                    until = self.last if one.detected_stamp is None else one.detected_stamp
+                    until = (
+                        self.last if one.detected_stamp is None else one.detected_stamp
+                    )
                     undetected |= rows & (output.stamp <= until)
             effect = output.rate - clean
             self._add_effect(0, effect[undetected])
@@ -308,7 +393,10 @@ class Evaluation:
         for one in self.faults:
             if not one.begun and one.fault.start <= time:
                 before = all(self._state[i] in ALONE for i in one.channels)
-                one.begun, one.outcome = True, replace(one.outcome, declared_before=before)
+                one.begun, one.outcome = (
+                    True,
+                    replace(one.outcome, declared_before=before),
+                )
 
     def _add_event(self, event: Event, time: float) -> None:
         self._state[event.channel] = event.after
@@ -324,7 +412,10 @@ class Evaluation:
         self.events.append(change)
         if event.after in (ChannelState.OK, ChannelState.UNCHECKED):
             self._declared.pop(event.channel, None)
-        if event.after not in STANDING or self._declared.get(event.channel) == event.after:
+        if (
+            event.after not in STANDING
+            or self._declared.get(event.channel) == event.after
+        ):
             # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
             return
         if event.declares:
@@ -356,7 +447,9 @@ class Evaluation:
             duration_s=round((self.last - first) * 1e-9, 9),
             faults=tuple(one.result() for one in self.faults),
             declared=tuple(self._unexplained),
-            fault_effect_rad_s=FaultEffect(*(rms(*one) for one in self._effects.T.tolist())),
+            fault_effect_rad_s=FaultEffect(
+                *(rms(*one) for one in self._effects.T.tolist())
+            ),
             start_s=0.0 if self._first is None else round(self.time(first), 9),
             samples_judged=judged,
             samples_with_rate=with_rate,
@@ -424,7 +517,11 @@ def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
     reached = list(accumulate(count for _, count in counts))
     found: dict[str, int | None] = {}
     for level in (0.5, 0.9, 0.99):
-        at_least = (n for (n, _), k in zip(counts, reached, strict=True) if k >= level * reached[-1])
+        at_least = (
+            n
+            for (n, _), k in zip(counts, reached, strict=True)
+            if k >= level * reached[-1]
+        )
         found[f"p{100 * level:g}"] = next(at_least, None)
     return found
 

@@ -22,7 +22,12 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.decision import ChannelState
 from fdi_ros.core.sources import source_of
 from fdi_ros.model.samples import Block, Int
-from fdi_ros.monitor.diagnostics import DIAGNOSTICS, InputStatus, describe, encode_diagnostics
+from fdi_ros.monitor.diagnostics import (
+    DIAGNOSTICS,
+    InputStatus,
+    describe,
+    encode_diagnostics,
+)
 from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
@@ -40,16 +45,43 @@ class CsvFile(Sink):
 
     def __init__(self, file: TextIO, names: tuple[str, ...]) -> None:
         self._writer = csv.writer(file)
-        head = ["stamp", "rate_x", "rate_y", "rate_z", "std_x", "std_y", "std_z", "statistic", "threshold", "alarm"]
-        self._writer.writerow(head + [f"{name}{what}" for name in names for what in ("", ".residual", ".state")])
+        head = [
+            "stamp",
+            "rate_x",
+            "rate_y",
+            "rate_z",
+            "std_x",
+            "std_y",
+            "std_z",
+            "statistic",
+            "threshold",
+            "alarm",
+        ]
+        self._writer.writerow(
+            head
+            + [
+                f"{name}{what}"
+                for name in names
+                for what in ("", ".residual", ".state")
+            ]
+        )
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Write the next samples."""
         variance = np.diagonal(output.covariance, axis1=1, axis2=2)
-        numbers = np.column_stack([output.rate, np.sqrt(variance), output.statistic, output.threshold])
+        numbers = np.column_stack(
+            [output.rate, np.sqrt(variance), output.statistic, output.threshold]
+        )
         channels = np.stack([block.z, output.residual], axis=2).tolist()
         states = _STATES[output.state].tolist()
-        rows = zip(output.stamp.tolist(), numbers.tolist(), output.alarm.tolist(), channels, states, strict=True)
+        rows = zip(
+            output.stamp.tolist(),
+            numbers.tolist(),
+            output.alarm.tolist(),
+            channels,
+            states,
+            strict=True,
+        )
         for stamp, figures, alarm, values, names in rows:
             line = [stamp, *map(_text, figures), int(alarm)]
             for pair, state in zip(values, names, strict=True):
@@ -80,13 +112,17 @@ class OutputBag(Sink):
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
         self._encoder = Encoder(config.body_frame, channels)
         self._source = source_of(config)
-        self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
+        self._before: list[tuple[Newest, dict[str, int]]] = [
+            (Newest(), {}) for _ in config.topics
+        ]
         self._shift = 0  # stamp of a sample minus that of its message, ns
         self._later = 0  # time of recording minus stamp, ns: what is written stands beside the message that brought it
 
     def __enter__(self) -> OutputBag:
         self._writer.open()
-        self._inputs = [self._topic(name, self._source.type) for name in self._source.topics]
+        self._inputs = [
+            self._topic(name, self._source.type) for name in self._source.topics
+        ]
         topics = (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
         self._outputs = {topic: self._topic(topic.name, topic.type) for topic in topics}
         return self
@@ -97,7 +133,11 @@ class OutputBag(Sink):
     def tap(self, batch: Batch, rows: Int) -> None:
         """Copy the messages that are used."""
         for k in rows.tolist():
-            self._writer.write(self._inputs[int(batch.topic[k])], int(batch.log_time[k]), batch.message(k))
+            self._writer.write(
+                self._inputs[int(batch.topic[k])],
+                int(batch.log_time[k]),
+                batch.message(k),
+            )
 
     def begin(self, samples: Samples) -> None:
         """Note how stamps and times of recording differ."""
@@ -115,7 +155,11 @@ class OutputBag(Sink):
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Write the regular diagnostics: once a second of the recording."""
         now = max(topic.log_time for topic in samples.newest)
-        self._diagnose(pipeline, now, [self._input_status(k, samples, now) for k in range(len(samples.topics))])
+        self._diagnose(
+            pipeline,
+            now,
+            [self._input_status(k, samples, now) for k in range(len(samples.topics))],
+        )
 
     def _input_status(self, k: int, samples: Samples, now: int) -> InputStatus:
         """Describe a topic after the messages read so far, by the clock of the recorder."""
@@ -132,16 +176,22 @@ class OutputBag(Sink):
             name=source.names[k],
             topic=topic,
             received=newest.received,
-            rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
+            rate=(newest.received - before.received) / spent
+            if before.received and spent > 0
+            else 0.0,
             silent=silent,
             live=silent is not None
             and silent <= source.timeout
             and (not source.stamped or samples.alignment.is_live(k)),
             lag=samples.alignment.lag[k] * 1e-9 if source.stamped else 0.0,
             max_lag=source.max_lag,
-            offset=(newest.log_time - newest.stamp) * 1e-9 if source.stamped and newest.received else None,
+            offset=(newest.log_time - newest.stamp) * 1e-9
+            if source.stamped and newest.received
+            else None,
             counts=counts,
-            recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
+            recent={
+                kind: count - counted.get(kind, 0) for kind, count in counts.items()
+            },
         )
 
     def _time(self, stamp: int) -> int:
@@ -150,9 +200,17 @@ class OutputBag(Sink):
 
     def _topic(self, name: str, kind: str) -> Connection:
         """Add a topic, called as by the node where nothing is remapped."""
-        name = name.replace("~", NODE, 1) if name.startswith("~") else f"/{name.lstrip('/')}"
+        name = (
+            name.replace("~", NODE, 1)
+            if name.startswith("~")
+            else f"/{name.lstrip('/')}"
+        )
         return self._writer.add_connection(name, kind, typestore=_STORE)
 
-    def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
+    def _diagnose(
+        self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]
+    ) -> None:
         lines = describe(pipeline.status(), inputs=inputs)
-        self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now))
+        self._writer.write(
+            self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now)
+        )

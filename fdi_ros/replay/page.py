@@ -16,7 +16,14 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.episodes import HOLE, Episode, Story, detail_words, episode_words, stretch_words
+from fdi_ros.replay.episodes import (
+    HOLE,
+    Episode,
+    Story,
+    detail_words,
+    episode_words,
+    stretch_words,
+)
 from fdi_ros.replay.outcomes import Outcome, StateChange
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import AutopilotText, Summary
@@ -65,7 +72,9 @@ class Report(Sink):
         fine = ["statistic", "threshold", *(f"rate.{axis}" for axis in _AXES)]
         small = [f"{what}.{axis}" for what in ("deviation", "level") for axis in _AXES]
         small += [f"residual.{i}" for i in range(geometry.n)]
-        self._store = PageStore({**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)})
+        self._store = PageStore(
+            {**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)}
+        )
         self._first_states: list[str] = []
         self._spectrum = Spectrum(self.names, rate) if there("scipy") else None
         self._peaks = np.zeros(2)  # of statistic and threshold
@@ -80,7 +89,9 @@ class Report(Sink):
         """Break the curves: nothing is recorded between the last sample and the next."""
         if self._spectrum:
             self._spectrum.begin_stretch()
-        self._store.add(np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan))
+        self._store.add(
+            np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan)
+        )
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take in the next samples."""
@@ -88,9 +99,14 @@ class Report(Sink):
             return
         time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         if not self._first_states:
-            self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
+            self._first_states = [
+                ChannelState(state).name for state in output.state[0].tolist()
+            ]
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
-        rates = np.column_stack([output.rate, deviation, output.level, output.residual]) * self._unit.factor
+        rates = (
+            np.column_stack([output.rate, deviation, output.level, output.residual])
+            * self._unit.factor
+        )
         columns = np.column_stack([output.statistic, output.threshold, rates])
         # Curves also break where samples are missing for a while within a stretch.
         holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
@@ -103,7 +119,9 @@ class Report(Sink):
             if self._spectrum:
                 self._spectrum.add(output.residual[part])
         judged = columns[:, :2]
-        self._peaks = np.maximum(self._peaks, judged.max(axis=0, initial=0.0, where=np.isfinite(judged)))
+        self._peaks = np.maximum(
+            self._peaks, judged.max(axis=0, initial=0.0, where=np.isfinite(judged))
+        )
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
@@ -111,21 +129,38 @@ class Report(Sink):
         # Shaded are the times of injected faults, and those between stretches, where nothing is recorded.
         times = [("fault", fault.start_s, fault.stop_s) for fault in scores.faults]
         times += [("gap", begin, end) for begin, end in story.gaps]
-        shapes = [{"type": "rect", "kind": kind, "x0": begin, "x1": end} for kind, begin, end in times]
+        shapes = [
+            {"type": "rect", "kind": kind, "x0": begin, "x1": end}
+            for kind, begin, end in times
+        ]
         common = {"shapes": shapes, "marks": _marks(scores.faults, story.episodes)}
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         said = _autopilot_marks(summary)
         # Words are read best where little else is.
-        quiet = {**common, "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)]}
+        quiet = {
+            **common,
+            "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)],
+        }
         states = _timeline(self.names, self._first_states, summary, quiet)
         statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
-        levels = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
+        levels = [
+            _line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)
+        ]
         stretches = stretch_words(story)
         spectrum = self._spectrum and self._spectrum.section(unit)
         sections = [
-            Section("The recording", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states, statistic]),
+            Section(
+                "The recording",
+                f"{self._zoom_hint()} {_marks_hint(summary)}",
+                "",
+                [states, statistic],
+            ),
             _episode_section(story, bool(scores.faults), unit, self._origin),
-            *([Section("Stretches", "Each is judged for itself.", stretches)] if stretches else []),
+            *(
+                [Section("Stretches", "Each is judged for itself.", stretches)]
+                if stretches
+                else []
+            ),
             Section(
                 "Fused rate, and each channel's reading of it",
                 "Band: two standard deviations. What each channel makes of an axis: the fused rate moved along the"
@@ -137,14 +172,25 @@ class Report(Sink):
                 "Residuals",
                 "Channel minus fused rate along its axis; all on one scale.",
                 "",
-                [self._residual(i, {**scale, "scale": "residuals", **common}) for i in range(len(self.names))],
+                [
+                    self._residual(i, {**scale, "scale": "residuals", **common})
+                    for i in range(len(self.names))
+                ],
             ),
             *([spectrum] if spectrum else []),
             Section(
                 "Protection level",
                 "Bound on the error of the fused rate with one undetected fault; gaps: none can be given.",
                 "",
-                [_plot(levels, 220, f"protection level, {unit.name}", True, {**scale, **common})],
+                [
+                    _plot(
+                        levels,
+                        220,
+                        f"protection level, {unit.name}",
+                        True,
+                        {**scale, **common},
+                    )
+                ],
             ),
             *fault_sections(scores, unit),
             _channel_section(summary, unit),
@@ -155,11 +201,19 @@ class Report(Sink):
         ]
         found = verdict(summary, unit)
         lines = [found.words, *sentences(summary, unit)]
-        return page(f"fdi_ros: {summary.bag}", lines, sections, self._store, found.severity, self._origin)
+        return page(
+            f"fdi_ros: {summary.bag}",
+            lines,
+            sections,
+            self._store,
+            found.severity,
+            self._origin,
+        )
 
     def _zoom_hint(self) -> str:
         words = (
-            "Drag across a plot to zoom all plots in time, double-click to see everything; arrow keys move the cursor."
+            "Drag across a plot to zoom all plots in time, double-click to see "
+            "everything; arrow keys move the cursor."
         )
         if self._store.width == 1:
             return words
@@ -179,18 +233,37 @@ class Report(Sink):
     def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
         """Draw the fused rate about an axis, and what the channels that see it make of it."""
         rate, axis = f"rate.{_AXES[k]}", _AXES[k]
-        band = {"type": "band", "packed": rate, "spread": [f"deviation.{axis}", 2], "name": "", "showlegend": False}
+        band = {
+            "type": "band",
+            "packed": rate,
+            "spread": [f"deviation.{axis}", 2],
+            "name": "",
+            "showlegend": False,
+        }
         data = [{**band, "line": {"color": "#808080"}}]
         for i in np.flatnonzero(self._sees[:, k]).tolist():
             plus = [f"residual.{i}", float(self._gain[i, k])]
             line = _line(rate, self.names[i], colour_of(i), 1.1)
-            data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
+            data.append(
+                {**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i}
+            )
         data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
-        return _plot(data, 210, f"{axis}, {self._unit.name}", k == len(_AXES) - 1, layout)
+        return _plot(
+            data, 210, f"{axis}, {self._unit.name}", k == len(_AXES) - 1, layout
+        )
 
     def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
-        line = {**_line(f"residual.{i}", self.names[i], colour_of(i), 1.1), "showlegend": False}
-        return _plot([line], 112, f"{self.names[i]}, {self._unit.name}", i == len(self.names) - 1, layout)
+        line = {
+            **_line(f"residual.{i}", self.names[i], colour_of(i), 1.1),
+            "showlegend": False,
+        }
+        return _plot(
+            [line],
+            112,
+            f"{self.names[i]}, {self._unit.name}",
+            i == len(self.names) - 1,
+            layout,
+        )
 
 
 def _channel_section(summary: Summary, unit: Unit) -> Section:
@@ -202,20 +275,30 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
     columns: Columns = {
         "channel": lambda one: one.name,
         "state": lambda one: one.state,
-        "since": lambda one: "the start" if one.since_s is None else f"{one.since_s:.3f} s",
+        "since": lambda one: (
+            "the start" if one.since_s is None else f"{one.since_s:.3f} s"
+        ),
         "reason": lambda one: one.reason or "-",
         "not checked": lambda one: f"{one.unchecked:.1%}",
         f"residual, {unit.name} rms": lambda one: rate(one.residual_rms_rad_s, ".2g"),
         "noise, noise_std": lambda one: number(one.noise, ".2g"),
         f"bias followed, {unit.name}": lambda one: rate(one.bias_followed, "+.2g"),
     }
-    return Section("Channels", "At the end; the residual while OK.", head_and_rows(columns, summary.monitor.channels))
+    return Section(
+        "Channels",
+        "At the end; the residual while OK.",
+        head_and_rows(columns, summary.monitor.channels),
+    )
 
 
-def _episode_section(story: Story, scored: bool, unit: Unit, origin: int | None) -> Section:
+def _episode_section(
+    story: Story, scored: bool, unit: Unit, origin: int | None
+) -> Section:
     """Lay out the episodes, a card each: its sentence, a link to its time in the plots, what else is known of it."""
     if not story.episodes:
-        return Section("What happened", "", ["Nothing was declared, and no channel fell silent."])
+        return Section(
+            "What happened", "", ["Nothing was declared, and no channel fell silent."]
+        )
     more = max(0, len(story.episodes) - MOST_CARDS) + story.more
     hint = (
         "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
@@ -232,7 +315,9 @@ def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
     date = date_of(origin + round(one.start_s * 1e9)) if origin is not None else None
     begin = [("begins", f"{date:%Y-%m-%d %H:%M:%S} UTC")] if date is not None else []
     told = (*begin, *detail_words(one, unit, scored))
-    rows = "".join(f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>" for title, words in told)
+    rows = "".join(
+        f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>" for title, words in told
+    )
     head = f"<h3>{escape(episode_words(one, unit))}.</h3>"
     return f'<article class="{one.state.lower()}">{head}{link}<dl>{rows}</dl></article>'
 
@@ -245,31 +330,60 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
         "from": lambda event: event.before,
         "to": lambda event: event.state,
         "reason": lambda event: event.reason,
-        "one of": lambda event: ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
+        "one of": lambda event: (
+            ", ".join(event.group) if event.state == "AMBIGUOUS" else ""
+        ),
         "error": lambda event: unit.words(event.error, 4) if event.error else "",
     }
-    more = f" {len(events) - MOST_ROWS} more are left out." if len(events) > MOST_ROWS else ""
+    more = (
+        f" {len(events) - MOST_ROWS} more are left out."
+        if len(events) > MOST_ROWS
+        else ""
+    )
     hint = f"The history: what it came to stands above.{more}"
-    return Section("Changes of state", hint, head_and_rows(columns, events[:MOST_ROWS]) if events else [])
+    return Section(
+        "Changes of state",
+        hint,
+        head_and_rows(columns, events[:MOST_ROWS]) if events else [],
+    )
 
 
 def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
     levels = summary.monitor.protection_level
     found = {}
-    for when, values in {"at end": levels.at_end, "after one more loss": levels.after_one_more_loss}.items():
-        words = ("none" if value is None else f"{value * unit.factor:.4g}" for value in values)
-        axes = " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True))
+    for when, values in {
+        "at end": levels.at_end,
+        "after one more loss": levels.after_one_more_loss,
+    }.items():
+        words = (
+            "none" if value is None else f"{value * unit.factor:.4g}"
+            for value in values
+        )
+        axes = " ".join(
+            f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)
+        )
         found[f"protection level {when}"] = f"{axes} {unit.name}"
     return found
 
 
-def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:
+def _line(
+    packed: str, name: str, colour: str, width: float | None = None, **more: Any
+) -> dict[str, Any]:
     look = {"color": colour, **({} if width is None else {"width": width}), **more}
     return {"type": "scatter", "packed": packed, "name": name, "line": look}
 
 
-def _plot(data: Sequence[Mapping[str, Any]], height: int, title: str, last: bool, layout: Mapping[str, Any]) -> Figure:
-    return {"data": data, "layout": time_layout(height, last, yaxis={"title": {"text": title}}, **layout)}
+def _plot(
+    data: Sequence[Mapping[str, Any]],
+    height: int,
+    title: str,
+    last: bool,
+    layout: Mapping[str, Any],
+) -> Figure:
+    return {
+        "data": data,
+        "layout": time_layout(height, last, yaxis={"title": {"text": title}}, **layout),
+    }
 
 
 # States and marks over time ------------------------------------------------------------------------------------------
@@ -291,11 +405,19 @@ STATES = {
 """Colour and pattern of each state."""
 
 
-def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more: Mapping[str, Any]) -> Figure:
+def _timeline(
+    names: Sequence[str],
+    first: Sequence[str],
+    summary: Summary,
+    more: Mapping[str, Any],
+) -> Figure:
     """Draw the states of the channels, a row each; first: those with the first sample, empty: none came."""
     scores, holes = summary.scores, summary.story.gaps
     begin, end = scores.start_s, max(scores.end_s, scores.start_s + 1e-9)
-    current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
+    current = {
+        name: (first[i] if first else "UNCHECKED", begin, "")
+        for i, name in enumerate(names)
+    }
     spans: dict[str, dict[str, list[Any]]] = {}
 
     def close(name: str, until: float) -> None:
@@ -305,7 +427,9 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more
             into["row"].append(names.index(name))
             into["from"].append(low)
             into["to"].append(high)
-            into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
+            into["text"].append(
+                f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s"
+            )
 
     changes = [event for event in scores.events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
@@ -314,7 +438,13 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more
     for name in names:
         close(name, end)
     data = [
-        {"type": "spans", "name": state, "line": {"color": colour}, "pattern": pattern, **spans[state]}
+        {
+            "type": "spans",
+            "name": state,
+            "line": {"color": colour},
+            "pattern": pattern,
+            **spans[state],
+        }
         for state, (colour, pattern) in STATES.items()
         if state in spans
     ]
@@ -324,7 +454,9 @@ def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary, more
     return {"data": data, "layout": layout}
 
 
-def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _recorded(
+    since: float, until: float, holes: Sequence[tuple[float, float]]
+) -> list[tuple[float, float]]:
     """Parts of a time, s, that are recorded."""
     parts = []
     for begin, end in holes:
@@ -335,32 +467,56 @@ def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) 
     return [*parts, (since, until)] if since <= until else parts
 
 
-def _in_view(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[list[float]]:
+def _in_view(
+    faults: Sequence[Outcome], episodes: Sequence[Episode]
+) -> list[list[float]]:
     """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
-    times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
+    times = [
+        time
+        for fault in faults
+        for time in (fault.start_s, fault.detected_at_s)
+        if time is not None
+    ]
     times += [one.since_s for one in episodes if one.declares]
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
 
-def _marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+def _marks(
+    faults: Sequence[Outcome], episodes: Sequence[Episode]
+) -> list[dict[str, Any]]:
     """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
     found: list[tuple[float | None, str, str, str]] = []
     for fault in faults:
-        for kind, at in (("detected", fault.detected_at_s), ("isolated", fault.isolated_at_s)):
+        for kind, at in (
+            ("detected", fault.detected_at_s),
+            ("isolated", fault.isolated_at_s),
+        ):
             found.append((at, kind, f"{fault.kind} on {fault.channel}: {kind}", ""))
     why = ", no injected fault explains it" if faults else ""
-    for one in [one for one in episodes if one.declares and not one.injected][:MOST_MARKS]:
-        found.append((one.start_s, "declared", f"{one.steps[0].who} {one.steps[0].state}", why))
+    for one in [one for one in episodes if one.declares and not one.injected][
+        :MOST_MARKS
+    ]:
+        found.append(
+            (one.start_s, "declared", f"{one.steps[0].who} {one.steps[0].state}", why)
+        )
         if one.state == "FAULTY" and one.since_s > one.start_s:
             found.append((one.since_s, "isolated", f"{one.who} {one.state}", why))
-    known = [(at, kind, f"{words} at {at:.3f} s{why}") for at, kind, words, why in found if at is not None]
+    known = [
+        (at, kind, f"{words} at {at:.3f} s{why}")
+        for at, kind, words, why in found
+        if at is not None
+    ]
     return [{"x": at, "kind": kind, "text": text} for at, kind, text in known]
 
 
 def _autopilot_marks(summary: Summary) -> list[dict[str, Any]]:
     """Mark what the autopilot said; its errors with their words."""
     return [
-        {"x": one.at_s, "kind": "autopilot", "text": f"autopilot at {one.at_s:.3f} s: {one.text}"}
+        {
+            "x": one.at_s,
+            "kind": "autopilot",
+            "text": f"autopilot at {one.at_s:.3f} s: {one.text}",
+        }
         | ({"label": f"autopilot: {one.text}"} if one.kind == "ERR" else {})
         for one in summary.autopilot[:MOST_MARKS]
     ]
@@ -372,7 +528,15 @@ def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
         "kind": lambda one: one.kind,
         "words": lambda one: one.text,
     }
-    return [Section("What the autopilot said", "", head_and_rows(columns, said[:MOST_ROWS]))] if said else []
+    return (
+        [
+            Section(
+                "What the autopilot said", "", head_and_rows(columns, said[:MOST_ROWS])
+            )
+        ]
+        if said
+        else []
+    )
 
 
 def _marks_hint(summary: Summary) -> str:
@@ -381,4 +545,8 @@ def _marks_hint(summary: Summary) -> str:
     if summary.scores.faults:
         hint = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
     hint += " □ the autopilot said something." if summary.autopilot else ""
-    return hint + (" Grey: gaps; each stretch between them is judged for itself." if summary.story.gaps else "")
+    return hint + (
+        " Grey: gaps; each stretch between them is judged for itself."
+        if summary.story.gaps
+        else ""
+    )

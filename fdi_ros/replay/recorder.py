@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.decision import ChannelState
-from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
+from fdi_ros.model.geometry import (
+    Geometry,
+    all_of_words,
+    axis_words,
+    lone_pairs,
+    one_of_words,
+    spans_space,
+)
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
@@ -45,7 +52,11 @@ from fdi_ros.replay.outcomes import SQUARED, finite
 
 Told = NDArray[np.uint8]  # states, of which those that say nothing are OK
 S = ChannelState
-_DECLARED, _TOLD, _HIDING = (S.AMBIGUOUS, S.FAULTY), (S.AMBIGUOUS, S.FAULTY, S.STALE), (S.STALE, S.SUSPECT)
+_DECLARED, _TOLD, _HIDING = (
+    (S.AMBIGUOUS, S.FAULTY),
+    (S.AMBIGUOUS, S.FAULTY, S.STALE),
+    (S.STALE, S.SUSPECT),
+)
 """States that declare; that an episode may have; that hide what is declared."""
 
 MOST_EPISODES = 1000
@@ -54,7 +65,10 @@ TOGETHER = 0.5
 """Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
 soon after a hole in the stream is part of the hole; and what the rate was before, is taken so long before, s."""
 _DIAGONAL = [0, 3, 5]  # of a symmetric matrix, in its upper triangle
-HOLES = 0.1, 5.0  # a hole in the stream is longer than this, s, and than so many of the interval before
+HOLES = (
+    0.1,
+    5.0,
+)  # a hole in the stream is longer than this, s, and than so many of the interval before
 
 
 @dataclass
@@ -87,7 +101,13 @@ class Recorder:
         self._geometry = geometry
         noise = noise.for_channels(geometry.n)
         norm = np.linalg.norm(geometry.axes, axis=1)
-        self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
+        self._stds: Array = np.array(
+            [
+                noise.noise_std,
+                noise.scale_std * norm,
+                noise.bias_std * np.ones(geometry.n),
+            ]
+        )
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
         self._pairs = lone_pairs(geometry)
         self._before: Told = np.zeros(geometry.n, dtype=np.uint8)
@@ -124,12 +144,23 @@ class Recorder:
         changes = np.flatnonzero((told != before).any(axis=1)).tolist()
         self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
         changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
-        reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
+        reasons = (
+            {
+                (event.stamp, event.channel): event.reason.value
+                for event in output.events
+            }
+            if changes
+            else {}
+        )
         for begin, end in pairwise(edges):
             if begin in changed:
-                self._resumed = max(resumed[resumed <= time[begin]], default=self._resumed)
+                self._resumed = max(
+                    resumed[resumed <= time[begin]], default=self._resumed
+                )
                 stamp = int(output.stamp[begin])
-                named = {i: why for i in range(output.n) if (why := reasons.get((stamp, i)))}
+                named = {
+                    i: why for i in range(output.n) if (why := reasons.get((stamp, i)))
+                }
                 self._change(float(time[begin]), before[begin], told[begin], named)
             if self._open:
                 self._take(slice(begin, end), time, output, told[begin])
@@ -144,13 +175,30 @@ class Recorder:
         recording: no episode.
         """
         standing = [self._ended(one, None) for one in self._open]
-        kept = [*self._episodes, *(one for one in standing if one is not None and (one.declares or one.start_s <= end))]
+        kept = [
+            *self._episodes,
+            *(
+                one
+                for one in standing
+                if one is not None and (one.declares or one.start_s <= end)
+            ),
+        ]
         parts = [*self._stretches, *([] if self._part is None else [self._part])]
         stretches = [
-            Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))
+            Stretch(
+                round(one.start_s, 9),
+                round(one.end_s, 9),
+                one.samples,
+                one.judged,
+                round(one.watched_s, 9),
+            )
             for one in parts
         ]
-        return Story(tuple(stretches), tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))), self._more)
+        return Story(
+            tuple(stretches),
+            tuple(sorted(kept, key=lambda one: (one.start_s, one.since_s))),
+            self._more,
+        )
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
         """Return what the states (N, n) say; what hides nothing says nothing."""
@@ -166,7 +214,10 @@ class Recorder:
     def _add_to_stretch(self, time: Array, output: Output, before: Told) -> None:
         """Count samples; before: what was told right before each."""
         part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
-        judged, steps = np.isfinite(output.threshold), np.diff(np.concatenate([[part.end_s], time]))
+        judged, steps = (
+            np.isfinite(output.threshold),
+            np.diff(np.concatenate([[part.end_s], time])),
+        )
         watched = judged & (steps <= HOLE) & ~np.isin(before, _DECLARED).any(axis=1)
         self._part = Stretch(
             part.start_s,
@@ -176,9 +227,14 @@ class Recorder:
             part.watched_s + float(steps[watched].sum()),
         )
 
-    def _change(self, at: float, before: Told, now: Told, reasons: Mapping[int, str]) -> None:
+    def _change(
+        self, at: float, before: Told, now: Told, reasons: Mapping[int, str]
+    ) -> None:
         """Take over what one sample changed; reasons: by channel."""
-        new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _TOLD}
+        new = {
+            kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist())
+            for kind in _TOLD
+        }
 
         def reason_of(members: set[int]) -> str:
             return next((reasons[i] for i in sorted(members) if i in reasons), "")
@@ -186,22 +242,40 @@ class Recorder:
         std = float(self._tail[self._row_before(at), 1])
         # A set widens, narrows, or comes to a name.
         for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
-            named, hiding = new[S.FAULTY] & one.members, {i for i in one.members if now[i] in _HIDING}
+            named, hiding = (
+                new[S.FAULTY] & one.members,
+                {i for i in one.members if now[i] in _HIDING},
+            )
             members = named or hiding | set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
             if named:
                 one.kind, one.reason = S.FAULTY, reason_of(named) or one.reason
             if named or (members and members != one.members):
                 self._step(one, members, at)
-        taken = set().union(*(one.members for one in self._open if one.kind == S.FAULTY and one.since == at))
+        taken = set().union(
+            *(
+                one.members
+                for one in self._open
+                if one.kind == S.FAULTY and one.since == at
+            )
+        )
         for group in self._by_unit(new[S.FAULTY] - taken):
             self._begin(S.FAULTY, group, at, reason_of(group), std)
         if new[S.AMBIGUOUS] and not any(one.kind == S.AMBIGUOUS for one in self._open):
-            self._begin(S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std)
-        hidden = set().union(*(one.members for one in self._open if one.kind != S.STALE))
+            self._begin(
+                S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std
+            )
+        hidden = set().union(
+            *(one.members for one in self._open if one.kind != S.STALE)
+        )
         for group in self._by_unit(new[S.STALE] - hidden):
             # Channels that fall silent right after others of their unit are one episode with them.
-            unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
-            silent = [one for one in self._open if one.kind == S.STALE and one.members <= unit]
+            unit = next(
+                (set(unit) for unit in self._geometry.units if group <= set(unit)),
+                group,
+            )
+            silent = [
+                one for one in self._open if one.kind == S.STALE and one.members <= unit
+            ]
             if lately := [one for one in silent if at - one.start <= TOGETHER]:
                 self._step(lately[0], lately[0].members | group, lately[0].since)
             else:
@@ -217,16 +291,24 @@ class Recorder:
         if self._part is None:
             # The first sample of a stretch comes after nothing.
             usual[:2] = np.inf
-        self._interval = float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
+        self._interval = (
+            float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
+        )
         return time[(steps > HOLES[0]) & (steps > HOLES[1] * usual)]
 
     def _row_before(self, at: float) -> int:
         """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
-        return max(0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1)
+        return max(
+            0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1
+        )
 
-    def _begin(self, kind: ChannelState, members: set[int], at: float, reason: str, std: float) -> None:
+    def _begin(
+        self, kind: ChannelState, members: set[int], at: float, reason: str, std: float
+    ) -> None:
         """Open an episode."""
-        self._open.append(_Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER))
+        self._open.append(
+            _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
+        )
         self._step(self._open[-1], members, at)
 
     def _step(self, one: _Open, members: set[int], at: float) -> None:
@@ -236,10 +318,16 @@ class Recorder:
         say = one_of_words if one.kind == S.AMBIGUOUS else all_of_words
         names = tuple(self._geometry.channel_names[i] for i in channels)
         step = Step(round(at, 9), one.kind.name, names, say(self._geometry, channels))
-        if one.steps and (one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS):
+        if one.steps and (
+            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS
+        ):
             one.steps.pop()
         one.steps.append(step)
-        one.batches = {key: batches for key, batches in one.batches.items() if members.issuperset(key)}
+        one.batches = {
+            key: batches
+            for key, batches in one.batches.items()
+            if members.issuperset(key)
+        }
 
     def _by_unit(self, channels: set[int]) -> list[set[int]]:
         """Channels that change together: those of one unit are one, others each for itself."""
@@ -274,13 +362,17 @@ class Recorder:
             if one.kind != S.STALE:
                 self._measure(one, rows, time[rows], output, told)
 
-    def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
+    def _measure(
+        self, one: _Open, rows: slice, time: Array, output: Output, told: Told
+    ) -> None:
         """Add the errors that the channels of an episode have by the others."""
         axes, residual = self._geometry.axes, output.residual[rows]
 
         def add(key: tuple[int, ...], gain: Array, error: Array) -> None:
             if key not in one.batches:
-                noise, scale, bias = np.sqrt((gain**2 * self._stds**2).sum(axis=1)).tolist()
+                noise, scale, bias = np.sqrt(
+                    (gain**2 * self._stds**2).sum(axis=1)
+                ).tolist()
                 one.batches[key] = Batches(float(time[0]), noise, scale, bias)
             one.batches[key].add(time, error, output.rate[rows] @ axes[key[0]])
 
@@ -297,11 +389,18 @@ class Recorder:
 
     def _apart(self, one: _Open) -> Apart | None:
         """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
-        pairs = {key: batches.size(one.since) for key, batches in one.batches.items() if len(key) > 1}
+        pairs = {
+            key: batches.size(one.since)
+            for key, batches in one.batches.items()
+            if len(key) > 1
+        }
         sizes = {pair: size for pair, size in pairs.items() if size is not None}
         if one.kind != S.AMBIGUOUS or not sizes:
             return None
-        pair, size = max(sizes.items(), key=lambda item: abs(item[1].rad_s) / (item[1].std_rad_s or np.inf))
+        pair, size = max(
+            sizes.items(),
+            key=lambda item: abs(item[1].rad_s) / (item[1].std_rad_s or np.inf),
+        )
         if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
             return None
         names = tuple(self._geometry.channel_names[i] for i in pair)
@@ -323,7 +422,11 @@ class Recorder:
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
-        found = [episode for episode in (self._ended(one, at) for one in ended) if episode is not None]
+        found = [
+            episode
+            for episode in (self._ended(one, at) for one in ended)
+            if episode is not None
+        ]
         room = MOST_EPISODES - len(self._episodes)
         self._episodes += found[:room]
         self._more += len(found[room:])
@@ -335,8 +438,15 @@ class Recorder:
         if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
             return None
         geometry, names = self._geometry, self._geometry.channel_names
-        sizes = {key[0]: batches.size(one.since) for key, batches in one.batches.items() if len(key) == 1}
-        candidates = [Candidate(names[i], axis_words(geometry, i), sizes.get(i)) for i in sorted(one.members)]
+        sizes = {
+            key[0]: batches.size(one.since)
+            for key, batches in one.batches.items()
+            if len(key) == 1
+        }
+        candidates = [
+            Candidate(names[i], axis_words(geometry, i), sizes.get(i))
+            for i in sorted(one.members)
+        ]
         episode = Episode(
             stretch=len(self._stretches) + 1,
             state=one.kind.name,
@@ -349,11 +459,15 @@ class Recorder:
             steps=tuple(one.steps),
             candidates=tuple(candidates),
             apart=self._apart(one),
-            evidence=Evidence(one.reason, finite(one.ratio), one.alarms, one.last_alarm),
+            evidence=Evidence(
+                one.reason, finite(one.ratio), one.alarms, one.last_alarm
+            ),
             rate=RateMeanwhile(
                 published=one.with_rate / max(1, one.samples),
                 std_before_rad_s=finite(one.std_before),
-                std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
+                std_rad_s=float(np.sqrt(one.variance / one.with_rate))
+                if one.with_rate
+                else None,
                 level_rad_s=finite(one.level),
             ),
         )
@@ -391,12 +505,16 @@ class Batches:
     deviation of what unknown scale factors make of the rate, as a share of it, and of unknown biases, rad/s.
     """
 
-    def __init__(self, begin: float, noise: float, scale: float = 0.0, bias: float = 0.0) -> None:
+    def __init__(
+        self, begin: float, noise: float, scale: float = 0.0, bias: float = 0.0
+    ) -> None:
         self._begin, self._noise, self._scale, self._bias = begin, noise, scale, bias
         self._width = FIRST_WIDTH
         # Of each batch: samples, sum, sum of squares.
         self._sums = np.zeros((3, MOST))
-        self._with_rate = np.zeros(2)  # sum of error times rate, and of the squared rate
+        self._with_rate = np.zeros(
+            2
+        )  # sum of error times rate, and of the squared rate
 
     def add(self, time: Array, error: Array, rate: Array) -> None:
         """Take in samples (N,): time, s; error and rate along the axis, rad/s; what is not finite does not count."""
@@ -405,7 +523,9 @@ class Batches:
         if not len(time):
             return
         while time[-1] - self._begin >= MOST * self._width:
-            self._sums = np.hstack([self._sums.reshape(3, -1, 2).sum(axis=2), np.zeros((3, MOST // 2))])
+            self._sums = np.hstack(
+                [self._sums.reshape(3, -1, 2).sum(axis=2), np.zeros((3, MOST // 2))]
+            )
             self._width *= 2
         number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
         number = np.minimum(number, MOST - 1)
@@ -420,20 +540,30 @@ class Batches:
         if not len(used):
             return None
         mean: Array = np.asarray(total[used] / count[used], dtype=np.float64)
-        middle: Array = np.asarray(self._begin + (used + 0.5) * self._width, dtype=np.float64)
+        middle: Array = np.asarray(
+            self._begin + (used + 0.5) * self._width, dtype=np.float64
+        )
         samples, whole = float(count.sum()), float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
         scatter = mean_square - whole**2
         scatter = scatter if scatter > ROUNDING * mean_square else 0.0
-        lasting = math.hypot(self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias)
+        lasting = math.hypot(
+            self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias
+        )
         std = math.hypot(_standard_error(mean, scatter, samples), lasting)
         last = float(mean[-1])
         rms, (product, rates) = math.sqrt(mean_square), self._with_rate.tolist()
         # The share of its mean square that a regression on the rate explains.
-        explained = product**2 / (rates * samples * mean_square) if rates > 0.0 and mean_square > 0.0 else 0.0
+        explained = (
+            product**2 / (rates * samples * mean_square)
+            if rates > 0.0 and mean_square > 0.0
+            else 0.0
+        )
         if explained > 0.5 and explained > 2 * whole**2 / mean_square:
             chance = _standard_error(mean, scatter, samples)
-            return Size(rms, chance, "proportional", last, share_of_rate=product / rates)
+            return Size(
+                rms, chance, "proportional", last, share_of_rate=product / rates
+            )
         at = (middle >= declared) & (middle < declared + max(LASTING, self._width))
         here = mean[at] if at.any() else mean[-1:]
         then = float(here.mean())
@@ -444,7 +574,9 @@ class Batches:
             error = math.hypot(_standard_error(part, scatter, samples_then), lasting)
             return Size(float(part.mean()), error, "gone", last, gone_s=round(gone, 3))
         slope = _trend(middle, mean)
-        if slope is not None and abs(slope) * (middle[-1] - middle[0]) > TREND * abs(whole):
+        if slope is not None and abs(slope) * (middle[-1] - middle[0]) > TREND * abs(
+            whole
+        ):
             course: Course = "growing" if slope * (then or whole) > 0 else "shrinking"
             straight = mean - slope * (middle - middle.mean())
             chance = float(straight.std(ddof=2)) / math.sqrt(len(here))

@@ -63,7 +63,9 @@ class Sink:
 
     stops_at_events: ClassVar[bool] = False
     """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
-    period: ClassVar[int] = 0  # it looks at recording and pipeline at multiples of this time of recording, ns; 0: never
+    period: ClassVar[int] = (
+        0  # it looks at recording and pipeline at multiples of this time of recording, ns; 0: never
+    )
 
     def tap(self, batch: Batch, rows: Int) -> None:
         """Take raw messages as they are read: those rows of a batch that are used."""
@@ -136,7 +138,9 @@ class Walk:
         """Pass a piece without a gap through the monitor."""
         stepwise = any(sink.stops_at_events for sink in self.sinks)
         row, begun = 0, clock()
-        for output in self.pipeline.steps(block) if stepwise else [self.pipeline.process(block)]:
+        for output in (
+            self.pipeline.steps(block) if stepwise else [self.pipeline.process(block)]
+        ):
             self.seconds += clock() - begun
             rows = slice(row, row + len(output))
             self.add(block[rows], output, rows)
@@ -152,15 +156,21 @@ class Walk:
 class Judge(Walk):
     """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults."""
 
-    def __init__(self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
+    def __init__(
+        self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()
+    ) -> None:
         super().__init__(pipeline, sinks)
         self.injector = injector
         self.evaluation = Evaluation(injector, pipeline.geometry)
-        self._intervals: list[tuple[float, int]] = []  # of each piece: the usual one, ns, and how many samples have it
+        self._intervals: list[
+            tuple[float, int]
+        ] = []  # of each piece: the usual one, ns, and how many samples have it
         self._recorder = Recorder(pipeline.geometry, pipeline.noise)
         self._degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
-        self._reference = Pipeline.from_config(pipeline.config) if injector.faults else None
+        self._reference = (
+            Pipeline.from_config(pipeline.config) if injector.faults else None
+        )
         self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
         """Stamp of the last value of each channel as it was recorded, ns."""
         self._clean: Array | None = None
@@ -168,7 +178,9 @@ class Judge(Walk):
 
     def begin_stretch(self, first: int) -> None:
         """Forget what is declared and suspected; what happened in the stretch before is over."""
-        before, after = self.injector.time(np.array([self.evaluation.last, first])).tolist()
+        before, after = self.injector.time(
+            np.array([self.evaluation.last, first])
+        ).tolist()
         self.injector.refuse_between(before, after, "between them nothing is recorded")
         super().begin_stretch(first)
         if self._reference is not None:
@@ -187,8 +199,12 @@ class Judge(Walk):
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
             limit = np.array(self.pipeline.config.health.max_rate)
             saturated = (np.abs(block.z) >= limit).any(axis=1, keepdims=True)
-            self._clean = np.where(saturated, np.nan, self._reference.process(block).rate)
-            self.evaluation.add_unmonitored(faulty, Block(block.stamp, np.where(saturated, np.nan, block.z)))
+            self._clean = np.where(
+                saturated, np.nan, self._reference.process(block).rate
+            )
+            self.evaluation.add_unmonitored(
+                faulty, Block(block.stamp, np.where(saturated, np.nan, block.z))
+            )
         super().feed(faulty)
         self._degraded |= degraded(self.pipeline.status())
 
@@ -206,33 +222,61 @@ class Judge(Walk):
         far = [one.name for one in status.channels if status.is_far(one)]
         monitor = MonitorResult(
             channels=tuple(self._channels(end, status.channels)),
-            delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
+            delays=tuple(
+                DelayResult(unit.name, late, std) for unit, late, std in delays
+            ),
             degraded=tuple(self._degraded.values()),
             bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
             note=status.note,
-            protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
+            protection_level=ProtectionLevel(
+                *(tuple(map(finite, level)) for level in levels)
+            ),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
         )
         story, episodes = self._recorder.story(end), []
         for one in story.episodes:
-            known = [followed.fault for followed in evaluation.faults if followed.explains(one.start_s, one.ever)]
+            known = [
+                followed.fault
+                for followed in evaluation.faults
+                if followed.explains(one.start_s, one.ever)
+            ]
             injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
             episodes.append(replace(one, injected=injected))
-        return Judgement(status.detector, evaluation.scores(), monitor, replace(story, episodes=tuple(episodes)))
+        return Judgement(
+            status.detector,
+            evaluation.scores(),
+            monitor,
+            replace(story, episodes=tuple(episodes)),
+        )
 
-    def _channels(self, end: float, statuses: Sequence[ChannelStatus]) -> Iterator[ChannelResult]:
+    def _channels(
+        self, end: float, statuses: Sequence[ChannelStatus]
+    ) -> Iterator[ChannelResult]:
         """Yield each channel as it was at a time near the end, s, with what its status at the end says beside."""
-        found = zip(statuses, self.evaluation.unchecked.tolist(), self.evaluation.residual_rms, strict=True)
+        found = zip(
+            statuses,
+            self.evaluation.unchecked.tolist(),
+            self.evaluation.residual_rms,
+            strict=True,
+        )
         for status, unchecked, rms in found:
-            changes = [one for one in self.evaluation.events if one.channel == status.name]
+            changes = [
+                one for one in self.evaluation.events if one.channel == status.name
+            ]
             before = [one for one in changes if one.at_s <= end]
             state, since, reason = status.state.name, None, status.reason.value
             if before:
-                state, since, reason = before[-1].state, before[-1].at_s, before[-1].reason
+                state, since, reason = (
+                    before[-1].state,
+                    before[-1].at_s,
+                    before[-1].reason,
+                )
             elif changes:
                 state, reason = changes[0].before, ""
             drift, noise = status.drift, status.noise or None
-            yield ChannelResult(status.name, state, since, reason, drift, noise, unchecked, rms)
+            yield ChannelResult(
+                status.name, state, since, reason, drift, noise, unchecked, rms
+            )
 
     @property
     def _end(self) -> float:
@@ -256,7 +300,9 @@ class Judge(Walk):
 # A recording ----------------------------------------------------------------------------------------------------------
 
 
-def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:
+def read(
+    path: Source, config: ConfigSource = None, start: float = 0.0, end: float = math.inf
+) -> Iterator[Block]:
     """Read a recording block by block, aligned as the node aligns its messages.
 
     Parameters
@@ -275,7 +321,9 @@ def read(path: Source, config: ConfigSource = None, start: float = 0.0, end: flo
     """
     bag = Path(path)
     if config is None:
-        settings = Config.from_parameters(starting_config_of(bag, f"{bag}: no settings for it").parameters)
+        settings = Config.from_parameters(
+            starting_config_of(bag, f"{bag}: no settings for it").parameters
+        )
     else:
         settings = Config.of(config)
     # Refused now, not with the first block.
@@ -324,16 +372,29 @@ def replay(
     bag = Path(path)
     settings = assumed_config(bag)[0] if config is None else Config.of(config)
     begun, period = clock(), max((sink.period for sink in sinks), default=0)
-    injector = Injector(tuple(map(_fault, faults)), build_geometry(settings).channel_names)
+    injector = Injector(
+        tuple(map(_fault, faults)), build_geometry(settings).channel_names
+    )
     judge = Judge(Pipeline.from_config(settings), injector, sinks)
     with Recording(bag) as recording:
-        samples = Samples(recording, settings, start, end, [sink.tap for sink in sinks], period)
+        samples = Samples(
+            recording, settings, start, end, [sink.tap for sink in sinks], period
+        )
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
-                first, learned = float(injector.time(block.stamp[0])), settings.bias.startup_bias_duration
-                why = "until then the biases are learned" if learned > 0 else "there the part that is read begins"
-                injector.refuse_between(-math.inf, first + learned if learned > 0 else start, why)
+                first, learned = (
+                    float(injector.time(block.stamp[0])),
+                    settings.bias.startup_bias_duration,
+                )
+                why = (
+                    "until then the biases are learned"
+                    if learned > 0
+                    else "there the part that is read begins"
+                )
+                injector.refuse_between(
+                    -math.inf, first + learned if learned > 0 else start, why
+                )
             for piece in judge.pieces(block):
                 for sink in sinks:
                     sink.begin(samples)
@@ -343,21 +404,40 @@ def replay(
             if progress is not None:
                 progress(samples.progress)
         if judge.evaluation.samples:
-            injector.refuse_between(judge.evaluation.time(judge.evaluation.last), math.inf, "that is the last sample")
+            injector.refuse_between(
+                judge.evaluation.time(judge.evaluation.last),
+                math.inf,
+                "that is the last sample",
+            )
         stream = StreamResult(
             sample_rate=SampleRate(settings.sample_rate, judge.rate),
             origin_ns=samples.origin,
             messages=samples.messages,
             malformed=samples.malformed,
             disordered=samples.disordered,
-            alignment=dict(zip(samples.topics, samples.alignment.counters, strict=True)),
+            alignment=dict(
+                zip(samples.topics, samples.alignment.counters, strict=True)
+            ),
             damage=recording.damage.report(),
         )
-        texts = [AutopilotText(judge.evaluation.time(one.stamp), one.kind, one.text) for one in recording.texts]
+        texts = [
+            AutopilotText(judge.evaluation.time(one.stamp), one.kind, one.text)
+            for one in recording.texts
+        ]
     judgement = judge.judgement()
     scores = judgement.scores
-    said = tuple(replace(one, at_s=round(one.at_s, 6)) for one in texts if scores.start_s <= one.at_s <= scores.end_s)
-    return Summary(**vars(judgement), bag=str(bag), stream=stream, seconds=clock() - begun, autopilot=said)
+    said = tuple(
+        replace(one, at_s=round(one.at_s, 6))
+        for one in texts
+        if scores.start_s <= one.at_s <= scores.end_s
+    )
+    return Summary(
+        **vars(judgement),
+        bag=str(bag),
+        stream=stream,
+        seconds=clock() - begun,
+        autopilot=said,
+    )
 
 
 def _fault(given: Fault | str | Mapping[str, Any]) -> Fault:

@@ -23,7 +23,9 @@ class ChannelResult:
 
     name: str
     state: str
-    since_s: float | None  # When it came into its state, s from the first message; None: it began in it.
+    since_s: (
+        float | None
+    )  # When it came into its state, s from the first message; None: it began in it.
     reason: str
     bias_followed: float  # Of its bias against the others, rad/s.
     noise: float | None  # Lately, over noise_std; None: not measured.
@@ -65,7 +67,9 @@ class MonitorResult:
 
     channels: tuple[ChannelResult, ...]
     delays: tuple[DelayResult, ...]
-    degraded: tuple[str, ...]  # What is worse than it should be without being declared, in sentences.
+    degraded: tuple[
+        str, ...
+    ]  # What is worse than it should be without being declared, in sentences.
     bias: BiasResult
     note: str
     protection_level: ProtectionLevel
@@ -85,7 +89,9 @@ class StreamResult:
     """The recording itself."""
 
     sample_rate: SampleRate
-    origin_ns: int | None  # Stamp of the first message, from which all times count; None: there is none.
+    origin_ns: (
+        int | None
+    )  # Stamp of the first message, from which all times count; None: there is none.
     messages: int  # Used.
     malformed: dict[str, int]  # By topic.
     disordered: int
@@ -105,9 +111,17 @@ class Judgement:
     @property
     def unchecked_channels(self) -> list[ChannelResult]:
         """Channels that end without being checked, but for those that a fault is injected into up to the end."""
-        lasting = [fault for fault in self.scores.faults if fault.stop_s is None or fault.stop_s >= self.scores.end_s]
+        lasting = [
+            fault
+            for fault in self.scores.faults
+            if fault.stop_s is None or fault.stop_s >= self.scores.end_s
+        ]
         struck = {name for fault in lasting for name in fault.channels}
-        return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
+        return [
+            one
+            for one in self.monitor.channels
+            if one.state in UNCHECKED_STATES and one.name not in struck
+        ]
 
 
 @dataclass(frozen=True)
@@ -138,8 +152,13 @@ class Summary(Judgement):
         import pandas
 
         columns = ["channel", "before", "state", "reason", "group", "error"]
-        rows = [[getattr(event, name) for name in columns] for event in self.scores.events]
-        stamps = [(self.stream.origin_ns or 0) + round(event.at_s * 1e9) for event in self.scores.events]
+        rows = [
+            [getattr(event, name) for name in columns] for event in self.scores.events
+        ]
+        stamps = [
+            (self.stream.origin_ns or 0) + round(event.at_s * 1e9)
+            for event in self.scores.events
+        ]
         return pandas.DataFrame(rows, index=time_index(stamps), columns=columns)
 
 
@@ -152,7 +171,10 @@ def as_json(summary: Summary) -> dict[str, Any]:
         **asdict(summary.monitor),
         **asdict(summary.stream),
         "stretches": [asdict(one) for one in summary.story.stretches],
-        "episodes": [{**asdict(one), "duration_s": one.duration_s} for one in summary.story.episodes],
+        "episodes": [
+            {**asdict(one), "duration_s": one.duration_s}
+            for one in summary.story.episodes
+        ],
         "more_episodes": summary.story.more,
         "autopilot": list(map(asdict, summary.autopilot)),
         "seconds": summary.seconds,

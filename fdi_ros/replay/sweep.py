@@ -53,7 +53,9 @@ class Swept:
     @property
     def size(self) -> float | None:
         """Its size; None: the kind has none."""
-        return next((float(value) for name, value in self.items if name == "size"), None)
+        return next(
+            (float(value) for name, value in self.items if name == "size"), None
+        )
 
     @property
     def unit(self) -> str:
@@ -64,7 +66,12 @@ class Swept:
     @property
     def family(self) -> str:
         """What it shares with the same fault in other sizes."""
-        return " ".join([self.kind, *(f"{name}={value}" for name, value in self.items if name != "size")])
+        return " ".join(
+            [
+                self.kind,
+                *(f"{name}={value}" for name, value in self.items if name != "size"),
+            ]
+        )
 
     @property
     def words(self) -> str:
@@ -74,7 +81,12 @@ class Swept:
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
         """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
-        items: dict[str, object] = {"channel": channel, "kind": self.kind, "start": start, "seed": seed}
+        items: dict[str, object] = {
+            "channel": channel,
+            "kind": self.kind,
+            "start": start,
+            "seed": seed,
+        }
         items |= dict(self.items)
         if self.size is not None and FAULT_KINDS[self.kind].has_signed_size():
             items["size"] = sign * self.size
@@ -87,17 +99,30 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     `FaultError` if it is not of that form, or a number does not fit its kind.
     """
     items = key_values(text)
-    if chosen := [name for name in items if name in ("channel", "start", "stop", "seed")]:
+    if chosen := [
+        name for name in items if name in ("channel", "start", "stop", "seed")
+    ]:
         raise FaultError(f"fault {text!r}: {chosen[0]} is chosen by the sweep")
     kind = items.pop("kind", "")
     if kind in FAULT_KINDS and FAULT_KINDS[kind].whole_unit:
-        raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
+        raise FaultError(
+            f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time"
+        )
     sizes = items.pop("size", "").split(",")
-    found = tuple(Swept(kind, (*([("size", size)] if size else []), *items.items())) for size in dict.fromkeys(sizes))
+    found = tuple(
+        Swept(kind, (*([("size", size)] if size else []), *items.items()))
+        for size in dict.fromkeys(sizes)
+    )
     for one in found:
         fault_from({"channel": "any", "kind": kind, **dict(one.items)})
-        if one.size is not None and one.size < 0 and FAULT_KINDS[kind].has_signed_size():
-            raise FaultError(f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn")
+        if (
+            one.size is not None
+            and one.size < 0
+            and FAULT_KINDS[kind].has_signed_size()
+        ):
+            raise FaultError(
+                f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn"
+            )
     return tuple(sorted(found, key=lambda one: one.size or 0.0))
 
 
@@ -120,7 +145,9 @@ class Baseline:
 
     judgement: Judgement
     judged: float  # share of the samples
-    doubtful: Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
+    doubtful: (
+        Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
+    )
     speed: Array  # (N,) fused rate, rad/s; NaN: none.
     begins: float  # when it first judges, s; NaN: never.
     duration: float  # from the first sample to the last, s
@@ -147,19 +174,34 @@ class Baseline:
 def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
     """Judge a recording as it is; `BagError` if there is not a single sample."""
     if not len(block):
-        raise BagError("its topics have no time in common: there is no sample of all channels")
+        raise BagError(
+            "its topics have no time in common: there is no sample of all channels"
+        )
 
     def what_counts(output: Output) -> tuple[Mask, Mask, Array]:
         doubtful = np.asarray(np.isin(output.state, STANDING).any(axis=1))
-        return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
+        return (
+            np.isfinite(output.threshold),
+            doubtful,
+            np.asarray(np.linalg.norm(output.rate, axis=1)),
+        )
 
     kept = Kept(what_counts)
-    judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
+    judge = Judge(
+        pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept]
+    )
     judge.take(block)
     judged, doubtful, speed = kept.columns
     seconds = _seconds(block)
     begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
-    return Baseline(judge.judgement(), float(judged.mean()), doubtful, speed, begins, float(seconds[-1]))
+    return Baseline(
+        judge.judgement(),
+        float(judged.mean()),
+        doubtful,
+        speed,
+        begins,
+        float(seconds[-1]),
+    )
 
 
 def _seconds(block: Block) -> Array:
@@ -185,7 +227,9 @@ class Onset:
     at: float  # s from the first sample
     origin: int  # stamp of the first sample, ns
     core: NDArray[Any]  # (1,) `fdi_ros.core.records.Core`
-    states: dict[int, NDArray[Any]]  # memory of the detector for each set of channels, by its bits
+    states: dict[
+        int, NDArray[Any]
+    ]  # memory of the detector for each set of channels, by its bits
     block: Block  # samples from some before the onset to the end of the watch
     row: int  # first sample of these that is faulty
 
@@ -201,7 +245,11 @@ class Trial:
 
 
 def onsets_of(
-    pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
+    pipeline: Pipeline,
+    block: Block,
+    times: Sequence[float],
+    watch: float,
+    lead: int = LEAD,
 ) -> Iterator[Onset]:
     """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
     walk, detector, done = Walk(pipeline), pipeline.detector, 0
@@ -210,7 +258,10 @@ def onsets_of(
         walk.take(block[done : rows.start])
         done, first = rows.start, max(0, rows.start - lead)
         own = detector.bank["row"][0]
-        states = {int(mask): detector.states[own[mask]].copy() for mask in np.flatnonzero(own >= 0)}
+        states = {
+            int(mask): detector.states[own[mask]].copy()
+            for mask in np.flatnonzero(own >= 0)
+        }
         part, row = block[first : rows.stop], rows.start - first
         yield Onset(at, int(block.stamp[0]), pipeline.core.copy(), states, part, row)
 
@@ -222,12 +273,16 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
     """
     detector = pipeline.detector
     # Sets that were met later are as if they had just been prepared.
-    detector.states[: int(detector.bank["rows"][0])] = np.zeros((), dtype=detector.states.dtype)
+    detector.states[: int(detector.bank["rows"][0])] = np.zeros(
+        (), dtype=detector.states.dtype
+    )
     for mask, state in onset.states.items():
         detector.prepare(mask)
         detector.states[int(detector.bank["row"][0, mask])] = state
     pipeline.core[:] = onset.core
-    injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
+    injected = Injector([fault], pipeline.channel_names, onset.origin).apply(
+        onset.block
+    )
     return pipeline.process(injected[onset.row :])
 
 
@@ -236,14 +291,28 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
     pipeline = monitor_of(config)
     name, stamp = pipeline.channel_names[channel], onset.block.stamp[onset.row :]
     # From the first faulty sample: before it there is nothing to be found.
-    since, start = np.asarray((stamp - stamp[0]) * 1e-9), float((stamp[0] - onset.origin) * 1e-9)
+    since, start = (
+        np.asarray((stamp - stamp[0]) * 1e-9),
+        float((stamp[0] - onset.origin) * 1e-9),
+    )
     trials = []
     for swept in plan.faults:
-        rng = np.random.default_rng([plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())])
+        rng = np.random.default_rng(
+            [plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())]
+        )
         # One sign and one seed for all sizes: then the sizes alone differ.
-        fault = swept.fault(name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31)))
+        fault = swept.fault(
+            name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
+        )
         output = judged_with(pipeline, onset, fault)
-        trials.append(Trial(channel, swept, fault, score(*standing(output), channel, since, plan.within)))
+        trials.append(
+            Trial(
+                channel,
+                swept,
+                fault,
+                score(*standing(output), channel, since, plan.within),
+            )
+        )
     return trials
 
 
@@ -263,23 +332,34 @@ class Subject:
     name: str
     config: Config
     block: Block
-    channels: tuple[str, ...] = ()  # names of all channels; those excluded are tried with no fault
+    channels: tuple[
+        str, ...
+    ] = ()  # names of all channels; those excluded are tried with no fault
     baseline: Baseline | None = None  # none: the monitor does not run
     refused: str = ""  # why it does not run, or judges nothing; empty: it does
     times: tuple[float, ...] = ()  # at which faults began, s
     skipped: tuple[float, ...] = ()
     """At which none did, as something stands declared without one, or a channel gives nothing, s."""
-    speeds: tuple[float, ...] = ()  # largest fused rate while the faults of each time are watched, rad/s; 0: none
+    speeds: tuple[
+        float, ...
+    ] = ()  # largest fused rate while the faults of each time are watched, rad/s; 0: none
     trials: tuple[Trial, ...] = ()
 
     @property
     def used(self) -> tuple[int, ...]:
         """Channels that are tried."""
-        return tuple(i for i, name in enumerate(self.channels) if name not in self.config.excluded_channels)
+        return tuple(
+            i
+            for i, name in enumerate(self.channels)
+            if name not in self.config.excluded_channels
+        )
 
 
 def sweep(
-    subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
+    subjects: Sequence[Subject],
+    plan: Plan,
+    workers: int = 1,
+    progress: Callable[[float], None] | None = None,
 ) -> Sequence[Subject]:
     """Try every monitor, all with the same channels, with every fault of the plan, at the same times; return them.
 
@@ -288,20 +368,39 @@ def sweep(
     """
     for one in subjects:
         _watch(one)
-    baselines = [(one, one.baseline) for one in subjects if one.baseline is not None and not one.refused]
+    baselines = [
+        (one, one.baseline)
+        for one in subjects
+        if one.baseline is not None and not one.refused
+    ]
     if not baselines:
         raise FaultError(f"no fault can be tried: {subjects[0].refused}")
     times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
-    lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
+    lead = max(
+        [
+            LEAD,
+            *(
+                int(fault.size or 0) + 1
+                for fault in plan.faults
+                if fault.kind == "delay"
+            ),
+        ]
+    )
     owned: list[tuple[Subject, tuple[Config, Onset, int, Plan]]] = []
     for one, baseline in baselines:
         _take_times(one, baseline, times, plan.within)
         pipeline = monitor_of(one.config)
         pipeline.restart()
         onsets = onsets_of(pipeline, one.block, one.times, plan.within, lead)
-        owned += [(one, (one.config, onset, channel, plan)) for onset in onsets for channel in one.used]
+        owned += [
+            (one, (one.config, onset, channel, plan))
+            for onset in onsets
+            for channel in one.used
+        ]
     found: dict[int, list[Trial]] = {}
-    for done, (k, trials) in enumerate(run_jobs(try_faults, [job for _, job in owned], workers, None), 1):
+    for done, (k, trials) in enumerate(
+        run_jobs(try_faults, [job for _, job in owned], workers, None), 1
+    ):
         found[k] = trials
         if progress is not None:
             progress(done / len(owned))
@@ -317,7 +416,11 @@ def _watch(one: Subject) -> None:
         pipeline = monitor_of(one.config)
         pipeline.restart()
         one.baseline = watch_baseline(pipeline, one.block)
-        one.refused = "" if one.baseline.judged else f"it judges nothing of this recording: {one.baseline.note}"
+        one.refused = (
+            ""
+            if one.baseline.judged
+            else f"it judges nothing of this recording: {one.baseline.note}"
+        )
     except FdiError as error:
         one.refused = str(error)
 
@@ -327,13 +430,23 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
 
     `FaultError` if that is too short to watch a fault.
     """
-    begins, end = max(one.begins for one in baselines), min(one.duration for one in baselines)
+    begins, end = (
+        max(one.begins for one in baselines),
+        min(one.duration for one in baselines),
+    )
     seconds = _seconds(block)
-    spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
+    spans = (
+        (float(seconds[rows.start]), float(seconds[rows.stop - 1]))
+        for rows in pieces(block.stamp)
+    )
     windows = [(max(low, begins), min(high, end) - plan.within) for low, high in spans]
     windows = [(low, high) for low, high in windows if high > low]
     if not windows:
-        gaps = ", in no piece of it without a gap long enough" if end - begins > plan.within else ": too short"
+        gaps = (
+            ", in no piece of it without a gap long enough"
+            if end - begins > plan.within
+            else ": too short"
+        )
         raise FaultError(
             f"the recording is judged from {begins:.1f} s to {end:.1f} s{gaps} to watch a fault for"
             f" {plan.within:g} s (within)"
@@ -346,7 +459,9 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
     return np.asarray(low[place] + (after - (ends - (high - low))[place])).tolist()
 
 
-def _take_times(one: Subject, baseline: Baseline, times: Sequence[float], within: float) -> None:
+def _take_times(
+    one: Subject, baseline: Baseline, times: Sequence[float], within: float
+) -> None:
     """Take the times at which nothing stands declared, nothing injected, and no sample is missing."""
     for at in times:
         rows = _rows_at(one.block, at, within)

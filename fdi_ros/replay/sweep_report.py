@@ -17,7 +17,16 @@ import numpy as np
 from fdi_ros.replay.episodes import episode_words
 from fdi_ros.replay.outcomes import Estimate, OutcomeKind, share
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, Swept
-from fdi_ros.report.layout import PALETTE, Columns, Figure, Section, head_and_rows, number, page, section_text
+from fdi_ros.report.layout import (
+    PALETTE,
+    Columns,
+    Figure,
+    Section,
+    head_and_rows,
+    number,
+    page,
+    section_text,
+)
 
 WANTED = 0.95  # share of the faults of a size that is to be found for the size to count as found
 NOT_ORDERED = ("saturation",)  # kinds of which a larger size is no larger fault
@@ -42,7 +51,9 @@ class Line:
 
     def count(self, named: bool) -> int:
         """Trials in which the channel was named; otherwise also those in which it was in a set."""
-        return self.counts[OutcomeKind.ISOLATED] + (0 if named else self.counts[OutcomeKind.AMBIGUOUS])
+        return self.counts[OutcomeKind.ISOLATED] + (
+            0 if named else self.counts[OutcomeKind.AMBIGUOUS]
+        )
 
     @property
     def isolated(self) -> Estimate:
@@ -57,19 +68,38 @@ class Line:
     @property
     def false(self) -> int:
         """Trials in which a channel without a fault was declared, or a set without the faulty one."""
-        return self.counts[OutcomeKind.FALSE_ISOLATION] + self.counts[OutcomeKind.FALSE_GROUP]
+        return (
+            self.counts[OutcomeKind.FALSE_ISOLATION]
+            + self.counts[OutcomeKind.FALSE_GROUP]
+        )
 
 
 def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Line]:
     """Sum up by kind and size, over all channels or of one."""
     lines = []
     for swept in plan.faults:
-        scored = [one.scored for one in tried.trials if one.swept == swept and channel in (None, one.channel)]
-        counts = {str(kind.value): sum(one.outcome is kind for one in scored) for kind in OutcomeKind}
+        scored = [
+            one.scored
+            for one in tried.trials
+            if one.swept == swept and channel in (None, one.channel)
+        ]
+        counts = {
+            str(kind.value): sum(one.outcome is kind for one in scored)
+            for kind in OutcomeKind
+        }
         # A fault that went with a false isolation was not found in any useful way.
-        good = [one for one in scored if one.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)]
-        named, found = [one.isolated_after for one in good], [one.detected_after for one in good]
-        delays = (_quantiles(after, len(scored), plan.within) for after in (named, found))
+        good = [
+            one
+            for one in scored
+            if one.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)
+        ]
+        named, found = (
+            [one.isolated_after for one in good],
+            [one.detected_after for one in good],
+        )
+        delays = (
+            _quantiles(after, len(scored), plan.within) for after in (named, found)
+        )
         lines.append(Line(swept, len(scored), counts, *delays))
     return lines
 
@@ -86,14 +116,21 @@ def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     """For each kind with sizes: the smallest from which on this size and all larger ones are found, or named."""
     found = {family: _smallest(own, named) for family, own in _families(lines).items()}
-    return {family: None if line is None else line.swept.size for family, line in found.items()}
+    return {
+        family: None if line is None else line.swept.size
+        for family, line in found.items()
+    }
 
 
 def _families(lines: Sequence[Line]) -> dict[str, list[Line]]:
     """Lines of each kind of which a larger size is a larger fault, in the order of size."""
     families: dict[str, list[Line]] = {}
     for line in lines:
-        if line.swept.size is not None and line.swept.kind not in NOT_ORDERED and line.trials:
+        if (
+            line.swept.size is not None
+            and line.swept.kind not in NOT_ORDERED
+            and line.trials
+        ):
             families.setdefault(line.swept.family, []).append(line)
     return families
 
@@ -110,7 +147,13 @@ def _smallest(lines: Sequence[Line], named: bool) -> Line | None:
 def sweep_figures(results: Sequence[Subject], plan: Plan, bag: str) -> dict[str, Any]:
     """Return all figures of a sweep: what its JSON file holds."""
     monitors = [_monitor_figures(tried, plan) for tried in results]
-    return {"bag": bag, "within_s": plan.within, "times": plan.times, "seed": plan.seed, "monitors": monitors}
+    return {
+        "bag": bag,
+        "within_s": plan.within,
+        "times": plan.times,
+        "seed": plan.seed,
+        "monitors": monitors,
+    }
 
 
 def _monitor_figures(tried: Subject, plan: Plan) -> dict[str, Any]:
@@ -129,16 +172,25 @@ def _monitor_figures(tried: Subject, plan: Plan) -> dict[str, Any]:
         },
         "times_s": tried.times,
         "times_left_out_s": tried.skipped,
-        "smallest": {"named": smallest(lines, named=True), "found": smallest(lines, named=False)},
+        "smallest": {
+            "named": smallest(lines, named=True),
+            "found": smallest(lines, named=False),
+        },
         "faults": list(map(_line_figures, lines)),
-        "channels": {tried.channels[i]: list(map(_line_figures, lines_of(tried, plan, i))) for i in tried.used},
+        "channels": {
+            tried.channels[i]: list(map(_line_figures, lines_of(tried, plan, i)))
+            for i in tried.used
+        },
     }
 
 
 def declared_figures(baseline: Baseline | None) -> list[dict[str, object]]:
     """Return what was declared of a recording as it is."""
     declared = [] if baseline is None else baseline.declared
-    return [{"at_s": one.at_s, "channel": one.channel, "state": one.state} for one in declared]
+    return [
+        {"at_s": one.at_s, "channel": one.channel, "state": one.state}
+        for one in declared
+    ]
 
 
 def _line_figures(line: Line) -> dict[str, Any]:
@@ -158,14 +210,35 @@ def _line_figures(line: Line) -> dict[str, Any]:
 def write_csv(file: IO[str], results: Iterable[Subject], plan: Plan) -> None:
     """Write one line for every fault."""
     writer = csv.writer(file)
-    head = ("monitor", "channel", "kind", "size", "fault", "at_s", "outcome", "named_after_s", "found_after_s")
+    head = (
+        "monitor",
+        "channel",
+        "kind",
+        "size",
+        "fault",
+        "at_s",
+        "outcome",
+        "named_after_s",
+        "found_after_s",
+    )
     writer.writerow(head)
     for tried in results:
         for trial in tried.trials:
             size = "" if trial.fault.size is None else f"{trial.fault.size:g}"
-            what = tried.name, tried.channels[trial.channel], trial.swept.kind, size, trial.swept.words
-            after = ["" if math.isinf(value) else f"{value:.6f}" for value in trial.scored[1:]]
-            writer.writerow((*what, f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after))
+            what = (
+                tried.name,
+                tried.channels[trial.channel],
+                trial.swept.kind,
+                size,
+                trial.swept.words,
+            )
+            after = [
+                "" if math.isinf(value) else f"{value:.6f}"
+                for value in trial.scored[1:]
+            ]
+            writer.writerow(
+                (*what, f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after)
+            )
 
 
 # In words and tables --------------------------------------------------------------------------------------------------
@@ -188,10 +261,16 @@ def figures_section(tried: Subject, plan: Plan) -> Section:
         "fault": lambda line: line.swept.words,
         "faults": lambda line: str(line.trials),
         "isolated": lambda line: number(line.isolated.value, ".0%"),
-        "95 % interval": lambda line: f"{line.isolated.low:.0%} to {line.isolated.high:.0%}" if line.trials else "-",
+        "95 % interval": lambda line: (
+            f"{line.isolated.low:.0%} to {line.isolated.high:.0%}"
+            if line.trials
+            else "-"
+        ),
         "detected": lambda line: number(line.detected.value, ".0%"),
         "false": lambda line: str(line.false) if line.trials else "-",
-        "missed": lambda line: number(share(line.counts[OutcomeKind.MISSED], line.trials).value, ".0%"),
+        "missed": lambda line: number(
+            share(line.counts[OutcomeKind.MISSED], line.trials).value, ".0%"
+        ),
         "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
         "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
     }
@@ -208,18 +287,28 @@ def sound_lines(tried: Subject) -> list[str]:
     words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
     lines = [f"{words}, from {baseline.begins:.1f} s on"]
     if told := baseline.judgement.story.declared:
-        more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
+        more = (
+            f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}"
+            if len(told) > 1
+            else ""
+        )
         doubt = "Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
-        lines = [f"declared, with nothing injected: {episode_words(told[0])}{more}. {doubt}"]
+        lines = [
+            f"declared, with nothing injected: {episode_words(told[0])}{more}. {doubt}"
+        ]
     if tried.skipped:
         at = ", ".join(f"{time:.1f} s" for time in tried.skipped)
         why = "something stands declared then without one, or a channel gives nothing"
         lines.append(f"no fault was injected at {at}: {why}")
     if not tried.times:
-        lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
+        lines.append(
+            "so no fault could be tried at all: mend the config, or name the channel in excluded_channels"
+        )
     lines += [f"as it is, {line}" for line in baseline.judgement.monitor.degraded]
     if tried.config.excluded_channels:
-        lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
+        lines.append(
+            f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}"
+        )
     return lines
 
 
@@ -229,15 +318,21 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         return []
     lines, words = lines_of(tried, plan), []
     for family, own in _families(lines).items():
-        words.append(f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}")
+        words.append(
+            f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}"
+        )
     for line in [line for line in lines if line.swept.size is None]:
         shares = f"detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
         words.append(f"{line.swept.words}: {shares}")
     false = sum(line.false for line in lines)
-    words.append(f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults")
+    words.append(
+        f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults"
+    )
     # At rest small faults are found that are lost in flight.
     moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
-    motion = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
+    motion = (
+        f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
+    )
     rest = ": these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
     return [*words, motion if 2 * moving >= times else motion + rest]
 
@@ -275,7 +370,10 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
     sections = _as_they_are(results, plan)
     sections += [figures_section(one, plan) for one in tried if len(results) == 1]
     hint = smallest_hint(plan)
-    sections += [Section(f"{one.name}, smallest faults", hint, verdict_lines(one, plan)) for one in tried]
+    sections += [
+        Section(f"{one.name}, smallest faults", hint, verdict_lines(one, plan))
+        for one in tried
+    ]
     sections.append(Section("Notes", "", HINTS))
     head = f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s\n"
     return "\n".join([head, *map(section_text, sections)])
@@ -283,10 +381,16 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
 
 def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
     """Tell of each monitor without a fault, and of all side by side with faults."""
-    sections = [Section(f"{one.name}, nothing injected", "", sound_lines(one)) for one in results]
+    sections = [
+        Section(f"{one.name}, nothing injected", "", sound_lines(one))
+        for one in results
+    ]
     lines = {one.name: lines_of(one, plan) for one in results if one.trials}
     if len(lines) > 1:
-        rows = [(swept.words, *(_in_short(own[k]) for own in lines.values())) for k, swept in enumerate(plan.faults)]
+        rows = [
+            (swept.words, *(_in_short(own[k]) for own in lines.values()))
+            for k, swept in enumerate(plan.faults)
+        ]
         sections.append(Section("Side by side", SHORT_HINT, (("fault", *lines), rows)))
     return sections
 
@@ -295,10 +399,14 @@ def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
 
 
 LEAST_SIZES = 3  # of a kind for a curve; the map and the table show fewer as well
-Curve = tuple[str, str, Callable[[Line], float]]  # name, dash and values of a line of a plot
+Curve = tuple[
+    str, str, Callable[[Line], float]
+]  # name, dash and values of a line of a plot
 
 
-def sweep_page(results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
+def sweep_page(
+    results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[str, str]
+) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
@@ -315,7 +423,12 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
         lines += [f"{before}nothing injected: {line}." for line in sound_lines(one)[:1]]
         verdict = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
-        lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
+        lines += [
+            f"{before}{line}."
+            for line in (
+                verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]]
+            )
+        ]
     return [*lines[:1], f"{smallest_hint(plan)}:", *lines[1:]]
 
 
@@ -333,19 +446,38 @@ def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:
         ("95 %", "dash", lambda line: line.found_after.p95),
     ]
     families, sections = Counter(swept.family for swept in plan.faults), []
-    for family in [name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried]:
-        own = {one.name: [line for line in lines_of(one, plan) if line.swept.family == family] for one in tried}
+    for family in [
+        name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried
+    ]:
+        own = {
+            one.name: [
+                line for line in lines_of(one, plan) if line.swept.family == family
+            ]
+            for one in tried
+        }
         hint = "Solid: isolated; dashed: detected; dotted: 95 % interval of the share isolated (Wilson 1927)."
         axis = {"title": {"text": "share of the faults, %"}, "range": [-3, 103]}
-        sections.append(Section(f"{family}: share detected", hint, "", [_figure(own, shares, axis)]))
-        if any(np.isfinite(line.found_after.median) for lines in own.values() for line in lines):
+        sections.append(
+            Section(f"{family}: share detected", hint, "", [_figure(own, shares, axis)])
+        )
+        if any(
+            np.isfinite(line.found_after.median)
+            for lines in own.values()
+            for line in lines
+        ):
             hint = "Until it was detected; solid: half of all faults were, dashed: 95 %. No point: fewer were."
-            figure = _figure(own, delays, {"title": {"text": "delay, s"}, "type": "log"})
+            figure = _figure(
+                own, delays, {"title": {"text": "delay, s"}, "type": "log"}
+            )
             sections.append(Section(f"{family}: delay", hint, "", [figure]))
     return sections
 
 
-def _figure(monitors: Mapping[str, Sequence[Line]], curves: Sequence[Curve], yaxis: dict[str, Any]) -> Figure:
+def _figure(
+    monitors: Mapping[str, Sequence[Line]],
+    curves: Sequence[Curve],
+    yaxis: dict[str, Any],
+) -> Figure:
     """Draw the curves of each monitor against the size of the faults."""
     alone, unit = len(monitors) == 1, next(iter(monitors.values()))[0].swept.unit
     data = [
@@ -369,7 +501,12 @@ def _map(one: Subject, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
-    names, words = [one.channels[channel] for channel in one.used], [line.swept.words for line in rows[0]]
+    names, words = (
+        [one.channels[channel] for channel in one.used],
+        [line.swept.words for line in rows[0]],
+    )
     heat = {"type": "heatmap", "z": found, "x": words, "y": names}
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(f"{one.name}, every channel", hint, "", [{"data": [heat], "layout": {}}])
+    return Section(
+        f"{one.name}, every channel", hint, "", [{"data": [heat], "layout": {}}]
+    )

@@ -21,7 +21,14 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.replay.episodes import MOST_TOLD, Episode, Story, detail_words, episode_words, stretch_words
+from fdi_ros.replay.episodes import (
+    MOST_TOLD,
+    Episode,
+    Story,
+    detail_words,
+    episode_words,
+    stretch_words,
+)
 from fdi_ros.replay.outcomes import UNCHECKED_STATES, Outcome, Scores
 from fdi_ros.replay.summary import ChannelResult, Judgement, SampleRate, Summary
 from fdi_ros.report.layout import (
@@ -39,7 +46,9 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.system.text import shown
 
-MOSTLY_JUDGED = 0.5  # share of the samples that must have been judged for a replay to say something
+MOSTLY_JUDGED = (
+    0.5  # share of the samples that must have been judged for a replay to say something
+)
 LONGEST_UNCHECKED = 0.5
 """Share of a recording that a channel may be unchecked for without a break where the recording is called healthy."""
 LASTING = 1.0  # what a channel does at the end for less, s, is not told: recordings end with the power
@@ -64,7 +73,9 @@ def _faulty(summary: Summary) -> list[Episode]:
     silent = [
         one
         for one in summary.story.episodes
-        if one.stands and one.duration_s >= LASTING and one.evidence.reason == Reason.NO_DATA.value
+        if one.stands
+        and one.duration_s >= LASTING
+        and one.evidence.reason == Reason.NO_DATA.value
     ]
     declared = sorted(summary.story.declared, key=lambda one: one.state != "FAULTY")
     return [*declared, *(one for one in silent if not one.declares)]
@@ -72,7 +83,11 @@ def _faulty(summary: Summary) -> list[Episode]:
 
 def _without_state(one: Episode, unit: Unit) -> str:
     """Tell of an episode behind the word FAULTY."""
-    untold = ", which of them cannot be told," if len(one.channels) > 1 else ", to be confirmed,"
+    untold = (
+        ", which of them cannot be told,"
+        if len(one.channels) > 1
+        else ", to be confirmed,"
+    )
     state = {"FAULTY": "", "AMBIGUOUS": untold, "STALE": " silent"}[one.state]
     return episode_words(one, unit).replace(f" {one.state} from", f"{state} from", 1)
 
@@ -82,15 +97,23 @@ def _verdict_on_faults(summary: Summary) -> Verdict:
     faults, isolated = summary.scores.faults, summary.scores.isolated
     detected = sum(fault.detected_at_s is not None for fault in faults)
     plural = "fault" if len(faults) == 1 else "faults"
-    words = f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated."
-    if _wrongly_named(summary) or any(not one.injected for one in summary.story.declared):
+    words = (
+        f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated."
+    )
+    if _wrongly_named(summary) or any(
+        not one.injected for one in summary.story.declared
+    ):
         return Verdict(Severity.BAD, words)
-    return Verdict(Severity.GOOD if isolated == len(faults) else Severity.UNKNOWN, words)
+    return Verdict(
+        Severity.GOOD if isolated == len(faults) else Severity.UNKNOWN, words
+    )
 
 
 def _wrongly_named(summary: Summary) -> list[str]:
     """Return the channels that are declared faulty by themselves and that no injected fault strikes."""
-    faulty = dict.fromkeys(one.channel for one in summary.scores.declared if one.state == "FAULTY")
+    faulty = dict.fromkeys(
+        one.channel for one in summary.scores.declared if one.state == "FAULTY"
+    )
     return [name for name in faulty if name not in summary.scores.struck]
 
 
@@ -102,7 +125,9 @@ def _untold(summary: Summary) -> str:
     if judged < MOSTLY_JUDGED * samples:
         return f"only {100 * judged / samples:.1f} % of {samples} samples were judged"
     if longest := _unchecked_longest(summary):
-        words = ", ".join(f"{name} for {seconds:.1f} s" for name, seconds in longest.items())
+        words = ", ".join(
+            f"{name} for {seconds:.1f} s" for name, seconds in longest.items()
+        )
         return f"not checked without a break, of {summary.scores.duration_s:.1f} s: {words}"
     if far := summary.monitor.bias.far:
         return f"{', '.join(far)} began with a bias far beyond bias.turn_on_std, as after a fault before the start"
@@ -114,9 +139,16 @@ def _unchecked_longest(summary: Summary) -> dict[str, float]:
     scores, found = summary.scores, {}
     for channel in summary.monitor.channels:
         changes = [one for one in scores.events if one.channel == channel.name]
-        states = [changes[0].before if changes else channel.state, *(one.state for one in changes)]
+        states = [
+            changes[0].before if changes else channel.state,
+            *(one.state for one in changes),
+        ]
         edges = pairwise([scores.start_s, *(one.at_s for one in changes), scores.end_s])
-        spans = [b - a for state, (a, b) in zip(states, edges, strict=True) if state in UNCHECKED_STATES]
+        spans = [
+            b - a
+            for state, (a, b) in zip(states, edges, strict=True)
+            if state in UNCHECKED_STATES
+        ]
         if max(spans, default=0.0) > LONGEST_UNCHECKED * scores.duration_s:
             found[channel.name] = max(spans)
     return found
@@ -125,20 +157,35 @@ def _unchecked_longest(summary: Summary) -> dict[str, float]:
 def _healthy_words(summary: Summary) -> str:
     channels, end = summary.monitor.channels, _unchecked_at_the_end(summary)
     checked = 1.0 - max((one.unchecked for one in channels), default=0.0)
-    share = "all checked" if checked > 0.995 else f"each checked in {checked:.0%} of the samples or more"
+    share = (
+        "all checked"
+        if checked > 0.995
+        else f"each checked in {checked:.0%} of the samples or more"
+    )
     more = f"; at the end not checked: {end}" if end else ""
     return f"no fault declared in {summary.scores.duration_s:.1f} s; {len(channels)} channels, {share}{more}"
 
 
 def _unchecked_at_the_end(summary: Summary) -> str:
     end, unchecked = summary.scores.end_s, summary.unchecked_channels
-    return _unchecked_words([one for one in unchecked if one.since_s is not None and end - one.since_s >= LASTING])
+    return _unchecked_words(
+        [
+            one
+            for one in unchecked
+            if one.since_s is not None and end - one.since_s >= LASTING
+        ]
+    )
 
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
     """Return what stands below the verdict."""
-    faults = sorted(summary.scores.faults, key=lambda fault: fault.detected_at_s is None)
-    lines = [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in faults]
+    faults = sorted(
+        summary.scores.faults, key=lambda fault: fault.detected_at_s is None
+    )
+    lines = [
+        f"{fault.kind} on {fault.channel}: {_detection_words(fault)}."
+        for fault in faults
+    ]
     return [*lines, *_episode_lines(summary, unit), *noisy_lines(summary, unit)]
 
 
@@ -146,10 +193,14 @@ def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
     """Tell of channels that are much noisier than the others."""
     # What is wrong already is said.
     channels = () if judgement.story.declared else judgement.monitor.channels
-    rms = {one.name: one.residual_rms_rad_s for one in channels if one.residual_rms_rad_s}
+    rms = {
+        one.name: one.residual_rms_rad_s for one in channels if one.residual_rms_rad_s
+    }
     lines = []
     for name, size in rms.items():
-        others = statistics.median([value for other, value in rms.items() if other != name] or [size])
+        others = statistics.median(
+            [value for other, value in rms.items() if other != name] or [size]
+        )
         if size > NOISIER * others:
             theirs, own = (f"{value * unit.factor:.2g}" for value in (others, size))
             lines.append(
@@ -167,9 +218,15 @@ def _unchecked_words(channels: Sequence[ChannelResult]) -> str:
     words = []
     for (state, reason), group in alike.items():
         since = sorted({one.since_s or 0.0 for one in group})
-        when = f"from {since[0]:.3f} to {since[-1]:.3f} s on" if len(since) > 1 else f"from {since[0]:.3f} s on"
+        when = (
+            f"from {since[0]:.3f} to {since[-1]:.3f} s on"
+            if len(since) > 1
+            else f"from {since[0]:.3f} s on"
+        )
         when = when if since[-1] else "from the start"
-        words.append(f"{', '.join(one.name for one in group)} {state} {when}{f' ({reason})' if reason else ''}")
+        words.append(
+            f"{', '.join(one.name for one in group)} {state} {when}{f' ({reason})' if reason else ''}"
+        )
     return "; ".join(words)
 
 
@@ -177,21 +234,36 @@ def notes(summary: Summary) -> list[str]:
     """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
     stream, scores = summary.stream, summary.scores
     lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
-    lines += [f"{count} malformed messages on {topic}" for topic, count in stream.malformed.items() if count]
+    lines += [
+        f"{count} malformed messages on {topic}"
+        for topic, count in stream.malformed.items()
+        if count
+    ]
     if stream.disordered:
-        lines.append(f"{stream.disordered} messages left out: recorded after later ones")
+        lines.append(
+            f"{stream.disordered} messages left out: recorded after later ones"
+        )
     for topic, counters in stream.alignment.items():
-        odd = ", ".join(f"{ODD.get(name, name)} ({n})" for name, n in counters.items() if n and name != "received")
+        odd = ", ".join(
+            f"{ODD.get(name, name)} ({n})"
+            for name, n in counters.items()
+            if n and name != "received"
+        )
         lines += [f"{topic}: {odd}"] if odd else []
     if missing := scores.samples - scores.samples_with_rate:
-        lines.append(f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}")
+        lines.append(
+            f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}"
+        )
     lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
 
 def sample_rate_notes(rate: SampleRate) -> list[str]:
     """Say so where the configured sample rate is not that of the recording."""
-    if rate.recorded_hz is None or abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:
+    if (
+        rate.recorded_hz is None
+        or abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE
+    ):
         return []
     return [
         f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has {rate.recorded_hz:.4g} Hz: the"
@@ -202,7 +274,11 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
 def _detection_words(fault: Outcome) -> str:
     """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
     if fault.detected_at_s is None:
-        return "its channels had been declared before" if fault.declared_before else "not detected"
+        return (
+            "its channels had been declared before"
+            if fault.declared_before
+            else "not detected"
+        )
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
         return f"{words}, isolated"
@@ -210,7 +286,11 @@ def _detection_words(fault: Outcome) -> str:
         words += f" as one of {', '.join(fault.declared_channels)}"
     elif len(fault.channels) > 1:
         words += f", declared: {', '.join(fault.declared_channels)}"
-    return f"{words}, isolated after {_time(fault.isolation_delay_s)}" if fault.isolated else f"{words}, not isolated"
+    return (
+        f"{words}, isolated after {_time(fault.isolation_delay_s)}"
+        if fault.isolated
+        else f"{words}, not isolated"
+    )
 
 
 def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
@@ -219,13 +299,23 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
     told = [one for one in story.declared if not one.injected]
     if not scores.faults:
         # What was declared, and that a healthy one was not checked at the end, the verdict says.
-        lost = "" if verdict(summary).severity is Severity.GOOD else _unchecked_at_the_end(summary)
+        lost = (
+            ""
+            if verdict(summary).severity is Severity.GOOD
+            else _unchecked_at_the_end(summary)
+        )
         return [f"At the end not checked: {lost}."] if lost else []
     if told:
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
         first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
-        stretches = [f"stretch {one.stretch}: " if len(story.stretches) > 1 else "" for one in told[:MOST_TOLD]]
-        lines = [f"{where}{episode_words(one, unit)}." for where, one in zip(stretches, told, strict=False)]
+        stretches = [
+            f"stretch {one.stretch}: " if len(story.stretches) > 1 else ""
+            for one in told[:MOST_TOLD]
+        ]
+        lines = [
+            f"{where}{episode_words(one, unit)}."
+            for where, one in zip(stretches, told, strict=False)
+        ]
         if more := len(told[MOST_TOLD:]) + story.more:
             lines.append(f"And {more} more episode{'s' if more > 1 else ''}.")
         return [f"{count} that no injected fault explains{first}:", *lines]
@@ -233,10 +323,14 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
         return [f"Declared faulty, and not struck by a fault: {', '.join(wrong)}."]
     if why := _untold(summary):
         return [f"Of the others it cannot be told: {why}."]
-    doubted = dict.fromkeys(name for fault in scores.faults for name in fault.other_channels)
+    doubted = dict.fromkeys(
+        name for fault in scores.faults for name in fault.other_channels
+    )
     doubted = {name: None for name in doubted if name not in scores.struck}
     if doubted:
-        return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
+        return [
+            f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."
+        ]
     return ["No other channel was declared faulty."]
 
 
@@ -257,7 +351,10 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
     scores = summary.scores
     rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
     parts = [
-        *(f"{line}\n" for line in (verdict(summary, unit).words, *sentences(summary, unit))),
+        *(
+            f"{line}\n"
+            for line in (verdict(summary, unit).words, *sentences(summary, unit))
+        ),
         f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
         f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
         _episodes(summary.story, bool(scores.faults), unit),
@@ -280,25 +377,36 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
         "detected": _detected,
         "delay": lambda fault: milliseconds(fault.delay_s),
         "as": lambda fault: fault.detected_as or "-",
-        "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        "isolated after": lambda fault: (
+            milliseconds(fault.isolation_delay_s) if fault.isolated else "no"
+        ),
         "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
     effect = scores.fault_effect_rad_s
     rows = [
         ("fused rate until detection", unit.words(effect.before_detection)),
         ("fused rate after it", unit.words(effect.after_detection)),
-        ("least squares of all channels, no monitor", unit.words(effect.without_monitor)),
+        (
+            "least squares of all channels, no monitor",
+            unit.words(effect.without_monitor),
+        ),
     ]
     hint = "Rms, against the same samples without the faults, saturated ones left out."
     return [
         Section("Injected faults", "", head_and_rows(columns, scores.faults)),
-        Section("Effect of the faults on the rate", hint, (("rate", "rms effect"), rows)),
+        Section(
+            "Effect of the faults on the rate", hint, (("rate", "rms effect"), rows)
+        ),
     ]
 
 
 def _detected(fault: Outcome) -> str:
     missed = "declared before" if fault.declared_before else "no"
-    return missed if fault.detected_at_s is None else number(fault.detected_at_s, unit=" s")
+    return (
+        missed
+        if fault.detected_at_s is None
+        else number(fault.detected_at_s, unit=" s")
+    )
 
 
 def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
@@ -318,7 +426,10 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     for place, one in enumerate(told, 1):
         where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
-        lines += [f"       {title}: {words}\n" for title, words in detail_words(one, unit, scored)]
+        lines += [
+            f"       {title}: {words}\n"
+            for title, words in detail_words(one, unit, scored)
+        ]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
 
@@ -338,14 +449,23 @@ _OF_FAULTS = {"detected": ("",), "delay": ("<", "<="), "isolated": ("", "<", "<=
 """Every injected fault is detected; it is, within so many seconds; it is isolated, or so within so many seconds."""
 _OF_ALL = {
     "false": ("<", "<=", "="),  # number of declarations that no injected fault explains
-    "declared": ("<", "<=", "="),  # number of episodes in which a fault was declared, injected or not
+    "declared": (
+        "<",
+        "<=",
+        "=",
+    ),  # number of episodes in which a fault was declared, injected or not
     "judged": (">", ">="),  # share of the samples that was judged
     "unchecked": ("<", "<=", "="),  # number of channels that end STALE or UNCHECKED
 }
-_FORMS = _OF_FAULTS | _OF_ALL  # how each quantity may be compared with a number; empty: it may stand without one
+_FORMS = (
+    _OF_FAULTS | _OF_ALL
+)  # how each quantity may be compared with a number; empty: it may stand without one
 CHANNEL_STATES = ("faulty", "ambiguous", "stale", "ok")
 """What a channel may be asked to have been: declared by itself, in a set, silent; or none of these."""
-_IMPLIED = (f"judged>={MOSTLY_JUDGED:g}", "unchecked=0")  # what must hold where nothing is said of it
+_IMPLIED = (
+    f"judged>={MOSTLY_JUDGED:g}",
+    "unchecked=0",
+)  # what must hold where nothing is said of it
 
 
 @dataclass(frozen=True)
@@ -356,28 +476,50 @@ class Condition:
     name: str  # of a quantity, or of a state of channels
     sign: str = ""
     bound: float = math.nan
-    channels: tuple[str, ...] = ()  # that are asked for: one, or those of a unit; empty: it is about a quantity
+    channels: tuple[
+        str, ...
+    ] = ()  # that are asked for: one, or those of a unit; empty: it is about a quantity
 
     def reasons(self, judgement: Judgement) -> list[str]:
         """Return why it does not hold, one line per reason; empty: it does."""
         if self.channels:
-            return [f"{name}: {why}" for name in self.channels if (why := self._of_channel(name, judgement))]
+            return [
+                f"{name}: {why}"
+                for name in self.channels
+                if (why := self._of_channel(name, judgement))
+            ]
         if self.name in _OF_ALL:
             value, words = _measure(self.name, judgement)
             return [] if self._holds(value) else [words]
         if judgement.scores.faults:
-            return [why for fault in judgement.scores.faults if (why := self._of_fault(fault))]
+            return [
+                why
+                for fault in judgement.scores.faults
+                if (why := self._of_fault(fault))
+            ]
         told = judgement.story.declared
-        return [episode_words(one) for one in told if one.state != "FAULTY"] if told else ["nothing was declared"]
+        return (
+            [episode_words(one) for one in told if one.state != "FAULTY"]
+            if told
+            else ["nothing was declared"]
+        )
 
     def _holds(self, value: float) -> bool:
         return not self.sign or _COMPARED[self.sign](value, self.bound)
 
     def _of_fault(self, fault: Outcome) -> str:
         """Say why an injected fault does not fulfil it; empty: it does."""
-        named, when, done = f"{fault.kind} on {fault.channel}", fault.delay_s, "detected"
+        named, when, done = (
+            f"{fault.kind} on {fault.channel}",
+            fault.delay_s,
+            "detected",
+        )
         if when is None:
-            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
+            missed = (
+                "declared before it began: nothing was left to detect"
+                if fault.declared_before
+                else "not detected"
+            )
             return f"{named}: {missed}"
         if self.name == "isolated":
             when, done = fault.isolation_delay_s, "isolated"
@@ -390,10 +532,18 @@ class Condition:
         episodes = judgement.story.episodes
         told = {one.state: one for one in episodes if channel in one.channels}
         if self.name == "ambiguous":
-            told |= {step.state: one for one in episodes for step in one.steps if channel in step.channels}
+            told |= {
+                step.state: one
+                for one in episodes
+                for step in one.steps
+                if channel in step.channels
+            }
         if not told if self.name == "ok" else self.name.upper() in told:
             return ""
-        return "; ".join(dict.fromkeys(map(episode_words, told.values()))) or "nothing was declared of it"
+        return (
+            "; ".join(dict.fromkeys(map(episode_words, told.values())))
+            or "nothing was declared of it"
+        )
 
 
 def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
@@ -401,17 +551,32 @@ def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
     scores, story = judgement.scores, judgement.story
     if name == "judged":
         share = scores.samples_judged / max(1, scores.samples)
-        return share, f"{scores.samples_judged} of {scores.samples} samples were judged, {share:.4f}"
+        return (
+            share,
+            f"{scores.samples_judged} of {scores.samples} samples were judged, {share:.4f}",
+        )
     if name == "unchecked":
         lost, total = judgement.unchecked_channels, len(judgement.monitor.channels)
-        return len(lost), f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{_unchecked_words(lost)}"
+        return (
+            len(lost),
+            f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{_unchecked_words(lost)}",
+        )
     if name == "declared":
-        count, told = len(story.declared) + story.more, "; ".join(map(episode_words, story.declared[:MOST_TOLD]))
+        count, told = (
+            len(story.declared) + story.more,
+            "; ".join(map(episode_words, story.declared[:MOST_TOLD])),
+        )
         which = f"episode{'s' if count != 1 else ''}"
     else:
         count, first = len(scores.declared), scores.declared[:MOST_TOLD]
-        told = "; ".join(f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in first)
-        which = "declarations that no injected fault explains" if scores.faults else "declarations, of channels"
+        told = "; ".join(
+            f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in first
+        )
+        which = (
+            "declarations that no injected fault explains"
+            if scores.faults
+            else "declarations, of channels"
+        )
     return count, f"{count} {which}{f': {told}' if told else ''}"
 
 
@@ -422,8 +587,14 @@ def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
     unchecked unless they say how many may.
     """
     named = {one.name for one in required}
-    implied = [one for one in map(_on_quantity, _IMPLIED) if required and one.name not in named]
-    return [f"{one.text}: {why}" for one in (*required, *implied) for why in one.reasons(judgement)]
+    implied = [
+        one for one in map(_on_quantity, _IMPLIED) if required and one.name not in named
+    ]
+    return [
+        f"{one.text}: {why}"
+        for one in (*required, *implied)
+        for why in one.reasons(judgement)
+    ]
 
 
 def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condition]:
@@ -434,15 +605,21 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
     """
     parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
     if not parts:
-        raise ConfigError(f"--check is empty, expected conditions on: {', '.join(_FORMS)}")
+        raise ConfigError(
+            f"--check is empty, expected conditions on: {', '.join(_FORMS)}"
+        )
     found: list[Condition] = []
     while parts:
         part = parts.pop(0)
         if parts and parts[0].lower() in CHANNEL_STATES:
             text = f"{part} {parts[0].lower()}"
-            meant = tuple(name for name in names if name == part or name.startswith(f"{part}."))
+            meant = tuple(
+                name for name in names if name == part or name.startswith(f"{part}.")
+            )
             if not meant:
-                raise ConfigError(f"--check: {text!r} names no channel, expected one of: {', '.join(names)}")
+                raise ConfigError(
+                    f"--check: {text!r} names no channel, expected one of: {', '.join(names)}"
+                )
             found.append(Condition(text, parts.pop(0).lower(), channels=meant))
             continue
         condition = _on_quantity(part)
@@ -460,9 +637,13 @@ def _on_quantity(part: str) -> Condition:
     assert match is not None
     name, sign, number = match[1], match[2] or "", match[3]
     if name not in _FORMS:
-        raise ConfigError(f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(_FORMS)}")
+        raise ConfigError(
+            f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(_FORMS)}"
+        )
     if sign not in _FORMS[name]:
-        expected = " or ".join(f"{name}{form}NUMBER" if form else name for form in _FORMS[name])
+        expected = " or ".join(
+            f"{name}{form}NUMBER" if form else name for form in _FORMS[name]
+        )
         what = f"is compared by {sign!r}" if sign else "has no bound"
         raise ConfigError(f"--check: {part!r} {what}, expected {expected}")
     if not sign:
@@ -472,9 +653,15 @@ def _on_quantity(part: str) -> Condition:
     except ValueError:
         bound = math.nan
     if not 0 <= bound < math.inf:
-        raise ConfigError(f"--check: {part!r} has the bound {number!r}, expected a number from 0 on")
+        raise ConfigError(
+            f"--check: {part!r} has the bound {number!r}, expected a number from 0 on"
+        )
     # No quantity is below 0, no share above 1, no count a fraction.
     most = 1.0 if name == "judged" else math.inf
-    if (sign, bound) in (("<", 0.0), (">", most)) or bound > most or (sign == "=" and bound % 1 != 0):
+    if (
+        (sign, bound) in (("<", 0.0), (">", most))
+        or bound > most
+        or (sign == "=" and bound % 1 != 0)
+    ):
         raise ConfigError(f"--check: {part!r} can never hold")
     return Condition(part, name, sign, bound)

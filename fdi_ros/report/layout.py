@@ -80,23 +80,31 @@ def unit_of(degrees: bool) -> Unit:
     return DEGREES if degrees else RADIANS
 
 
-Rows = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows of a table, as `table` and `html_table` take them
+Rows = tuple[
+    Sequence[str], Sequence[Sequence[str]]
+]  # head and rows of a table, as `table` and `html_table` take them
 Columns = Mapping[str, Callable[[Any], str]]
 """Columns of a table by their heads: what each says of that which a row is about."""
 
 
 def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
     """Lay out a row for each item."""
-    return tuple(columns), [tuple(say(item) for say in columns.values()) for item in items]
+    return tuple(columns), [
+        tuple(say(item) for say in columns.values()) for item in items
+    ]
 
 
 class Column(NamedTuple):
     """A figure of all that a table has rows of: by name for programs, in SI units, and in words for people."""
 
     name: str  #: empty: for people alone
-    values: Sequence[Any] | NDArray[Any]  #: one for each row; of several heads one for each of them
+    values: (
+        Sequence[Any] | NDArray[Any]
+    )  #: one for each row; of several heads one for each of them
     heads: Sequence[str] = ()  #: empty: for programs alone
-    say: str | Callable[[Any], str] = ""  #: words of a value, or the format that makes them
+    say: str | Callable[[Any], str] = (
+        ""  #: words of a value, or the format that makes them
+    )
     factor: float = 1.0  #: of what people are told over the SI unit
 
 
@@ -104,7 +112,9 @@ def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
     """Return a row for each item, for programs: its figures by name."""
     named = [column for column in columns if column.name]
     rows = zip(*(column.values for column in named), strict=True)
-    return [dict(zip((column.name for column in named), row, strict=True)) for row in rows]
+    return [
+        dict(zip((column.name for column in named), row, strict=True)) for row in rows
+    ]
 
 
 def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
@@ -112,12 +122,25 @@ def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
     shown_ones, cells = [column for column in columns if column.heads], []
     for column in shown_ones:
         say = column.say if callable(column.say) else f"{{:{column.say}}}".format
-        for values in zip(*column.values, strict=True) if len(column.heads) > 1 else [column.values]:
-            cells += [[say(value if column.factor == 1.0 else value * column.factor) for value in values]]
-    return tuple(unit.named(head) for column in shown_ones for head in column.heads), list(zip(*cells, strict=True))
+        for values in (
+            zip(*column.values, strict=True)
+            if len(column.heads) > 1
+            else [column.values]
+        ):
+            cells += [
+                [
+                    say(value if column.factor == 1.0 else value * column.factor)
+                    for value in values
+                ]
+            ]
+    return tuple(
+        unit.named(head) for column in shown_ones for head in column.heads
+    ), list(zip(*cells, strict=True))
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:
+def table(
+    head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True
+) -> list[str]:
     """Lay out lines of words in columns as wide as their widest entries; what a terminal would obey is escaped.
 
     ``figures``: the columns after the first hold figures, which end below each other. Else all hold words, which begin
@@ -126,7 +149,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = Tr
     most = LINE if figures else WORD
     lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    form = "  ".join(f"{{:{'>' if figures and k else '<'}{wide}}}" for k, wide in enumerate(width))
+    form = "  ".join(
+        f"{{:{'>' if figures and k else '<'}{wide}}}" for k, wide in enumerate(width)
+    )
     return [form.format(*line).rstrip() for line in lines]
 
 
@@ -135,9 +160,13 @@ def indented(lines: Iterable[str]) -> str:
     return "".join(f"  {line}\n" for line in lines)
 
 
-def first_of(words: Sequence[str], most: int, between: str = ", ", last: str = " and") -> str:
+def first_of(
+    words: Sequence[str], most: int, between: str = ", ", last: str = " and"
+) -> str:
     """Return the first of some words, and how many more there are."""
-    return between.join(words[:most]) + (f"{last} {len(words) - most} more" if len(words) > most else "")
+    return between.join(words[:most]) + (
+        f"{last} {len(words) - most} more" if len(words) > most else ""
+    )
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
@@ -150,15 +179,37 @@ def milliseconds(seconds: float | None) -> str:
     return "-" if seconds is None else f"{1000 * seconds:.1f} ms"
 
 
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
+PALETTE = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#8c564b",
+    "#7f7f7f",
+    "#b8a500",
+)
 """Colours that differ for colour-blind people too (after Okabe and Ito)."""
-CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")  # as many as there may be channels
+CHANNEL_COLOURS = (
+    *PALETTE,
+    "#9a4dff",
+    "#e20134",
+    "#00b4a0",
+)  # as many as there may be channels
 LONG = 24  # characters from which on the text of a cell may go on in a second line
 TERMINAL = 110  # characters in a line of sentences
 PAPER_ROWS = 60  # of a table, as page.css has it
 FEWEST_LINKED = 4  # sections from which on a page has a table of contents
 TIME_AXIS = "s from the first sample"
-_SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "table.js", "page.js")
+_SCRIPTS = (
+    "plot_data.js",
+    "plot_scale.js",
+    "plot_chart.js",
+    "plot_other.js",
+    "table.js",
+    "page.js",
+)
 
 
 Figure = dict[str, Any]
@@ -176,18 +227,32 @@ class Section:
     title: str
     hint: str = ""
     content: Content = ""
-    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)  #: each a `Figure`
+    figures: Sequence[Mapping[str, Any]] = field(
+        default_factory=tuple
+    )  #: each a `Figure`
 
 
 def section_lines(section: Section) -> list[str]:
     """Lay out a section for a terminal, without its plots; its content is a table or sentences."""
     lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
-    return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content or ["none"])]
+    return [
+        *lines,
+        *(
+            table(*section.content)
+            if isinstance(section.content, tuple)
+            else section.content or ["none"]
+        ),
+    ]
 
 
 def text_of(lines: Sequence[str], sections: Iterable[Section]) -> str:
     """Lay out lines, and sections below them, for a terminal."""
-    return "\n".join([*lines, *(line for section in sections for line in ("", *section_lines(section)))])
+    return "\n".join(
+        [
+            *lines,
+            *(line for section in sections for line in ("", *section_lines(section))),
+        ]
+    )
 
 
 def section_text(section: Section) -> str:
@@ -196,7 +261,9 @@ def section_text(section: Section) -> str:
     return f"{title}\n{indented(lines)}"
 
 
-def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False) -> str:
+def html_table(
+    head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False
+) -> str:
     """Lay out a table that scrolls by itself; on paper it has the first rows; a reader may sort and filter it."""
     rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
@@ -216,7 +283,9 @@ def escape(text: str) -> str:
 
 def _cell(text: str, tag: str = "td") -> str:
     # Figures and names are not broken over lines; sentences are.
-    return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
+    return (
+        f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
+    )
 
 
 def html_of(content: Content) -> str:
@@ -226,9 +295,19 @@ def html_of(content: Content) -> str:
     if isinstance(content, tuple):
         return html_table(*content)
     if isinstance(content, list):
-        return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in content) or "<li>None.</li>") + "</ul>"
+        return (
+            "<ul>"
+            + (
+                "".join(f"<li>{escape(line)}</li>" for line in content)
+                or "<li>None.</li>"
+            )
+            + "</ul>"
+        )
     # On a narrow screen one below the other.
-    rows = (f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>' for name, words in content.items())
+    rows = (
+        f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>'
+        for name, words in content.items()
+    )
     return f'<div class="scroll fold"><table class="about"><tbody>{"".join(rows)}</tbody></table></div>'
 
 
@@ -246,8 +325,14 @@ def page(
     is no verdict). ``store`` holds the long series that figures name by ``packed``. ``origin``: UTC that times count
     from, ns; None: not known.
     """
-    looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
-    links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
+    looks = [
+        "" if severity is None else f" class={severity.value}",
+        *[""] * len(summary),
+    ]
+    links = "".join(
+        f'<a href="#{_anchor(section)}">{escape(section.title)}</a>'
+        for section in sections
+    )
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
     for section in (_speaking(section, store) for section in sections):
@@ -255,21 +340,30 @@ def page(
         figures += section.figures
     parts = {
         "TITLE": escape(title),
-        "VERDICT": "".join(f"<li{look}>{escape(line)}</li>" for look, line in zip(looks, summary, strict=False)),
-        "CONTENTS": f'<nav aria-label="contents">{links}</nav>' if len(sections) >= FEWEST_LINKED else "",
+        "VERDICT": "".join(
+            f"<li{look}>{escape(line)}</li>"
+            for look, line in zip(looks, summary, strict=False)
+        ),
+        "CONTENTS": f'<nav aria-label="contents">{links}</nav>'
+        if len(sections) >= FEWEST_LINKED
+        else "",
         "BODY": "\n".join(part for part in body if part),
         "STYLE": _resource("page.css"),
         "DATA": _safe_json(
             {
                 "figures": figures,
                 "store": None if store is None else store.data(),
-                "origin": None if origin is None or date_of(origin) is None else origin // 1_000_000,
+                "origin": None
+                if origin is None or date_of(origin) is None
+                else origin // 1_000_000,
             }
         ),
         "SCRIPT": "".join(map(_resource, _SCRIPTS)),
     }
     # In one pass: what is put in is not searched for places.
-    return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
+    return re.sub(
+        "<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html")
+    )
 
 
 def _anchor(section: Section) -> str:
@@ -279,7 +373,11 @@ def _anchor(section: Section) -> str:
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
     """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
-    figures = [figure for figure in section.figures if any(_draws(trace, store) for trace in figure["data"])]
+    figures = [
+        figure
+        for figure in section.figures
+        if any(_draws(trace, store) for trace in figure["data"])
+    ]
     if len(figures) == len(section.figures):
         return section
     words = "" if figures else "Nothing to draw: there are no values."
@@ -290,20 +388,32 @@ def _draws(trace: Mapping[str, Any], store: PageStore | None) -> bool:
     """Whether a trace has any value."""
     if "packed" in trace:
         return store is not None and store.shows(trace["packed"])
-    values = trace.get({"band": "low", "spans": "row", "heatmap": "z"}.get(trace["type"], "y"), ())
+    values = trace.get(
+        {"band": "low", "spans": "row", "heatmap": "z"}.get(trace["type"], "y"), ()
+    )
     return any(value is not None for value in values)
 
 
 def _section(section: Section, number: int) -> list[str]:
     """Lay out a section; its figures are numbered from `number`."""
-    head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
+    head = f"<h2>{escape(section.title)}</h2>" + (
+        f'<p class="hint">{escape(section.hint)}</p>' if section.hint else ""
+    )
     if not section.figures:
-        return [f'<section id="{_anchor(section)}">{head}{html_of(section.content)}</section>']
+        return [
+            f'<section id="{_anchor(section)}">{head}{html_of(section.content)}</section>'
+        ]
     numbers = range(number, number + len(section.figures))
-    places = [f'<figure data-figure="{k}"><div class="stage" tabindex="0"></div></figure>' for k in numbers]
+    places = [
+        f'<figure data-figure="{k}"><div class="stage" tabindex="0"></div></figure>'
+        for k in numbers
+    ]
     # On paper the head stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    begin, end = f'<section id="{_anchor(section)}" class="plots">{first}', f"{html_of(section.content)}</section>"
+    begin, end = (
+        f'<section id="{_anchor(section)}" class="plots">{first}',
+        f"{html_of(section.content)}</section>",
+    )
     return [begin, *places[1:], end]
 
 
@@ -325,7 +435,9 @@ def drawn(value: float | None) -> float | None:
 
 def _safe_json(data: Any) -> str:
     # Within a script element the only thing that could end it is a tag.
-    return json.dumps(_visible(data), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return json.dumps(_visible(data), separators=(",", ":"), allow_nan=False).replace(
+        "<", "\\u003c"
+    )
 
 
 def _visible(data: Any) -> Any:
@@ -334,7 +446,9 @@ def _visible(data: Any) -> Any:
         return visible(data)
     if isinstance(data, Mapping):
         return {visible(name): _visible(value) for name, value in data.items()}
-    return [_visible(value) for value in data] if isinstance(data, (list, tuple)) else data
+    return (
+        [_visible(value) for value in data] if isinstance(data, (list, tuple)) else data
+    )
 
 
 def _resource(name: str) -> str:
@@ -370,12 +484,16 @@ class PageStore:
 
     def add(self, time: Array, values: Array) -> None:
         """Take in the next samples: time (N,) s, values (N, c) of every series in order."""
-        values = np.vstack([self._waiting[1], np.where(np.isfinite(values), values, np.nan)])
+        values = np.vstack(
+            [self._waiting[1], np.where(np.isfinite(values), values, np.nan)]
+        )
         time = np.concatenate([self._waiting[0], time])
         whole = len(time) // self.width * self.width
         self._waiting = time[whole:], values[whole:]
         if whole:
-            self._store(time[: whole : self.width], values[:whole], values[:whole], self.width)
+            self._store(
+                time[: whole : self.width], values[:whole], values[:whole], self.width
+            )
         while len(self._time) > (self._most if self.width == 1 else self._most // 2):
             time, low, high = self._time, self._low, self._high
             self._time, self._low, self._high = time[:0], low[:0], high[:0]
@@ -387,7 +505,10 @@ class PageStore:
     def _store(self, time: Array, low: Array, high: Array, together: int) -> None:
         low, high = _extremes(low, high, together)
         self._time = np.concatenate([self._time, time])
-        self._low, self._high = np.vstack([self._low, low]), np.vstack([self._high, high])
+        self._low, self._high = (
+            np.vstack([self._low, low]),
+            np.vstack([self._high, high]),
+        )
 
     def spans(self) -> tuple[Array, Array, Array]:
         """Return what there is: time of the first sample (k,), smallest and largest values (k, c)."""
@@ -395,7 +516,11 @@ class PageStore:
         if len(time) == 0:
             return self._time, self._low, self._high
         low, high = _extremes(values, values, len(time))
-        return np.append(self._time, time[:1]), np.vstack([self._low, low]), np.vstack([self._high, high])
+        return (
+            np.append(self._time, time[:1]),
+            np.vstack([self._low, low]),
+            np.vstack([self._high, high]),
+        )
 
     def shows(self, name: str) -> bool:
         """Whether a series has any value."""
@@ -406,7 +531,10 @@ class PageStore:
         time, *extremes = self.spans()
         kept = extremes if self.width > 1 else extremes[:1]
         series = {
-            name: (kind, _packed(np.column_stack([values[:, k] for values in kept]), kind))
+            name: (
+                kind,
+                _packed(np.column_stack([values[:, k] for values in kept]), kind),
+            )
             for k, (name, kind) in enumerate(self.kinds.items())
         }
         return {"time": _packed(time, "f8"), "width": self.width, "series": series}
@@ -415,10 +543,14 @@ class PageStore:
 def _packed(values: Array, kind: str) -> str:
     if kind == SMALL:
         values = np.clip(values, -LARGEST_HALF, LARGEST_HALF)
-    return base64.b64encode(np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()).decode("ascii")
+    return base64.b64encode(
+        np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
+    ).decode("ascii")
 
 
 def _extremes(low: Array, high: Array, together: int) -> tuple[Array, Array]:
     """Smallest and largest of every `together` rows; NaN only where all are."""
     shape = (-1, together, low.shape[1])
-    return np.fmin.reduce(low.reshape(shape), axis=1), np.fmax.reduce(high.reshape(shape), axis=1)
+    return np.fmin.reduce(low.reshape(shape), axis=1), np.fmax.reduce(
+        high.reshape(shape), axis=1
+    )

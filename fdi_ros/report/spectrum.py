@@ -19,7 +19,9 @@ from fdi_ros.report.layout import RADIANS, Section, Unit, colour_of, drawn
 PIECE = 512  # samples of one of the spectra that are averaged
 AT_ONCE = 16 * PIECE  # samples of which spectra are taken at once
 AROUND = 31  # frequencies whose median is the baseline next to a line
-STANDS_OUT = 4.0  # a line has so many times the amplitude density that is usual next to it
+STANDS_OUT = (
+    4.0  # a line has so many times the amplitude density that is usual next to it
+)
 FLAT = 0.8  # what has more than this share of the usual amplitude density at half the sample rate goes on beyond it
 MOST_LINES = 3
 
@@ -31,7 +33,10 @@ class Spectrum:
         self._names, self._rate = names, rate
         self._waiting = np.empty((0, len(names)))
         """Samples of which none is averaged yet, but for half a piece: all of the same channels."""
-        self._power, self._weight = np.zeros((PIECE // 2 + 1, len(names))), np.zeros(len(names))
+        self._power, self._weight = (
+            np.zeros((PIECE // 2 + 1, len(names))),
+            np.zeros(len(names)),
+        )
 
     def add(self, values: Array) -> None:
         """Take in the next samples (N, n), rad/s; where a channel begins or ends to be missing a new piece begins."""
@@ -72,12 +77,23 @@ class Spectrum:
         ]
         layout = {
             "height": 320,
-            "xaxis": {"title": {"text": "frequency, Hz"}, "range": [0.0, self._rate / 2]},
-            "yaxis": {"type": "log", "title": {"text": f"residual, {unit.name} per sqrt(Hz)"}},
+            "xaxis": {
+                "title": {"text": "frequency, Hz"},
+                "range": [0.0, self._rate / 2],
+            },
+            "yaxis": {
+                "type": "log",
+                "title": {"text": f"residual, {unit.name} per sqrt(Hz)"},
+            },
         }
         hint = "Of each channel's residual: what it differs by from the fused rate."
         figure = {"data": data, "layout": layout}
-        return Section("Spectrum of the differences", f"{hint} {self._words(density)}", "", [figure])
+        return Section(
+            "Spectrum of the differences",
+            f"{hint} {self._words(density)}",
+            "",
+            [figure],
+        )
 
     def _words(self, density: Array) -> str:
         """Say where lines stand out (the density is without that at 0 Hz), and what of it may be folded."""
@@ -88,10 +104,15 @@ class Spectrum:
         half, step = self._rate / 2, self._rate / PIECE
         around = median_filter(density, size=(AROUND, 1), mode="nearest")
         peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
-        found = [(peaks[k] + 1) * step for k in np.argsort(-about["peak_heights"])[:MOST_LINES]]
+        found = [
+            (peaks[k] + 1) * step
+            for k in np.argsort(-about["peak_heights"])[:MOST_LINES]
+        ]
         words = []
         if found:
-            lines = ", ".join(f"{at:.3g} Hz ({self._rate - at:.3g} Hz if folded)" for at in found)
+            lines = ", ".join(
+                f"{at:.3g} Hz ({self._rate - at:.3g} Hz if folded)" for at in found
+            )
             words.append(f"Lines stand out at {lines}.")
         if (around[-1] > FLAT * np.median(density, axis=0)).any():
             words.append(
@@ -106,6 +127,8 @@ class Spectrum:
         known = np.isfinite(values[0])
         if known.any():
             weight = len(values) * 2 // PIECE - 1
-            power = welch(values[:, known], self._rate, nperseg=PIECE, axis=0, detrend="linear")[1]
+            power = welch(
+                values[:, known], self._rate, nperseg=PIECE, axis=0, detrend="linear"
+            )[1]
             self._power[:, known] += weight * power
             self._weight[known] += weight

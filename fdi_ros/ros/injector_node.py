@@ -28,7 +28,9 @@ from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros.node import CheckedNode
 
-LOOK_PERIOD = 0.05  # how often it is looked whether an output has found its first subscriber, s
+LOOK_PERIOD = (
+    0.05  # how often it is looked whether an output has found its first subscriber, s
+)
 
 
 class InjectorNode(CheckedNode):
@@ -44,14 +46,21 @@ class InjectorNode(CheckedNode):
         self._malformed = self._struck = 0
         suffix = self.values()["suffix"]
         if not suffix:
-            raise FdiError("suffix is empty, expected a text: an output may not have the name of its input")
+            raise FdiError(
+                "suffix is empty, expected a text: an output may not have the name of its input"
+            )
         self._source = source_of(self.config)
         # The first message must not wait for a compiler.
         warm_codec(self._source)
-        self._unheard: dict[str, tuple[int, Any]] = {}  # topics whose output has no subscriber yet: number, output
+        self._unheard: dict[
+            str, tuple[int, Any]
+        ] = {}  # topics whose output has no subscriber yet: number, output
         for k, topic in enumerate(self._source.topics):
             self.resolved(topic + suffix)
-            self._unheard[topic] = k, self.create_output(self._source.type, topic + suffix)
+            self._unheard[topic] = (
+                k,
+                self.create_output(self._source.type, topic + suffix),
+            )
         self._look_timer = self.every(LOOK_PERIOD, self._look)
         self._diagnostics = self.create_diagnostics()
         self.create_timer(1.0, self._report)
@@ -66,7 +75,9 @@ class InjectorNode(CheckedNode):
             self._switch(self.values(own))
 
     def _switch(self, values: dict[str, Any]) -> None:
-        faults = tuple(parse_fault(text) for text in values["faults"].split(";") if text.strip())
+        faults = tuple(
+            parse_fault(text) for text in values["faults"].split(";") if text.strip()
+        )
         if values["scenario"]:
             faults += load_scenario(values["scenario"])
         if values["enabled"] and not faults:
@@ -74,7 +85,11 @@ class InjectorNode(CheckedNode):
         # One per topic: the messages of the topics come apart, and each effect keeps its own memory of them.
         self._injectors = [Injector(faults, self._names) for _ in self.config.topics]
         self._origin: int | None = None
-        self._injecting = f"INJECTING FAULTS: {'; '.join(map(str, faults))}" if values["enabled"] else ""
+        self._injecting = (
+            f"INJECTING FAULTS: {'; '.join(map(str, faults))}"
+            if values["enabled"]
+            else ""
+        )
         """In words; empty: off."""
         if self._injecting:
             self.log.error(self._injecting)
@@ -87,7 +102,9 @@ class InjectorNode(CheckedNode):
         for topic, (k, publisher) in tuple(self._unheard.items()):
             if publisher.get_subscription_count():
                 del self._unheard[topic]
-                self.inputs.open(self._source.type, topic, partial(self._pass_on, k, publisher))
+                self.inputs.open(
+                    self._source.type, topic, partial(self._pass_on, k, publisher)
+                )
         if not self._unheard:
             self.destroy_timer(self._look_timer)
 
@@ -113,20 +130,33 @@ class InjectorNode(CheckedNode):
         z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
         z[0, channels], received[0, channels] = values, True
         self._injectors[k].start_stamp = self._origin
-        out = self._injectors[k].apply(Block(np.array([stamp], dtype=np.int64), z, received))
+        out = self._injectors[k].apply(
+            Block(np.array([stamp], dtype=np.int64), z, received)
+        )
         after = out.z[0, channels].tolist()
         lost = out.received is not None and not out.received[0, channels].any()
         self._struck += lost or after != list(values)
         return None if lost else self._source.patch(data, after)
 
-    def _on_switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_switch(
+        self, on: bool, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         result = self.set_parameters([Parameter("enabled", value=on)])[0]
         response.success = result.successful
         response.message = result.reason or ("injecting" if on else "off")
         return response
 
     def _report(self) -> None:
-        level, words = (Level.WARN, self._injecting) if self._injecting else (Level.OK, "off")
-        values = (("messages struck", str(self._struck)), ("malformed", str(self._malformed)))
-        line = StatusLine(level, self.prefix + "injector", words, self.config.hardware_id, values)
-        self._diagnostics.publish(encode_diagnostics([line], self.get_clock().now().nanoseconds))
+        level, words = (
+            (Level.WARN, self._injecting) if self._injecting else (Level.OK, "off")
+        )
+        values = (
+            ("messages struck", str(self._struck)),
+            ("malformed", str(self._malformed)),
+        )
+        line = StatusLine(
+            level, self.prefix + "injector", words, self.config.hardware_id, values
+        )
+        self._diagnostics.publish(
+            encode_diagnostics([line], self.get_clock().now().nanoseconds)
+        )

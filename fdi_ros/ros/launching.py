@@ -26,10 +26,21 @@ def arguments(config: str) -> list[Action]:
     """Declare the arguments of every launch file, with a shipped config as the default."""
     return [
         DeclareLaunchArgument(
-            "config", default_value=config, description="ROS 2 parameter file: a path, or the name of a shipped file"
+            "config",
+            default_value=config,
+            description="ROS 2 parameter file: a path, or the name of a shipped file",
         ),
-        DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
-        DeclareLaunchArgument("log_level", default_value="info", choices=LEVELS, description="of the nodes"),
+        DeclareLaunchArgument(
+            "namespace",
+            default_value="",
+            description="namespace of the nodes and their topics",
+        ),
+        DeclareLaunchArgument(
+            "log_level",
+            default_value="info",
+            choices=LEVELS,
+            description="of the nodes",
+        ),
     ]
 
 
@@ -42,7 +53,12 @@ def checked(context: LaunchContext) -> tuple[str, Config]:
         raise RuntimeError(str(error)) from None
 
 
-def node(name: str, parameters: Sequence[Any], remappings: Sequence[Any] = (), on_exit: Any = None) -> Node:
+def node(
+    name: str,
+    parameters: Sequence[Any],
+    remappings: Sequence[Any] = (),
+    on_exit: Any = None,
+) -> Node:
     """Make a node of this package."""
     return Node(
         package="fdi_ros",
@@ -62,5 +78,7 @@ def end(event: ProcessExited, context: LaunchContext) -> list[Action]:
     if context.is_shutdown:
         return []
     if event.returncode:
-        raise RuntimeError(f"{event.process_name} has failed: exit code {event.returncode}")
+        raise RuntimeError(
+            f"{event.process_name} has failed: exit code {event.returncode}"
+        )
     return [Shutdown(reason=f"{event.process_name} has ended")]

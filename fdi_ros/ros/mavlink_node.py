@@ -34,19 +34,32 @@ from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.protocol import ImuSample, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
-from fdi_ros.monitor.diagnostics import DIAGNOSTICS, INPUT, WHOLE, Level, StatusLine, encode_diagnostics
+from fdi_ros.monitor.diagnostics import (
+    DIAGNOSTICS,
+    INPUT,
+    WHOLE,
+    Level,
+    StatusLine,
+    encode_diagnostics,
+)
 from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros.node import REPORT_PERIOD, CheckedNode, message_class, read_diagnostics
 from fdi_ros.ros.process import Stop, guarded, make_executor
 
 IMU = "sensor_msgs/msg/Imu"
-NAMES = ("imu_1", "imu_2", "imu_3")  # of units where the settings name none, each on the topic ``NAME/data_raw``
+NAMES = (
+    "imu_1",
+    "imu_2",
+    "imu_3",
+)  # of units where the settings name none, each on the topic ``NAME/data_raw``
 WAIT = 0.02  # the link is waited for at most so long, and the executor gets its turn as often, s
 INJECTED = "_faulty"  # what the injector adds to the name of a topic: on the bench the monitor's inputs
 PARTING = 4.0  # so long the end waits on the ground for IMUs to be put back, s
 MOST_CALLS = 32  # callbacks of a turn of the executor
 _SEND_EVERY = 10_000_000  # what is to be sent is looked for so often, ns
-_LARGEST = 1 << 17  # bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000
+_LARGEST = (
+    1 << 17
+)  # bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000
 _VALUE_EVERY = 450_000_000  # between two NAMED_VALUE_FLOAT of a name, ns
 
 
@@ -60,25 +73,44 @@ class AutopilotNode(CheckedNode):
         self._link = open_link(params["url"])
         self._vehicle = Vehicle(settings, self._link.send, time.time)
         names = config.imu_names if config.has_units else NAMES
-        topics = config.topics if config.has_units else [f"{name}/data_raw" for name in NAMES]
+        topics = (
+            config.topics
+            if config.has_units
+            else [f"{name}/data_raw" for name in NAMES]
+        )
         outputs = [self.create_output(IMU, topic) for topic in topics]
         self._topics = [output.topic_name for output in outputs]
         self._units = list(zip(outputs, map(ImuTemplate, names), strict=True))
         self._reporter = Reporter(self._link, self._vehicle, names, self._topics)
         self._diagnostics = self.create_diagnostics()
         self._valued = self._due = 0
-        self._link_state = (0, self._link.trouble)  # how often it was opened, and why it is not open
+        self._link_state = (
+            0,
+            self._link.trouble,
+        )  # how often it was opened, and why it is not open
         self._ahead = system_ahead()
         self._called = False  # whether the executor has found something to do
-        channels = config.channel_names or [f"{name}.{axis}" for name in names for axis in "xyz"]
+        channels = config.channel_names or [
+            f"{name}.{axis}" for name in names for axis in "xyz"
+        ]
         self._announcer = Announcer(channels) if params["statustext"] else None
         self._sends_values: bool = params["named_values"]
         # In full, as it stands in diagnostics: without the first slash.
-        self._monitor = expand_topic_name(params["monitor"], self.get_name(), self.get_namespace()).lstrip("/")
-        self._failover = None if params["failover"] == "off" else self._make_failover(params)
-        if self._announcer is not None or self._sends_values or self._failover is not None:
+        self._monitor = expand_topic_name(
+            params["monitor"], self.get_name(), self.get_namespace()
+        ).lstrip("/")
+        self._failover = (
+            None if params["failover"] == "off" else self._make_failover(params)
+        )
+        if (
+            self._announcer is not None
+            or self._sends_values
+            or self._failover is not None
+        ):
             few = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-            self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
+            self.create_subscription(
+                DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True
+            )
         self.every(REPORT_PERIOD, self._report)
         self.get_logger().info(f"listening on {params['url']}")
 
@@ -90,31 +122,52 @@ class AutopilotNode(CheckedNode):
         rate = params["rate"] or self.config.sample_rate
         if not 1.0 <= rate <= 1000.0:
             raise ConfigError(f"rate is {rate:g} Hz, expected 1 to 1000 Hz")
-        kind = "" if params["messages"] == "auto" else f"{params['messages'].upper()}_IMU"
+        kind = (
+            "" if params["messages"] == "auto" else f"{params['messages'].upper()}_IMU"
+        )
         key = read_key(params["signing_key"]) if params["signing_key"] else b""
-        return VehicleSettings(params["system_id"], params["component_id"], kind, rate, key)
+        return VehicleSettings(
+            params["system_id"], params["component_id"], kind, rate, key
+        )
 
     def _make_failover(self, params: dict[str, Any]) -> Failover:
         units = len(self.config.topics)
-        if not self.config.has_units or not 2 <= units <= len(INS_USE) or params["messages"] not in ("auto", "scaled"):
+        if (
+            not self.config.has_units
+            or not 2 <= units <= len(INS_USE)
+            or params["messages"] not in ("auto", "scaled")
+        ):
             raise ConfigError(
                 f"failover is {params['failover']!r}, with {units} topics and messages {params['messages']!r}, expected"
                 f" input: imus, 2 to {len(INS_USE)} imus.topics, and messages: scaled"
             )
         if not 1 <= params["failover_limit"] < units:
-            raise ConfigError(f"failover_limit is {params['failover_limit']}, expected 1 to {units - 1}")
-        path = Path(params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")).expanduser()
+            raise ConfigError(
+                f"failover_limit is {params['failover_limit']}, expected 1 to {units - 1}"
+            )
+        path = Path(
+            params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")
+        ).expanduser()
         if not params["failover_file"]:
             path.mkdir(parents=True, exist_ok=True)
             path /= f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
         kind = message_class(INTEGRITY.topic.type)
-        heard = self.create_subscription(kind, declarations, self._on_integrity, 10, raw=True)
-        self._sole = [heard.topic_name, *self._topics]  # topics, remapped, that must have one publisher
+        heard = self.create_subscription(
+            kind, declarations, self._on_integrity, 10, raw=True
+        )
+        self._sole = [
+            heard.topic_name,
+            *self._topics,
+        ]  # topics, remapped, that must have one publisher
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not params["signing_key"]:
-            self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
-        return Failover(self._vehicle, self.config.channel_names, params["failover_limit"], path)
+            self.get_logger().warning(
+                "failover over an unsigned link: whoever reaches it can pass for the autopilot"
+            )
+        return Failover(
+            self._vehicle, self.config.channel_names, params["failover_limit"], path
+        )
 
     def live(self, stop: Stop) -> None:
         """Wait for the link, pass on what came, and give the executor its turn, until stopped: all in one thread."""
@@ -137,7 +190,11 @@ class AutopilotNode(CheckedNode):
     def _put_back(self) -> None:
         """Before the end, on the ground, put back what is out of use by failover; in flight it stays out."""
         end = time.monotonic() + PARTING
-        while self._failover is not None and not self._failover.is_done and time.monotonic() < end:
+        while (
+            self._failover is not None
+            and not self._failover.is_done
+            and time.monotonic() < end
+        ):
             self._failover.turn(time.monotonic_ns(), restore=True)
             self._link.wait(WAIT)
             self._turn()
@@ -172,7 +229,9 @@ class AutopilotNode(CheckedNode):
         received = link.receive(time.monotonic_ns())
         if (state := (link.opened, link.trouble)) != self._link_state:
             self._link_state = state
-            self.log.info(f"{link.url} is {f'not open: {link.trouble}' if link.trouble else 'open'}")
+            self.log.info(
+                f"{link.url} is {f'not open: {link.trouble}' if link.trouble else 'open'}"
+            )
             if not link.trouble:
                 self._vehicle.reopened()
         for peer, data in received:
@@ -193,12 +252,18 @@ class AutopilotNode(CheckedNode):
         if len(data) > _LARGEST or f"{self._monitor}: ".encode() not in data:
             return
         try:
-            lines = read_diagnostics(deserialize_message(data, DiagnosticArray), self._monitor)
+            lines = read_diagnostics(
+                deserialize_message(data, DiagnosticArray), self._monitor
+            )
         except ValueError:
             # Not the monitor's: it has no such level.
             return
         whole = next((line for line in lines if line.name == WHOLE), None)
-        due = self._sends_values and self._vehicle.in_reach and now - self._valued >= _VALUE_EVERY
+        due = (
+            self._sends_values
+            and self._vehicle.in_reach
+            and now - self._valued >= _VALUE_EVERY
+        )
         if whole is not None and due:
             self._valued = now
             for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
@@ -206,12 +271,22 @@ class AutopilotNode(CheckedNode):
                     self._vehicle.send_value(name, value, now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
-        topics = [line.value("topic").removesuffix(INJECTED) for line in lines if line.name.startswith(INPUT)]
+        topics = [
+            line.value("topic").removesuffix(INJECTED)
+            for line in lines
+            if line.name.startswith(INPUT)
+        ]
         if failover is not None and topics:
             # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
-            agrees = whole is not None and whole.level != Level.STALE and topics == self._topics
+            agrees = (
+                whole is not None
+                and whole.level != Level.STALE
+                and topics == self._topics
+            )
             failover.reported = now if agrees else 0
-            failover.errors = {line.name: line.number("estimated error (rad/s)") for line in lines}
+            failover.errors = {
+                line.name: line.number("estimated error (rad/s)") for line in lines
+            }
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
@@ -219,11 +294,15 @@ class AutopilotNode(CheckedNode):
         now, count = time.monotonic_ns(), len(self.config.channel_names)
         _, values = ChannelsSource.parse(data, count + 5)
         # A second publisher is a stranger, a second monitor, or gives it rates that are not this autopilot's.
-        self._failover.is_alone = all(self.count_publishers(topic) == 1 for topic in self._sole)
+        self._failover.is_alone = all(
+            self.count_publishers(topic) == 1 for topic in self._sole
+        )
         self._failover.declarations.hear(values[2 : 2 + count], now)
         self._failover.turn(now)
 
-    def _on_restore(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_restore(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         self._called = True
         assert self._failover is not None
         response.success, response.message = self._failover.restore(time.monotonic_ns())
@@ -249,7 +328,9 @@ class AutopilotNode(CheckedNode):
 
 def encode_imu(template: ImuTemplate, stamp: int, sample: ImuSample) -> bytes:
     """Return the Imu message of a sample, stamped in ns, with acceleration."""
-    struct.pack_into("<iI", template.bytes.data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
+    struct.pack_into(
+        "<iI", template.bytes.data, ENCAPSULATION, *divmod(stamp, 1_000_000_000)
+    )
     # Unknown is a covariance of zeros (REP-145); the template says that there is no acceleration.
     values = (*sample.rate, *(0.0,) * 9, *sample.acceleration, 0.0)
     struct.pack_into("<16d", template.bytes.data, template.at, *values)

@@ -33,9 +33,13 @@ from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.system.text import shown
 
-CHECK_PERIOD = 0.05  # how often silence is checked for, and the state saved if it has changed, s
+CHECK_PERIOD = (
+    0.05  # how often silence is checked for, and the state saved if it has changed, s
+)
 LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
-END_OF_TIME = 2**62  # stamps beyond all clocks, ns: a clock was set back by decades again and again
+END_OF_TIME = (
+    2**62
+)  # stamps beyond all clocks, ns: a clock was set back by decades again and again
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RCLError = rclpy_implementation.RCLError
 
@@ -45,7 +49,9 @@ class MonitorNode(CheckedNode, LifecycleNode):
 
     def __init__(self, **options: Any) -> None:
         topics = [output.topic.name for output in OUTPUTS]
-        super().__init__("fdi_node", MONITOR, subscribes=True, publishes=topics, **options)
+        super().__init__(
+            "fdi_node", MONITOR, subscribes=True, publishes=topics, **options
+        )
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         file, age = (self.values()[name] for name in ("state_file", "state_max_age"))
@@ -54,8 +60,12 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self._running: Running | None = None
         self._checked_at = time.monotonic()  # steady time of the last check, s
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
-        self._receiver: Receiver | None = self._build()  # again from configure to cleanup
-        self._service_change_state.callback = partial(self._on_change_state, self._service_change_state.callback)
+        self._receiver: Receiver | None = (
+            self._build()
+        )  # again from configure to cleanup
+        self._service_change_state.callback = partial(
+            self._on_change_state, self._service_change_state.callback
+        )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/relearn_bias", self._on_relearn_bias)
 
@@ -68,7 +78,9 @@ class MonitorNode(CheckedNode, LifecycleNode):
             say(self._state_file.words)
         return receiver
 
-    def create_subscription(self, kind: Any, topic: str, callback: Any, *arguments: Any, **options: Any) -> Any:
+    def create_subscription(
+        self, kind: Any, topic: str, callback: Any, *arguments: Any, **options: Any
+    ) -> Any:
         """Subscribe; what rclpy makes of /clock is made safe from times that it cannot hold."""
         if kind is ClockMessage:
             callback = partial(self._on_clock, callback)
@@ -78,7 +90,9 @@ class MonitorNode(CheckedNode, LifecycleNode):
         if message.clock.sec >= 0:
             take(message)
         else:
-            words = f"/clock says {message.clock.sec} s, which is before 1970: left aside"
+            words = (
+                f"/clock says {message.clock.sec} s, which is before 1970: left aside"
+            )
             self.get_logger().error(words, throttle_duration_sec=1.0)
 
     # Managed node -------------------------------------------------------------------------------------------------
@@ -99,12 +113,16 @@ class MonitorNode(CheckedNode, LifecycleNode):
             )
         super().live(stop)
 
-    def _on_change_state(self, change: Any, request: ChangeState.Request, response: Any) -> ChangeState.Response:
+    def _on_change_state(
+        self, change: Any, request: ChangeState.Request, response: Any
+    ) -> ChangeState.Response:
         """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""
         try:
             return change(request, response)
         except RCLError as error:
-            wanted = shown(request.transition.label) or f"transition {request.transition.id}"
+            wanted = (
+                shown(request.transition.label) or f"transition {request.transition.id}"
+            )
             now = self._state_machine.current_state[1]
             self.log.warning(f"{wanted} refused: not possible while {now}")
             self.get_logger().debug(str(error))
@@ -128,7 +146,11 @@ class MonitorNode(CheckedNode, LifecycleNode):
             return FAILURE
         self._running.listen()
         pipeline = self._running.receiver.pipeline
-        self.log.info(summary_line(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
+        self.log.info(
+            summary_line(
+                pipeline.geometry, pipeline.noise, alarm_probability(self.config)
+            )
+        )
         names = ", ".join(topic.topic for topic in self._running.topics)
         self.log.info(f"monitoring {names} with {self.config.detector.name}")
         return SUCCESS
@@ -152,13 +174,18 @@ class MonitorNode(CheckedNode, LifecycleNode):
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take down what a failed transition has left."""
-        self.log.error(f"transition from {state.label} failed: the node is unconfigured")
+        self.log.error(
+            f"transition from {state.label} failed: the node is unconfigured"
+        )
         return self.on_cleanup(state)
 
     def keep_up(self) -> None:
         """Take in what waits and check what may have changed, where requests keep the executor from doing so."""
         super().keep_up()
-        if self._running is not None and time.monotonic() - self._checked_at > LATE * CHECK_PERIOD:
+        if (
+            self._running is not None
+            and time.monotonic() - self._checked_at > LATE * CHECK_PERIOD
+        ):
             self.inputs.drain()
             self._check(self._running)
 
@@ -167,13 +194,19 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self.save_state()
         running.check()
         if not 0 <= running.receiver.live["last_stamp"][0] < END_OF_TIME:
-            self.log.error("the clock went back by decades too often: the monitor begins anew")
+            self.log.error(
+                "the clock went back by decades too often: the monitor begins anew"
+            )
             self._receiver = self._build()
             running.start(self._receiver)
 
     def save_state(self) -> None:
         """Save biases and declarations, if there is a file for them and they have changed."""
-        if self._state_file is None or self._receiver is None or not self._state_file.save(self._receiver.pipeline):
+        if (
+            self._state_file is None
+            or self._receiver is None
+            or not self._state_file.save(self._receiver.pipeline)
+        ):
             return
         if self._state_file.failed:
             self.get_logger().error(self._state_file.words, throttle_duration_sec=60.0)
@@ -209,21 +242,35 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self.config = config
         self.log.info(f"changed: {', '.join(f'{p.name} = {p.value}' for p in changes)}")
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._receiver is not None, "not configured"
+    def _on_reset(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        response.success, response.message = (
+            self._receiver is not None,
+            "not configured",
+        )
         if self._receiver is not None:
-            pipeline, declared = self._receiver.pipeline, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+            pipeline, declared = (
+                self._receiver.pipeline,
+                (ChannelState.FAULTY, ChannelState.AMBIGUOUS),
+            )
             names = [c.name for c in pipeline.status().channels if c.state in declared]
             pipeline.reset()
             response.message = f"cleared: {', '.join(names) or 'nothing was declared'}"
             self.log.info(f"reset; {response.message}")
         return response
 
-    def _on_relearn_bias(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_relearn_bias(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         running = self._running
         refusal = "no samples" if running is None else running.why_not_at_rest()
         response.success = not refusal
-        response.message = f"refused: {refusal}" if refusal else "learning the bias; keep the vehicle at rest"
+        response.message = (
+            f"refused: {refusal}"
+            if refusal
+            else "learning the bias; keep the vehicle at rest"
+        )
         if running is not None and not refusal:
             running.receiver.pipeline.relearn_bias()
         self.log.info(f"relearn_bias: {response.message}")

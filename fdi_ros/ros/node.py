@@ -14,7 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, ParameterType, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    ParameterType,
+    SetParametersResult,
+)
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterNotDeclaredException
@@ -25,7 +31,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
+from fdi_ros.config.config import (
+    PARAMETERS,
+    Config,
+    is_ros_parameter,
+    unknown_parameter,
+)
 from fdi_ros.config.settings import ALL_NODES, Field, check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError, FdiError
@@ -38,7 +49,9 @@ REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 MOST_LINES = 20  # of one severity in one such period: what anybody may cause with requests hides no declaration
 LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
-FLOOD_TIME = 5.0  # so long after a flood has begun it is not looked whether it is over, s
+FLOOD_TIME = (
+    5.0  # so long after a flood has begun it is not looked whether it is over, s
+)
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
 MOST_PARAMETERS = 256  # in one request: several times what any node has
@@ -57,7 +70,9 @@ def message_class(name: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
     except ImportError as error:
-        raise FdiError(f"messages of type {name} need the ROS package {package}: {error}") from error
+        raise FdiError(
+            f"messages of type {name} need the ROS package {package}: {error}"
+        ) from error
 
 
 def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
@@ -71,14 +86,20 @@ def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
                 raise ValueError(f"level {level}, expected 0 to {max(Level)}")
             values = tuple((pair.key, pair.value) for pair in status.values)
             name = status.name.removeprefix(prefix)
-            found.append(StatusLine(Level(level), name, status.message, status.hardware_id, values))
+            found.append(
+                StatusLine(
+                    Level(level), name, status.message, status.hardware_id, values
+                )
+            )
     return found
 
 
 class BoundedLog(logging.Handler):
     """Logs so many lines a second at most, each of bounded length, and says how many were left out."""
 
-    def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, logger: Any, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         super().__init__()
         self._logger, self._clock = logger, clock
         self._since = clock()
@@ -139,7 +160,9 @@ class InputQueue:
     """
 
     def __init__(self, node: Node) -> None:
-        self.subscriptions: dict[Subscription[Any], Callable[[bytes], None]] = {}  # each with what takes its messages
+        self.subscriptions: dict[
+            Subscription[Any], Callable[[bytes], None]
+        ] = {}  # each with what takes its messages
         self.flooded = False
         self._node = node
         self._taken = 0  # messages that came by an event of the executor in this turn
@@ -158,7 +181,9 @@ class InputQueue:
         # A new QoS each time, as overrides are written into it.
         qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         message = message_class(kind)
-        subscription = self._node.create_subscription(message, topic, take_event, qos, raw=True, **OVERRIDABLE)
+        subscription = self._node.create_subscription(
+            message, topic, take_event, qos, raw=True, **OVERRIDABLE
+        )
         self.subscriptions[subscription] = take
 
     def close(self) -> None:
@@ -172,10 +197,16 @@ class InputQueue:
         takers = list(self.subscriptions.items())
         taken, end = 0, time.monotonic() + LONGEST
         heads = [_next(one) for one, _ in takers]
-        while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
+        while waiting := [
+            (head[0], k, head[1]) for k, head in enumerate(heads) if head is not None
+        ]:
             _, k, data = min(waiting)
             subscription, take = takers[k]
-            heads[k] = _next(subscription) if taken < 2 * DEPTH and time.monotonic() < end else None
+            heads[k] = (
+                _next(subscription)
+                if taken < 2 * DEPTH and time.monotonic() < end
+                else None
+            )
             taken += 1
             take(data)
         self._waiting += taken
@@ -210,31 +241,61 @@ class CheckedNode(Node):
     """
 
     def __init__(
-        self, name: str, fields: Mapping[str, Field], *, subscribes: bool, publishes: Sequence[str] = (), **options: Any
+        self,
+        name: str,
+        fields: Mapping[str, Field],
+        *,
+        subscribes: bool,
+        publishes: Sequence[str] = (),
+        **options: Any,
     ) -> None:
         self.inputs = InputQueue(self)
         self._fields = fields
         super().__init__(name, **options)
-        self.log = BoundedLog(self.get_logger())  # for lines that something outside may cause as often as it likes
+        self.log = BoundedLog(
+            self.get_logger()
+        )  # for lines that something outside may cause as often as it likes
         # A file gives no type, and so no value, for an empty array.
-        given = {name: [] if one.value is None else one.value for name, one in self._parameter_overrides.items()}
+        given = {
+            name: [] if one.value is None else one.value
+            for name, one in self._parameter_overrides.items()
+        }
         self.config = Config.from_parameters(
-            {name: value for name, value in given.items() if name not in fields and not is_ros_parameter(name)}
+            {
+                name: value
+                for name, value in given.items()
+                if name not in fields and not is_ros_parameter(name)
+            }
         )
-        self._check_overrides(given, self.config.topics if subscribes else (), publishes)
+        self._check_overrides(
+            given, self.config.topics if subscribes else (), publishes
+        )
         own = {**ALL_NODES, **fields}
-        values = {name: field.default for name, field in own.items()} | self.config.parameters() | given
+        values = (
+            {name: field.default for name, field in own.items()}
+            | self.config.parameters()
+            | given
+        )
         for name, field in own.items():
             _checked(name, field, values[name])
         for name, field in (own | PARAMETERS).items():
-            value = list(values[name]) if isinstance(values[name], tuple) else values[name]
-            self.declare_parameter(name, value, _descriptor(name, field), ignore_override=True)
+            value = (
+                list(values[name]) if isinstance(values[name], tuple) else values[name]
+            )
+            self.declare_parameter(
+                name, value, _descriptor(name, field), ignore_override=True
+            )
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def values(self, changes: Sequence[Parameter] = ()) -> dict[str, Any]:
         """Return the parameters that are none of the settings, with changes made to them, checked."""
-        given = {name: self.get_parameter(name).value for name in self._fields} | {p.name: p.value for p in changes}
-        return {name: _checked(name, field, given[name]) for name, field in self._fields.items()}
+        given = {name: self.get_parameter(name).value for name in self._fields} | {
+            p.name: p.value for p in changes
+        }
+        return {
+            name: _checked(name, field, given[name])
+            for name, field in self._fields.items()
+        }
 
     def change(self, changes: Sequence[Parameter]) -> None:
         """Take over parameters that are being set; `FdiError` if they cannot be: then none of them is set."""
@@ -248,7 +309,9 @@ class CheckedNode(Node):
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
         """Call a function by the steady clock: that of a simulation, or of a recording, may stand still."""
-        return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return self.create_timer(
+            seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def keep_up(self) -> None:
         """Do what must go on between the parts of a long request, and beside a storm of short ones."""
@@ -266,58 +329,95 @@ class CheckedNode(Node):
     def create_output(self, kind: str, topic: str, **options: Any) -> Any:
         """Publish messages, given as bytes, as REP-2003 wants sensor data: reliable, for subscribers of either kind."""
         # A new QoS each time, as overrides are written into it.
-        return self.create_publisher(message_class(kind), topic, QoSProfile(depth=DEPTH), **options)
+        return self.create_publisher(
+            message_class(kind), topic, QoSProfile(depth=DEPTH), **options
+        )
 
     def create_diagnostics(self) -> Any:
         """Publish diagnostics; they are handed over as bytes."""
-        return self.create_publisher(message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10))
+        return self.create_publisher(
+            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
+        )
 
     def resolved(self, topic: str) -> str:
         """Return the full name of a topic, remapped; `ConfigError` if it is no name of a topic."""
         try:
             return str(self.resolve_topic_name(topic))
         except (ValueError, RuntimeError) as error:
-            raise ConfigError(f"topic {topic!r} is no ROS name: {' '.join(str(error).split())}") from error
+            raise ConfigError(
+                f"topic {topic!r} is no ROS name: {' '.join(str(error).split())}"
+            ) from error
 
-    def _check_overrides(self, given: Mapping[str, Any], subscribes: Sequence[str], publishes: Sequence[str]) -> None:
+    def _check_overrides(
+        self,
+        given: Mapping[str, Any],
+        subscribes: Sequence[str],
+        publishes: Sequence[str],
+    ) -> None:
         """Refuse QoS overrides that would have no effect, or would fail only when the topic is made."""
         topics = [f"{self.resolved(topic)}.subscription" for topic in subscribes]
         topics += [f"{self.resolved(topic)}.publisher" for topic in publishes]
-        known = {f"qos_overrides.{topic}.{policy}": _POLICIES[policy] for topic in topics for policy in _POLICIES}
+        known = {
+            f"qos_overrides.{topic}.{policy}": _POLICIES[policy]
+            for topic in topics
+            for policy in _POLICIES
+        }
         for name in filter(lambda name: name.startswith("qos_overrides."), given):
             if name not in known:
-                raise ConfigError(f"unknown QoS override {name!r}, expected one of: {', '.join(known) or 'none'}")
+                raise ConfigError(
+                    f"unknown QoS override {name!r}, expected one of: {', '.join(known) or 'none'}"
+                )
             value, choices = given[name], known[name]
             if choices and value not in choices:
-                raise ConfigError(f"{name} is {value!r}, expected one of: {', '.join(choices)}")
+                raise ConfigError(
+                    f"{name} is {value!r}, expected one of: {', '.join(choices)}"
+                )
             if not choices and (type(value) is not int or not 1 <= value <= _MAX_DEPTH):
-                raise ConfigError(f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}")
+                raise ConfigError(
+                    f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}"
+                )
 
     # Requests -----------------------------------------------------------------------------------------------------
 
-    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+    def set_parameters_atomically(
+        self, parameter_list: list[Parameter]
+    ) -> SetParametersResult:
         """Set parameters together; every refusal is logged too."""
         try:
             result = super().set_parameters_atomically(parameter_list)
         except ParameterNotDeclaredException:
-            unknown = next(p.name for p in parameter_list if not self.has_parameter(p.name))
+            unknown = next(
+                p.name for p in parameter_list if not self.has_parameter(p.name)
+            )
             result = _refusal(unknown_parameter(unknown))
         if not result.successful:
             result.reason = shown(result.reason, LINE)
             self.log.warning(f"parameters refused: {result.reason}")
         return result
 
-    def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
+    def create_service(
+        self, kind: Any, name: str, callback: Any, **options: Any
+    ) -> Any:
         """Offer a service that answers every request; rclpy leaves one unanswered in which something is wrong."""
         if kind in (SetParameters, SetParametersAtomically):
             callback = self._on_set_parameters
-        return super().create_service(kind, name, partial(self._answer, callback), **options)
+        return super().create_service(
+            kind, name, partial(self._answer, callback), **options
+        )
 
     def _answer(self, callback: Any, request: Any, response: Any) -> Any:
         try:
             return callback(request, response)
-        except (ValueError, TypeError, OverflowError, AssertionError, RuntimeError) as error:
-            self.log.error(f"answered with nothing, as it cannot be worked: {type(error).__name__}: {error}")
+        except (
+            ValueError,
+            TypeError,
+            OverflowError,
+            AssertionError,
+            RuntimeError,
+        ) as error:
+            self.log.error(
+                f"answered with nothing, as it cannot be worked: {type(error).__name__}: {error}"
+            )
             return type(response)()
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
@@ -343,7 +443,9 @@ class CheckedNode(Node):
                 reason = f"parameter {shown(one.name)!r} has {what}, expected a name and a type of {known}"
                 self.log.warning(f"parameters refused: {reason}")
                 return _refusal(reason)
-        return self.set_parameters_atomically([Parameter.from_parameter_msg(one) for one in messages])
+        return self.set_parameters_atomically(
+            [Parameter.from_parameter_msg(one) for one in messages]
+        )
 
 
 def _refusal(reason: str) -> SetParametersResult:
@@ -352,14 +454,21 @@ def _refusal(reason: str) -> SetParametersResult:
 
 def _checked(name: str, field: Field, value: Any) -> Any:
     # YAML reads off as false.
-    return check(field, "off" if value is False and "off" in field.choices else value, name, ConfigError)
+    return check(
+        field,
+        "off" if value is False and "off" in field.choices else value,
+        name,
+        ConfigError,
+    )
 
 
 def _descriptor(name: str, field: Field) -> ParameterDescriptor:
     """Describe a parameter to ROS: meaning, unit, range; read-only unless it may change at run time."""
     unit = f" [{field.unit}]" if field.unit else ""
     # A whole number given for a real one, or one value for an array of one, is checked by the table.
-    described = ParameterDescriptor(description=field.description + unit, read_only=not field.runtime)
+    described = ParameterDescriptor(
+        description=field.description + unit, read_only=not field.runtime
+    )
     described.dynamic_typing = True
     bounded = math.isfinite(field.low) and math.isfinite(field.high)
     # Not in the table of settings: detectors are a layer above it.
@@ -369,7 +478,11 @@ def _descriptor(name: str, field: Field) -> ParameterDescriptor:
     elif bounded and field.kind in ("float", "numbers"):
         described.additional_constraints = f"{field.low:g} to {field.high:g}{unit}"
     if bounded and field.kind == "float":
-        described.floating_point_range = [FloatingPointRange(from_value=field.low, to_value=field.high)]
+        described.floating_point_range = [
+            FloatingPointRange(from_value=field.low, to_value=field.high)
+        ]
     if bounded and field.kind == "int":
-        described.integer_range = [IntegerRange(from_value=int(field.low), to_value=int(field.high))]
+        described.integer_range = [
+            IntegerRange(from_value=int(field.low), to_value=int(field.high))
+        ]
     return described

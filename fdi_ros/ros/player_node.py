@@ -31,7 +31,10 @@ from fdi_ros.ros.process import Stop, guarded
 
 PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
 SETTLING = 0.3  # time for the subscribers that were found to have found the player, s
-LONGEST_STEP, DISORDER = 60.0, 1.0  # a longer pause is not waited for, s; messages may stand so far out of order, s
+LONGEST_STEP, DISORDER = (
+    60.0,
+    1.0,
+)  # a longer pause is not waited for, s; messages may stand so far out of order, s
 MOST_BEHIND = 0.01  # a message is late by so much at most, s: what is due meanwhile fits into a queue at 10 kHz
 CLOCK_STEP = 1_000_000  # /clock is published at most this often, ns of recorded time
 
@@ -44,17 +47,25 @@ class PlayerNode(CheckedNode):
         values = self.values()
         if not values["bag"]:
             raise BagError("no recording given: set the parameter bag")
-        self._rate, self._patience, self._loop = (values[name] for name in ("rate", "wait", "loop"))
+        self._rate, self._patience, self._loop = (
+            values[name] for name in ("rate", "wait", "loop")
+        )
         self._paused = False
         source = source_of(self.config)
         self.recording = Recording(values["bag"])
         self.recording.require(source.topics, source.type)
-        self.outputs = [self.create_output(source.type, topic) for topic in source.topics]
-        self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
+        self.outputs = [
+            self.create_output(source.type, topic) for topic in source.topics
+        ]
+        self._clock_output = (
+            self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
+        )
         self.create_service(Trigger, "~/pause", partial(self._on_pause, True))
         self.create_service(Trigger, "~/resume", partial(self._on_pause, False))
 
-    def _on_pause(self, pause: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_pause(
+        self, pause: bool, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         response.success, response.message = True, "paused" if pause else "playing"
         if pause != self._paused:
             self.log.info(response.message)
@@ -82,8 +93,14 @@ class PlayerNode(CheckedNode):
         """Wait for a subscriber to every topic, as long as the user has patience."""
         start = time.monotonic()
         if lacking := self._without_subscriber():
-            self.log.info(f"waiting for subscribers of {lacking}, at most {self._patience:g} s")
-        while self._without_subscriber() and not stop.asked and time.monotonic() < start + self._patience:
+            self.log.info(
+                f"waiting for subscribers of {lacking}, at most {self._patience:g} s"
+            )
+        while (
+            self._without_subscriber()
+            and not stop.asked
+            and time.monotonic() < start + self._patience
+        ):
             spin(0.05)
         if (lacking := self._without_subscriber()) and not stop.asked:
             self.log.warning(f"no subscriber to {lacking}: playing all the same")
@@ -113,12 +130,18 @@ class PlayerNode(CheckedNode):
                 if not self._paused and start + due / self._rate <= now:
                     break
         if math.isnan(start):
-            raise BagError(f"{self.recording.path} holds no message of {', '.join(self.config.topics)}")
+            raise BagError(
+                f"{self.recording.path} holds no message of {', '.join(self.config.topics)}"
+            )
         return not stop.asked
 
     def _without_subscriber(self) -> str:
         """Topics that have no subscriber."""
-        return ", ".join(output.topic_name for output in self.outputs if not output.get_subscription_count())
+        return ", ".join(
+            output.topic_name
+            for output in self.outputs
+            if not output.get_subscription_count()
+        )
 
     def messages(self) -> Iterator[float]:
         """Publish the messages one by one; before each, yield when it is due, s from the first."""
@@ -132,16 +155,22 @@ class PlayerNode(CheckedNode):
                     due += step
                 else:
                     clock = None
-                    self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
+                    self.log.info(
+                        f"the time of the recording steps by {step:.0f} s, which is not waited for"
+                    )
                 last = now
                 yield due
-                if self._clock_output is not None and (clock is None or now - clock >= CLOCK_STEP):
+                if self._clock_output is not None and (
+                    clock is None or now - clock >= CLOCK_STEP
+                ):
                     clock = now
                     if not 0 <= now <= LAST_STAMP:
                         words = f"a message of {now} ns since 1970 is beyond what /clock can say"
                         raise BagError(f"{self.recording.path}: {words}")
                     sec, nanosec = divmod(now, 10**9)
-                    self._clock_output.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
+                    self._clock_output.publish(
+                        Clock(clock=Time(sec=sec, nanosec=nanosec))
+                    )
                 self.outputs[int(batch.topic[k])].publish(batch.message(k))
 
     def destroy_node(self) -> None:

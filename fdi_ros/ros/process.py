@@ -24,7 +24,14 @@ from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.system import BAGS, require
 
 TIMEOUT = 0.1  # of one turn of the executor, s, which a signal waits for; the EventsExecutor needs one to work
-ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-config-file", "--enclave")
+ROS_ARGUMENTS = (
+    "--params-file",
+    "--param",
+    "--remap",
+    "--log-level",
+    "--log-config-file",
+    "--enclave",
+)
 NODES = {
     "fdi_node": "monitor_node.MonitorNode",
     "injector_node": "injector_node.InjectorNode",
@@ -95,8 +102,12 @@ def make_executor(node: Any, auto: str = "events") -> Any:
             node.get_logger().info("executor: EventsExecutor")
         except (ImportError, RuntimeError) as error:
             if wanted == "events":
-                raise FdiError(f"executor events does not work here: {error}") from error
-            node.get_logger().info(f"executor: SingleThreadedExecutor, EventsExecutor does not work here: {error}")
+                raise FdiError(
+                    f"executor events does not work here: {error}"
+                ) from error
+            node.get_logger().info(
+                f"executor: SingleThreadedExecutor, EventsExecutor does not work here: {error}"
+            )
         else:
             return executor
     return _executor(node, events=False)
@@ -123,7 +134,9 @@ def _make(name: str) -> Any:
     return getattr(importlib.import_module(f"fdi_ros.ros.{module}"), kind)()
 
 
-def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None) -> int:
+def run(
+    name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None
+) -> int:
     """Make one of `NODES`, let it live until it is done, a signal or a shutdown; return the exit code, 0 or 2.
 
     Arguments are those of ROS, by default those of the process. Something else may make the node.
@@ -181,7 +194,9 @@ def _check_files(node: Any, arguments: list[str]) -> None:
     name = node.get_fully_qualified_name()
     for file in (file for word, file in pairwise(arguments) if word == "--params-file"):
         document = read_yaml(file, "parameter file", ConfigError)
-        if not any(re.fullmatch(pattern, name) for pattern in _node_names("", document)):
+        if not any(
+            re.fullmatch(pattern, name) for pattern in _node_names("", document)
+        ):
             raise FdiError(f"no parameters for {name} in {file}, nor in /**")
 
 
@@ -190,7 +205,11 @@ def _node_names(prefix: str, document: Any) -> Iterator[str]:
     wildcards = {"**": r"(/\w+)*", "*": r"/\w+"}
     for key, value in document.items() if isinstance(document, Mapping) else ():
         if key != "ros__parameters":
-            parts = [wildcards.get(part, "/" + re.escape(part)) for part in str(key).split("/") if part]
+            parts = [
+                wildcards.get(part, "/" + re.escape(part))
+                for part in str(key).split("/")
+                if part
+            ]
             yield from _node_names(prefix + "".join(parts), value)
         elif value:
             yield prefix

@@ -15,8 +15,23 @@ import numpy as np
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, NEVER, SUPPLY, WORKED
-from fdi_ros.monitor.diagnostics import WHOLE, InputStatus, Level, StatusLine, describe, encode_diagnostics
+from fdi_ros.core.path import (
+    HAS_EVENTS,
+    HAS_RATE,
+    MALFORMED,
+    MORE,
+    NEVER,
+    SUPPLY,
+    WORKED,
+)
+from fdi_ros.monitor.diagnostics import (
+    WHOLE,
+    InputStatus,
+    Level,
+    StatusLine,
+    describe,
+    encode_diagnostics,
+)
 from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
@@ -29,7 +44,15 @@ MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that
 ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
 NAMED = 4  # publishers of one topic that are named at most
 QUIET = 5.0  # after a line about a channel the next one waits so long, s, unless its state becomes worse
-BY_SEVERITY = ("OK", "EXCLUDED", "UNCHECKED", "SUSPECT", "STALE", "AMBIGUOUS", "FAULTY")  # states, the worst last
+BY_SEVERITY = (
+    "OK",
+    "EXCLUDED",
+    "UNCHECKED",
+    "SUSPECT",
+    "STALE",
+    "AMBIGUOUS",
+    "FAULTY",
+)  # states, the worst last
 
 
 @dataclass
@@ -45,23 +68,34 @@ class _Line:
 class ChangeLog:
     """Logs changes of state: channels that change alike in one line, and of each channel seldom more than a few."""
 
-    def __init__(self, log: BoundedLog, names: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        log: BoundedLog,
+        names: Sequence[str],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._log, self._names, self._clock = log, names, clock
         self._last = [_Line() for _ in names]
 
-    def add(self, events: Sequence[Event], shift: int, pair: ApartStatus | None) -> None:
+    def add(
+        self, events: Sequence[Event], shift: int, pair: ApartStatus | None
+    ) -> None:
         """Log what a sample has changed; shift, ns, is taken off its stamp; pair: what surely differs in a set."""
         now = self._clock()
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
             last = self._last[event.channel]
-            if now < last.until and BY_SEVERITY.index(event.after.name) <= BY_SEVERITY.index(last.state.name):
+            if now < last.until and BY_SEVERITY.index(
+                event.after.name
+            ) <= BY_SEVERITY.index(last.state.name):
                 last.left_out, last.present = last.left_out + 1, event.after
                 continue
             words = format_reason(event, self._names)
             words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
             line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
-            lines.setdefault((event.after, f"{line}{words and ': '}{words}"), []).append(event.channel)
+            lines.setdefault(
+                (event.after, f"{line}{words and ': '}{words}"), []
+            ).append(event.channel)
         for (state, words), channels in lines.items():
             self._write(state, channels, words)
 
@@ -74,7 +108,11 @@ class ChangeLog:
                 lines.setdefault(last.present, []).append(channel)
         for state, channels in lines.items():
             most = max(self._last[channel].left_out for channel in channels)
-            self._write(state, channels, f"{state.name} now, after {most} more change{'s' if most > 1 else ''}")
+            self._write(
+                state,
+                channels,
+                f"{state.name} now, after {most} more change{'s' if most > 1 else ''}",
+            )
 
     def _write(self, state: ChannelState, channels: Sequence[int], words: str) -> None:
         for channel in channels:
@@ -104,12 +142,21 @@ class InputTopic:
     @property
     def _is_unstamped(self) -> bool:
         # One may be of 0 s, not several.
-        return self._inlet["stamp"] == 0 and self._receiver.counts(self._number).get("duplicate", 0) > 0
+        return (
+            self._inlet["stamp"] == 0
+            and self._receiver.counts(self._number).get("duplicate", 0) > 0
+        )
 
     def status(self, now: int) -> InputStatus:
         """Describe the topic at the clock time now, ns."""
-        counts, receiver, watchdog = self._receiver.counts(self._number), self._receiver, self._watchdog
-        received, stamp, lag = (int(self._inlet[name]) for name in ("received", "stamp", "lag"))
+        counts, receiver, watchdog = (
+            self._receiver.counts(self._number),
+            self._receiver,
+            self._watchdog,
+        )
+        received, stamp, lag = (
+            int(self._inlet[name]) for name in ("received", "stamp", "lag")
+        )
         return InputStatus(
             name=self._name,
             topic=self.topic,
@@ -122,7 +169,10 @@ class InputTopic:
             max_lag=receiver.source.max_lag,
             offset=None if stamp == NEVER else (watchdog.at - stamp) / 1e9,
             counts=counts,
-            recent={kind: count - self._reported_counts.get(kind, 0) for kind, count in counts.items()},
+            recent={
+                kind: count - self._reported_counts.get(kind, 0)
+                for kind, count in counts.items()
+            },
             error=receiver.errors[self._number],
             unstamped=self._is_unstamped,
             parted=receiver.alignment.are_parted,
@@ -134,7 +184,9 @@ class InputTopic:
         received = int(self._inlet["received"])
         changed = self._watchdog.check(received, now)
         if changed and not self._watchdog.silent:
-            log.info(f"{self._name}: messages on {self.topic}{' again' if self._was_heard else ''}")
+            log.info(
+                f"{self._name}: messages on {self.topic}{' again' if self._was_heard else ''}"
+            )
         elif changed and not received:
             log.warning(f"{self._name}: no message yet on {self.topic}")
         elif changed:
@@ -145,15 +197,25 @@ class InputTopic:
             log.warning(f"{self.topic}: stamps are not set")
         return changed
 
-    def check_sources(self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog) -> None:
+    def check_sources(
+        self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog
+    ) -> None:
         """Log when more than one publisher comes to be on the topic, or an input before it reads the same one."""
         before, self._sources = self._sources, ""
         first = next(one for one in inputs if one.topic == self.topic)
         if first is not self:
-            self._sources = f"{self._name} and {first._name} read the same topic {self.topic}"
+            self._sources = (
+                f"{self._name} and {first._name} read the same topic {self.topic}"
+            )
         elif len(found := node.get_publishers_info_by_topic(self.topic)) > 1:
-            names = sorted(f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in found[:NAMED])
-            self._sources = shown(f"{len(found)} publishers on {self.topic}, expected one: {', '.join(names)}", LINE)
+            names = sorted(
+                f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+                for one in found[:NAMED]
+            )
+            self._sources = shown(
+                f"{len(found)} publishers on {self.topic}, expected one: {', '.join(names)}",
+                LINE,
+            )
         if self._sources and self._sources != before:
             log.warning(self._sources)
 
@@ -167,10 +229,15 @@ class InputTopic:
 class Running:
     """A configured monitor: the path of its messages, its outputs, and what an operator should know of it."""
 
-    def __init__(self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None) -> None:
+    def __init__(
+        self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None
+    ) -> None:
         self._node, self._state_file = node, state_file
         self._outputs = {
-            output: node.create_output(output.topic.type, output.topic.name, **OVERRIDABLE) for output in OUTPUTS
+            output: node.create_output(
+                output.topic.type, output.topic.name, **OVERRIDABLE
+            )
+            for output in OUTPUTS
         }
         self._diagnostics = node.create_diagnostics()
         self._latencies: deque[int] = deque(maxlen=REMEMBERED)
@@ -180,13 +247,18 @@ class Running:
         """Run a monitor from now on, its first or another one."""
         config = receiver.pipeline.config
         self.receiver = receiver
-        self.topics = [InputTopic(receiver, k, self._node.resolved(topic)) for k, topic in enumerate(config.topics)]
+        self.topics = [
+            InputTopic(receiver, k, self._node.resolved(topic))
+            for k, topic in enumerate(config.topics)
+        ]
         self._count_subscribers()
         self._changes = ChangeLog(self._node.log, receiver.pipeline.channel_names)
         self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._due = 0.0  # steady time of the next regular report, s: the first at once
-        self._at_once = MAX_AT_ONCE  # changes that may still be reported at once before it
+        self._at_once = (
+            MAX_AT_ONCE  # changes that may still be reported at once before it
+        )
         self._restarts = receiver.restarts
         self._bias_outcome = -1
         self._changed = [(0, 0)] * len(receiver.pipeline.channel_names)
@@ -209,7 +281,9 @@ class Running:
         """Take in a message, and publish what comes of it and of all samples that it completes."""
         begun, receiver = time.perf_counter_ns(), self.receiver
         # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
-        result = receiver.receive(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
+        result = receiver.receive(
+            inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP)
+        )
         while result:
             if result & SUPPLY:
                 receiver.supply()
@@ -229,7 +303,10 @@ class Running:
         in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
         pair = self.receiver.pipeline.status().apart if in_sets else None
         for event in events:
-            self._changed[event.channel] = (event.stamp, event.stamp - self.receiver.shift)
+            self._changed[event.channel] = (
+                event.stamp,
+                event.stamp - self.receiver.shift,
+            )
         self._changes.add(events, self.receiver.shift, pair)
         if self._at_once > 0:
             self._at_once -= 1
@@ -247,7 +324,9 @@ class Running:
             self._report()
         if self.receiver.restarts != self._restarts:
             self._restarts = self.receiver.restarts
-            log.warning("all stamps jumped together, or paused: the time of the samples begins anew")
+            log.warning(
+                "all stamps jumped together, or paused: the time of the samples begins anew"
+            )
         self._check_bias()
         self._changes.check()
         if (steady := time.monotonic()) >= self._due:
@@ -266,7 +345,11 @@ class Running:
         if not np.isfinite(rate):
             return "no fused rate, so nothing says that the vehicle is at rest"
         limit = self.receiver.pipeline.config.bias.max_rest_rate
-        return f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s" if rate > limit else ""
+        return (
+            f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s"
+            if rate > limit
+            else ""
+        )
 
     @property
     def _samples(self) -> int:
@@ -290,7 +373,11 @@ class Running:
         outcome = int(pipeline.core["bias"]["outcome"][0])
         if outcome != self._bias_outcome and self._samples:
             self._bias_outcome = outcome
-            say = log.warning if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION) else log.info
+            say = (
+                log.warning
+                if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION)
+                else log.info
+            )
             say(f"bias: {pipeline.status().bias_state}")
 
     def _count_anew(self, now: int) -> None:
@@ -309,7 +396,11 @@ class Running:
         now, prefix = self._node.get_clock().now().nanoseconds, self._node.prefix
         if not self._node.inputs.subscriptions:
             hardware = self.receiver.pipeline.config.hardware_id
-            lines = [StatusLine(Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware)]
+            lines = [
+                StatusLine(
+                    Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware
+                )
+            ]
         else:
             status = self.receiver.pipeline.status()
             lines = describe(
@@ -319,19 +410,28 @@ class Running:
                 silent=self._watchdog.seconds(now) if self._has_no_samples else None,
                 since=[
                     message if sample == channel.since else channel.since
-                    for channel, (sample, message) in zip(status.channels, self._changed, strict=True)
+                    for channel, (sample, message) in zip(
+                        status.channels, self._changed, strict=True
+                    )
                 ],
                 warning=self._rate_check.words,
             )
         self._diagnostics.publish(encode_diagnostics(lines, now))
 
     def _figures(self) -> list[tuple[str, str]]:
-        median, late = np.percentile(np.array(self._latencies or [0]), (50, 99), method="lower") / 1e6
+        median, late = (
+            np.percentile(np.array(self._latencies or [0]), (50, 99), method="lower")
+            / 1e6
+        )
         return [
             ("sample rate (Hz)", f"{self._watchdog.rate:.1f}"),
             ("latency p50 (ms)", f"{median:.3f}"),
             ("latency p99 (ms)", f"{late:.3f}"),
             ("samples without fused rate", str(self.receiver.live["without_rate"][0])),
             ("restarts of time", str(self._restarts)),
-            *([("state file", self._state_file.words)] if self._state_file is not None else []),
+            *(
+                [("state file", self._state_file.words)]
+                if self._state_file is not None
+                else []
+            ),
         ]

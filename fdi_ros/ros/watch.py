@@ -48,9 +48,17 @@ SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there 
 SETTLE = 1.0  # monitors appear one by one: wait for so long before one is taken for the only one, s
 STATES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-SILENT = {"fused": 1.0, "diagnostics": 3.0}  # after so long without a message the last one is no longer shown, s
+SILENT = {
+    "fused": 1.0,
+    "diagnostics": 3.0,
+}  # after so long without a message the last one is no longer shown, s
 REMEMBERED = 50  # changes of state that were not reported yet, or may be drawn
-COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
+COLOURS = {
+    Level.OK: "green",
+    Level.WARN: "yellow",
+    Level.ERROR: "bold red",
+    Level.STALE: "magenta",
+}
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
 """What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
@@ -73,12 +81,18 @@ class Picture:
     monitor: str = ""  # full name of the node
     caption: str = ""  # what else is to be known, above all; empty: nothing
     waiting: str = "looking for a monitor"  # what is waited for; empty: nothing
-    since: float = field(default_factory=time.monotonic)  # when waiting for it began, s, monotonic clock
-    whole: StatusLine = field(default_factory=lambda: StatusLine(Level.STALE, WHOLE, ""))
+    since: float = field(
+        default_factory=time.monotonic
+    )  # when waiting for it began, s, monotonic clock
+    whole: StatusLine = field(
+        default_factory=lambda: StatusLine(Level.STALE, WHOLE, "")
+    )
     channels: Mapping[str, StatusLine] = field(default_factory=dict)  # by name
     inputs: Sequence[StatusLine] = ()
     rate: tuple[float, float, float] | None = None  # fused rate, rad/s
-    heard: dict[str, float] = field(default_factory=dict)  # when the last message of each kind came, s, monotonic clock
+    heard: dict[str, float] = field(
+        default_factory=dict
+    )  # when the last message of each kind came, s, monotonic clock
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
     def is_silent(self, kind: str) -> bool:
@@ -90,13 +104,20 @@ class Picture:
         """Statistic and threshold; None: no sample is judged now."""
         found = self.whole.number("statistic"), self.whole.number("threshold")
         is_stale = self.whole.level == Level.STALE or self.is_silent("diagnostics")
-        return None if is_stale or not math.isfinite(found[0]) or not found[1] > 0 else found
+        return (
+            None
+            if is_stale or not math.isfinite(found[0]) or not found[1] > 0
+            else found
+        )
 
     def update_channels(self, channels: Mapping[str, StatusLine]) -> None:
         """Keep the present channels and remember which changed state."""
         moves: dict[tuple[Level, str], list[str]] = {}
         for name, line in channels.items():
-            before, state = self.channels[name].value("state") if name in self.channels else "", line.value("state")
+            before, state = (
+                self.channels[name].value("state") if name in self.channels else "",
+                line.value("state"),
+            )
             if state != before:
                 why = f": {line.message}" if state != "OK" and line.message else ""
                 words = f"{before} -> {state}{why}" if before else f"{state}{why}"
@@ -104,7 +125,9 @@ class Picture:
         self.channels = channels
         for (level, words), names in moves.items():
             who = "all" if len(names) == len(channels) else ", ".join(names)
-            self.changes.append(Change(time.time(), level, shown(f"{who}  {words}", LINE)))
+            self.changes.append(
+                Change(time.time(), level, shown(f"{who}  {words}", LINE))
+            )
 
 
 class Watcher(Node):
@@ -114,7 +137,9 @@ class Watcher(Node):
         super().__init__(name, start_parameter_services=False)
         self.picture = Picture(monitor)
         self._callbacks = {Imu: self._on_fused, DiagnosticArray: self._on_diagnostics}
-        self._heard_on: dict[type, Subscription[Any]] = {}  # by message type; empty: nothing is listened to yet
+        self._heard_on: dict[
+            type, Subscription[Any]
+        ] = {}  # by message type; empty: nothing is listened to yet
         self._found = math.inf
 
     def look(self) -> None:
@@ -130,14 +155,18 @@ class Watcher(Node):
 
     def _choose(self) -> str:
         services = self.get_service_names_and_types()
-        there = sorted(name[: -len(SERVICE)] for name, _ in services if name.endswith(SERVICE))
+        there = sorted(
+            name[: -len(SERVICE)] for name, _ in services if name.endswith(SERVICE)
+        )
         now = time.monotonic()
         self._found = min(self._found, now) if there else math.inf
         if not there or now - self._found < SETTLE:
             return ""
         if len(there) > 1:
             names = shown(", ".join(there), LINE)
-            raise FdiError(f"{len(there)} monitors are running: choose with --node one of {names}")
+            raise FdiError(
+                f"{len(there)} monitors are running: choose with --node one of {names}"
+            )
         return there[0]
 
     def _listen(self, monitor: str) -> str:
@@ -146,13 +175,17 @@ class Watcher(Node):
         # /diagnostics: that a topic has a publisher proves nothing.
         namespace, _, name = monitor.rpartition("/")
         try:
-            published = self.get_publisher_names_and_types_by_node(name, namespace or "/")
+            published = self.get_publisher_names_and_types_by_node(
+                name, namespace or "/"
+            )
         except NodeNameNonExistentError:
             # One that comes back has published nothing yet.
             self.picture.heard.clear()
             if self._heard_on:
                 return f"{monitor} is gone: waiting for it to come back"
-            return f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
+            return (
+                f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
+            )
         topics = {
             kind: topic
             for topic, kinds in published
@@ -160,7 +193,9 @@ class Watcher(Node):
             if kinds[0].endswith(f"/{kind.__name__}")
         }
         if len(topics) < len(self._callbacks):
-            return f"{monitor} is not configured: waiting for a lifecycle manager to do it"
+            return (
+                f"{monitor} is not configured: waiting for a lifecycle manager to do it"
+            )
         if topics != {kind: one.topic_name for kind, one in self._heard_on.items()}:
             for one in self._heard_on.values():
                 self.destroy_subscription(one)
@@ -170,10 +205,18 @@ class Watcher(Node):
             }
         if self.picture.is_silent("diagnostics"):
             # DDS goes on listing one that was killed for a while.
-            silent = f"{monitor} is silent: it was killed or hangs; " if "diagnostics" in self.picture.heard else ""
+            silent = (
+                f"{monitor} is silent: it was killed or hangs; "
+                if "diagnostics" in self.picture.heard
+                else ""
+            )
             return f"{silent}waiting for diagnostics of {monitor} on {topics[DiagnosticArray]}"
         whole = self.picture.whole
-        return f"waiting for the first sample: {whole.message}" if whole.value("samples") == "0" else ""
+        return (
+            f"waiting for the first sample: {whole.message}"
+            if whole.value("samples") == "0"
+            else ""
+        )
 
     # What no monitor sends is ignored: anybody may speak there.
     def _on_fused(self, message: Imu) -> None:
@@ -187,10 +230,16 @@ class Watcher(Node):
         with contextlib.suppress(ValueError):
             found = read_diagnostics(message, picture.monitor)
         channels = {line.name: line for line in found if line.value("state")}
-        if found and STATES.issuperset(line.value("state") for line in channels.values()):
-            picture.whole = next((line for line in found if line.name == WHOLE), picture.whole)
+        if found and STATES.issuperset(
+            line.value("state") for line in channels.values()
+        ):
+            picture.whole = next(
+                (line for line in found if line.name == WHOLE), picture.whole
+            )
             picture.inputs = [
-                line._replace(name=line.name.removeprefix(INPUT)) for line in found if line.name.startswith(INPUT)
+                line._replace(name=line.name.removeprefix(INPUT))
+                for line in found
+                if line.name.startswith(INPUT)
             ]
             picture.update_channels(channels or picture.channels)
             picture.heard["diagnostics"] = time.monotonic()
@@ -200,7 +249,9 @@ def watch(node: str = "", plain: bool = False) -> int:
     """Show a monitor, by its full name or the only one, until interrupted; `FdiError` if there is not one monitor."""
     name = f"/{node.removeprefix('/')}" if node else ""
     if name and not is_plain_name(name):
-        raise FdiError(f"--node is {node!r}, expected the full name of a node such as /drone/fdi_node")
+        raise FdiError(
+            f"--node is {node!r}, expected the full name of a node such as /drone/fdi_node"
+        )
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         # The usual end.
@@ -211,14 +262,20 @@ def watch(node: str = "", plain: bool = False) -> int:
     return 0
 
 
-def show(watcher: Watcher, plain: bool = False, over: Callable[[], bool] = lambda: False) -> None:
+def show(
+    watcher: Watcher, plain: bool = False, over: Callable[[], bool] = lambda: False
+) -> None:
     """Show a monitor until that is over: drawn in place on a terminal, elsewhere or if plain line by line."""
     is_terminal = sys.stdout.isatty() and not plain
-    showing: AbstractContextManager[Callable[[], None]] = contextlib.nullcontext(LineReport(watcher.picture).print)
+    showing: AbstractContextManager[Callable[[], None]] = contextlib.nullcontext(
+        LineReport(watcher.picture).print
+    )
     if is_terminal and CAN_DRAW and "utf" in (sys.stdout.encoding or "").lower():
         showing = drawing(watcher.picture)
     elif is_terminal:
-        print("line by line: for a view of the whole, pip install rich and use a UTF-8 terminal")
+        print(
+            "line by line: for a view of the whole, pip install rich and use a UTF-8 terminal"
+        )
     executor = SingleThreadedExecutor()
     executor.add_node(watcher)
     is_over = False
@@ -247,15 +304,27 @@ class LineReport:
 
     def lines(self) -> list[str]:
         """Return what is new since the last time; its changes are taken out of the picture."""
-        picture, now, caption, before = self._picture, time.time(), self._caption, self._said
-        whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole.message)
+        picture, now, caption, before = (
+            self._picture,
+            time.time(),
+            self._caption,
+            self._said,
+        )
+        whole = picture.waiting or (
+            "" if picture.is_silent("diagnostics") else picture.whole.message
+        )
         self._caption, self._said = picture.caption, whole
         lines = [(now, picture.caption)] if picture.caption != caption else []
         lines += [(change.at, change.words) for change in picture.changes]
         picture.changes.clear()
         if whole and (whole != before or now >= self._due):
             self._due = now + REGULAR
-            lines.append((now, whole if picture.waiting else f"{whole}{_format_figures(picture)}"))
+            lines.append(
+                (
+                    now,
+                    whole if picture.waiting else f"{whole}{_format_figures(picture)}",
+                )
+            )
         return [
             f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}  {shown(words, LINE)}"
             for at, words in lines
@@ -268,7 +337,10 @@ def _format_figures(picture: Picture) -> str:
         rate = f"fused rate{''.join(f' {value:+.3f}' for value in picture.rate)} rad/s"
     if picture.evidence is not None:
         evidence = "evidence {:.3g} of {:.3g}".format(*picture.evidence)
-    hertz, late = (picture.whole.value(key) or "none" for key in ("sample rate (Hz)", "latency p99 (ms)"))
+    hertz, late = (
+        picture.whole.value(key) or "none"
+        for key in ("sample rate (Hz)", "latency p99 (ms)")
+    )
     return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"
 
 
@@ -288,16 +360,28 @@ def drawing(picture: Picture) -> Iterator[Callable[[], None]]:
 
 def draw(picture: Picture, width: int) -> Group:
     """Draw a monitor, no line wider than the terminal."""
-    parts: list[Text | Table] = [Text(shown(picture.caption, LINE), style="bold")] if picture.caption else []
+    parts: list[Text | Table] = (
+        [Text(shown(picture.caption, LINE), style="bold")] if picture.caption else []
+    )
     parts.append(_head(picture))
     if picture.waiting:
         waited = time.monotonic() - picture.since
-        parts.append(Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow"))
+        parts.append(
+            Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow")
+        )
     if not picture.is_silent("diagnostics"):
-        parts.append(Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level]))
+        parts.append(
+            Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level])
+        )
     if not picture.channels:
         return Group(*parts)
-    parts += [Text(), _figure_table(picture), _channel_table(picture, width >= WIDE), *_input_lines(picture), Text()]
+    parts += [
+        Text(),
+        _figure_table(picture),
+        _channel_table(picture, width >= WIDE),
+        *_input_lines(picture),
+        Text(),
+    ]
     for change in list(picture.changes)[: -LATEST - 1 : -1]:
         at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
         parts.append(at.append(change.words, style=COLOURS[change.level]))
@@ -305,19 +389,33 @@ def draw(picture: Picture, width: int) -> Group:
 
 
 def _head(picture: Picture) -> Text:
-    head = Text(f"{shown(picture.monitor) or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
+    head = Text(
+        f"{shown(picture.monitor) or 'fdi_ros'}  ",
+        style="bold",
+        no_wrap=True,
+        overflow="ellipsis",
+    )
     if picture.is_silent("diagnostics"):
         return head.append("says nothing" if picture.heard else "", style="magenta")
     keys = ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector")
-    hertz, middle, late, detector = (shown(picture.whole.value(key) or "none") for key in keys)
-    return head.append(f"{hertz} Hz  latency {middle} ms (p99 {late})  {detector}", style="not bold")
+    hertz, middle, late, detector = (
+        shown(picture.whole.value(key) or "none") for key in keys
+    )
+    return head.append(
+        f"{hertz} Hz  latency {middle} ms (p99 {late})  {detector}", style="not bold"
+    )
 
 
 def _grid(widths: Sequence[int | None]) -> Table:
     """Make a table without lines; None: the column that takes what is left of the terminal."""
     table = Table.grid(padding=(0, 1), expand=True)
     for wide in widths:
-        table.add_column(width=wide, ratio=1 if wide is None else None, no_wrap=True, overflow="ellipsis")
+        table.add_column(
+            width=wide,
+            ratio=1 if wide is None else None,
+            no_wrap=True,
+            overflow="ellipsis",
+        )
     return table
 
 
@@ -327,15 +425,30 @@ def _figure_table(picture: Picture) -> Table:
     if picture.rate is None or picture.is_silent("fused"):
         table.add_row("fused", Text("no rate", style="bold red"))
     else:
-        rate = "  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True))
-        level = [parse_number(text) for text in picture.whole.value("protection level (rad/s)").split()]
+        rate = "  ".join(
+            f"{axis} {value:+.3f}"
+            for axis, value in zip("xyz", picture.rate, strict=True)
+        )
+        level = [
+            parse_number(text)
+            for text in picture.whole.value("protection level (rad/s)").split()
+        ]
         known = bool(level) and all(map(math.isfinite, level))
-        table.add_row("fused", f"{rate} rad/s", Text(f"within {max(level):.2g}" if known else "", style=GREY))
+        table.add_row(
+            "fused",
+            f"{rate} rad/s",
+            Text(f"within {max(level):.2g}" if known else "", style=GREY),
+        )
     if picture.evidence is None:
         table.add_row("evidence", Text("none: no sample is being judged", style=GREY))
     else:
         statistic, threshold = picture.evidence
-        bar = Bar(threshold, 0.0, min(statistic, threshold), color="red" if statistic >= threshold else "cyan")
+        bar = Bar(
+            threshold,
+            0.0,
+            min(statistic, threshold),
+            color="red" if statistic >= threshold else "cyan",
+        )
         table.add_row("evidence", bar, f"{statistic:.3g} of {threshold:.3g}")
     return table
 
@@ -343,20 +456,46 @@ def _figure_table(picture: Picture) -> Table:
 def _channel_table(picture: Picture, is_wide: bool) -> Table:
     """Draw one row per channel: state, residual, and where there is room the bias."""
     is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
-    residuals = {name: line.number("residual (rad/s)") for name, line in picture.channels.items()}
-    sizes = {name: abs(value) if math.isfinite(value) else 0.0 for name, value in residuals.items()}
-    scale = next((scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1])
+    residuals = {
+        name: line.number("residual (rad/s)") for name, line in picture.channels.items()
+    }
+    sizes = {
+        name: abs(value) if math.isfinite(value) else 0.0
+        for name, value in residuals.items()
+    }
+    scale = next(
+        (scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1]
+    )
     table = _grid((max(len(shown(name)) for name in sizes), 9, None, 9, 18)[:columns])
-    heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")
+    heads = (
+        "channel",
+        "state",
+        f"residual, to {scale:g} rad/s",
+        "rad/s",
+        "bias, rad/s",
+    )
     table.add_row(*(Text(word, style=GREY) for word in heads[:columns]))
     for name, line in picture.channels.items():
         # A string would be taken for markup.
-        cells: list[Text | Bar | str] = [Text(shown(name)), Text("?", style=GREY), Bar(scale, 0.0, 0.0), "none", "none"]
+        cells: list[Text | Bar | str] = [
+            Text(shown(name)),
+            Text("?", style=GREY),
+            Bar(scale, 0.0, 0.0),
+            "none",
+            "none",
+        ]
         if is_fresh:
             colour, residual = COLOURS[line.level], residuals[name]
-            bar = Bar(scale, 0.0, min(sizes[name], scale), color=colour.removeprefix("bold "))
+            bar = Bar(
+                scale, 0.0, min(sizes[name], scale), color=colour.removeprefix("bold ")
+            )
             figure = f"{residual:+.4f}" if math.isfinite(residual) else "none"
-            cells[1:] = [Text(line.value("state"), style=colour), bar, figure, _format_bias(line)]
+            cells[1:] = [
+                Text(line.value("state"), style=colour),
+                bar,
+                figure,
+                _format_bias(line),
+            ]
         table.add_row(*cells[:columns])
     return table
 
@@ -373,6 +512,14 @@ def _input_lines(picture: Picture) -> list[Text]:
         return []
     odd = [line for line in picture.inputs if line.level != Level.OK]
     if odd:
-        return [Text(shown(f"input {line.name}: {line.message}", LINE), style=COLOURS[line.level]) for line in odd]
-    rates = ", ".join(f"{line.name} {line.value('rate (Hz)')} Hz" for line in picture.inputs)
+        return [
+            Text(
+                shown(f"input {line.name}: {line.message}", LINE),
+                style=COLOURS[line.level],
+            )
+            for line in odd
+        ]
+    rates = ", ".join(
+        f"{line.name} {line.value('rate (Hz)')} Hz" for line in picture.inputs
+    )
     return [Text(shown(f"inputs   {rates}", LINE), no_wrap=True, overflow="ellipsis")]

@@ -25,7 +25,9 @@ from fdi_ros.setup.blocks import WINDOW, Data
 
 LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s: biases are mostly less
 LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
-LEAST_WINDOWS = 20  # in motion; with fewer, units are not compared, and no mount is estimated
+LEAST_WINDOWS = (
+    20  # in motion; with fewer, units are not compared, and no mount is estimated
+)
 SHARED, SAME = 0.7, 0.9
 """Share of rotation in common, or correlation: less contradicts, more shows the rotation, if along other axes or on
 another scale. Vibration and late stamps take some of it."""
@@ -47,7 +49,9 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
     if len(means) < LEAST_WINDOWS:
         return
     _check_units(means, nominal, unknown)
-    rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1)
+    rate = np.median(
+        np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1
+    )
     moving = means[rate >= LEAST_ROTATION / 2]
     if len(moving) >= LEAST_WINDOWS and not unknown:
         _check_response(moving, nominal)
@@ -55,7 +59,11 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
 
 def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> None:
     """Refuse a unit that turns by another factor than most, such as deg/s, or about other axes."""
-    units = [list(unit) for unit in nominal.units if len(unit) == 3 and spans_space(nominal.axes[list(unit)])]
+    units = [
+        list(unit)
+        for unit in nominal.units
+        if len(unit) == 3 and spans_space(nominal.axes[list(unit)])
+    ]
     if len(units) < 2:
         return
     turning = np.array([np.linalg.norm(means[:, unit], axis=1) for unit in units])
@@ -65,14 +73,21 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     turning, means = np.maximum(turning[:, moving], 1e-9), means[moving]
     ratio = np.median(turning[:, None] / turning[None], axis=2)
     # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
-    along = np.sqrt(np.maximum([np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in units], 1e-18))
+    along = np.sqrt(
+        np.maximum(
+            [np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in units], 1e-18
+        )
+    )
     least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
     alike = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
     rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
     # Of what is mounted nobody knows how, the axes say nothing.
     known = [not {*unit} & {*unknown} for unit in units]
     turn = [
-        [not (known[k] and known[j]) or _in_common(one, other) > SHARED for j, other in enumerate(rates)]
+        [
+            not (known[k] and known[j]) or _in_common(one, other) > SHARED
+            for j, other in enumerate(rates)
+        ]
         for k, one in enumerate(rates)
     ]
     agree = alike & np.array(turn)
@@ -80,12 +95,25 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     odd = next((k for k in range(len(units)) if k not in most), None)
     if odd is None:
         return
-    names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in units]
-    name, others, mend = names[odd], " and ".join(names[k] for k in most), "or name its channels in excluded_channels"
+    names = [
+        nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad"
+        for unit in units
+    ]
+    name, others, mend = (
+        names[odd],
+        " and ".join(names[k] for k in most),
+        "or name its channels in excluded_channels",
+    )
     if alike[odd, most].all():
-        doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
+        doubt = (
+            ""
+            if len(most) > 1
+            else " (or the other way round: nothing decides between two)"
+        )
         true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
-        shares = [_in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES]
+        shares = [
+            _in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES
+        ]
         words = f"{name} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])}, against {others}{doubt}: mend its driver"
         words += f" or mount, {mend}"
         if max(shares) < SAME:
@@ -94,7 +122,9 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     elif 2 * len(most) > len(units):
         words = f"{name} shows {np.median(ratio[odd, most]):.3g} times the rotation that {others} show: mend it {mend}"
     else:
-        low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
+        low, high = (
+            int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax)
+        )
         words = f"{' and '.join(names)} do not show one rotation, and nothing decides which is right: {names[high]}"
         words += f" shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
     raise DisagreementError(words)
@@ -103,7 +133,11 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
 def _wrong_axes(signed: Array) -> str:
     """Say what a unit shows whose channels are these rows (3, 3) of its axes as configured."""
     # x forward, y left, z up.
-    seen = ("a roll to the right as one to the left", "nose up as nose down", "a left turn as a right turn")
+    seen = (
+        "a roll to the right as one to the left",
+        "nose up as nose down",
+        "a left turn as a right turn",
+    )
     if (np.diag(signed) != 0.0).all():
         return " and ".join(f"shows {seen[a]}" for a in range(3) if signed[a, a] < 0.0)
     kind = "has mirrored axes" if np.linalg.det(signed) < 0 else "has swapped axes"
@@ -112,12 +146,17 @@ def _wrong_axes(signed: Array) -> str:
 
 def _axes_of(signed: Array) -> list[str]:
     """Name the axis, with its sign, that each row of signed axes (3, 3) is along."""
-    return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in signed]
+    return [
+        f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}"
+        for row in signed
+    ]
 
 
 def _in_common(one: Array, other: Array) -> float:
     """Share of the rotation (W, 3) of two units that they have in common."""
-    return 1.0 - float(((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30))
+    return 1.0 - float(
+        ((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30)
+    )
 
 
 def _check_response(moving: Array, nominal: Geometry) -> None:
@@ -131,8 +170,14 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
             continue
         response, seen = np.median(found, axis=0).tolist()
         shows = f"{response:.0%} of" if abs(response) < 1 else f"{response:.3g} times"
-        alike = [nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])]
-        which = f", and nothing decides which of {', '.join(alike)} is right" if len(alike) > 1 else ""
+        alike = [
+            nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])
+        ]
+        which = (
+            f", and nothing decides which of {', '.join(alike)} is right"
+            if len(alike) > 1
+            else ""
+        )
         raise DisagreementError(
             f"{name} does not follow the rotation: it shows {shows} the {seen:.2f} rad/s rms that the others see along"
             f" its axis{which}; mend {'the one that is wrong' if which else 'it'} or name it in excluded_channels"
@@ -145,16 +190,22 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
     ``square``: mean products (n, n) of the channels, (rad/s)^2.
     """
     size, found = float(np.sqrt(square[i, i])), []
-    for three in map(list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)):
+    for three in map(
+        list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)
+    ):
         if not spans_space(axes[three]):
             continue
         gain = np.linalg.solve(axes[three].T, axes[i])
-        seen = float(np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0)))
+        seen = float(
+            np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0))
+        )
         if seen < LEAST_ROTATION:
             return []
         response = float(gain @ square[three, i]) / seen**2
         small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
-        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > SAME * size
+        large = (
+            abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > SAME * size
+        )
         if not small and not large:
             return []
         found.append((response, seen))
@@ -164,10 +215,16 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 # How the units are turned against each other --------------------------------------------------------------------------
 
 
-LEAST_RATE = LEAST_ROTATION / 5  # rotation about some axis, root mean square, below which nothing turns, rad/s
-LARGEST_ERROR = np.radians(2.0)  # a mount less certain than this, in any direction, is not shown
+LEAST_RATE = (
+    LEAST_ROTATION / 5
+)  # rotation about some axis, root mean square, below which nothing turns, rad/s
+LARGEST_ERROR = np.radians(
+    2.0
+)  # a mount less certain than this, in any direction, is not shown
 SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
-SQUARE = np.radians(10.0)  # a mount this close to axes along axes is taken for that: the rest is misalignment
+SQUARE = np.radians(
+    10.0
+)  # a mount this close to axes along axes is taken for that: the rest is misalignment
 
 
 def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
@@ -184,13 +241,17 @@ def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
         return rotation, mirrored, math.inf
     a, b, c = size * sign
     gram = (left * size**2) @ left.T
-    spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / ((a + b) * (b + c) * (c + a))
+    spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / (
+        (a + b) * (b + c) * (c + a)
+    )
     return rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1])
 
 
 def angle_of(rotation: Array) -> float:
     """Angle of a rotation (3, 3), rad."""
-    return 2.0 * math.asin(min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0))
+    return 2.0 * math.asin(
+        min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0)
+    )
 
 
 @dataclass(frozen=True)
@@ -198,11 +259,19 @@ class Mount:
     """How one unit is turned against the first."""
 
     words: str  # what it is, or why it is not known
-    shared: float = 0.0  # share of the rotation of the unit that is that of the first one
-    rotation: Array | None = None  # (3, 3) by rows: v_first = R v_unit; None: it is not shown
+    shared: float = (
+        0.0  # share of the rotation of the unit that is that of the first one
+    )
+    rotation: Array | None = (
+        None  # (3, 3) by rows: v_first = R v_unit; None: it is not shown
+    )
     off: float = 0.0  # what it was measured to be away from `rotation`, rad
-    error: float = math.inf  # standard error in the least certain direction, rad; infinite: not shown at all
-    contradicts: bool = False  # it turns, and not as the first unit does, however it may be mounted
+    error: float = (
+        math.inf
+    )  # standard error in the least certain direction, rad; infinite: not shown at all
+    contradicts: bool = (
+        False  # it turns, and not as the first unit does, however it may be mounted
+    )
     mirrored: bool = False  # one of the two is no right-handed frame
 
 
@@ -212,31 +281,54 @@ def find_mounts(data: Data) -> tuple[Mount, ...]:
     # What is taken off must turn with the unit: means do, medians do not.
     means = means - means.mean(axis=0) if len(means) else means
     first = Mount("the body frame is taken to be its own", 1.0, np.eye(3), error=0.0)
-    return (first, *(_against(means[:, :3], means[:, k : k + 3]) for k in range(3, means.shape[1], 3)))
+    return (
+        first,
+        *(
+            _against(means[:, :3], means[:, k : k + 3])
+            for k in range(3, means.shape[1], 3)
+        ),
+    )
 
 
 def _against(first: Array, unit: Array) -> Mount:
     """Mount of a unit whose rates are these (W, 3) against the one that shows first (W, 3), rad/s."""
     if len(unit) < LEAST_WINDOWS:
-        return Mount(f"NOT KNOWN: only {len(unit) * WINDOW:.0f} s in which every unit gives values")
-    most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0))[:0:-1]
+        return Mount(
+            f"NOT KNOWN: only {len(unit) * WINDOW:.0f} s in which every unit gives values"
+        )
+    most, second = np.sqrt(
+        np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
+    )[:0:-1]
     if most < LEAST_RATE:
         return Mount(f"NOT KNOWN: it does not turn ({most:.2g} rad/s rms)")
     rotation, mirrored, uncertainty = find_turn(first, unit)
     if math.isinf(uncertainty):
-        return Mount("NOT KNOWN: it and the first unit never turn about two axes together")
-    power, square = max(float((first**2).sum()), 1e-30), (first - unit @ rotation.T) ** 2
+        return Mount(
+            "NOT KNOWN: it and the first unit never turn about two axes together"
+        )
+    power, square = (
+        max(float((first**2).sum()), 1e-30),
+        (first - unit @ rotation.T) ** 2,
+    )
     missed = float(square.sum()) / power
     shared, error = 1.0 - missed, math.sqrt(float(np.mean(square)) * uncertainty)
     if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
-        return Mount("NOT KNOWN: mirrored against the first unit", shared, contradicts=True, mirrored=True)
+        return Mount(
+            "NOT KNOWN: mirrored against the first unit",
+            shared,
+            contradicts=True,
+            mirrored=True,
+        )
     # Then most of what it shows is not of this rotation.
     if shared < 0.5:
         words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
         return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
-        return Mount(f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg", shared)
+        return Mount(
+            f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg",
+            shared,
+        )
     # Vibration that units see differently looks like a turn between them, however long it lasts.
     doubt = math.sqrt(missed) * min(1.0, math.sqrt(missed) / UNEQUAL)
     # Of all signed axes, a mirrored one is never the nearest.
@@ -246,7 +338,10 @@ def _against(first: Array, unit: Array) -> Mount:
         words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)
-    along = ", ".join(f"{body} is its {axis}" for body, axis in zip("xyz", _axes_of(nearest), strict=True))
+    along = ", ".join(
+        f"{body} is its {axis}"
+        for body, axis in zip("xyz", _axes_of(nearest), strict=True)
+    )
     turn = "as the first" if (nearest == np.eye(3)).all() else f"turned: body {along}"
     words = f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
     return Mount(words, shared, nearest, off, error)

@@ -23,7 +23,9 @@ from fdi_ros.setup.noise import projector
 WINDOW = 0.25  # over which rates are averaged to compare units, s: turns by hand stay, noise goes
 SPIKE = 25.0  # usual sizes beyond which a value is a spike: vibration has tails, too
 SPIKE_PORTION = 256  # samples looked at at once
-MEDIAN_TO_RMS = 1.4826  # of normal errors: standard deviation over median absolute deviation
+MEDIAN_TO_RMS = (
+    1.4826  # of normal errors: standard deviation over median absolute deviation
+)
 
 
 @dataclass
@@ -32,7 +34,9 @@ class Data:
 
     stamp: NDArray[np.int64]  # (N,) ns
     z: Array  # (N, n) rad/s, NaN where not usable
-    unusable: dict[str, Int]  # (n,) samples not usable, by the reason: missing, not_finite, out_of_range, repeated
+    unusable: dict[
+        str, Int
+    ]  # (n,) samples not usable, by the reason: missing, not_finite, out_of_range, repeated
 
     def __post_init__(self) -> None:
         self.seconds: Array = np.asarray(
@@ -40,7 +44,9 @@ class Data:
         )  # (N,) since the first sample
         self.duration = float(self.seconds[-1]) if len(self.stamp) else 0.0  # s
         # Usual time from sample to sample, s.
-        self.step = float(np.median(np.diff(self.stamp))) * 1e-9 if len(self.stamp) > 1 else 0.0
+        self.step = (
+            float(np.median(np.diff(self.stamp))) * 1e-9 if len(self.stamp) > 1 else 0.0
+        )
 
     def slow_rates(self) -> Array:
         """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
@@ -50,7 +56,12 @@ class Data:
         # A window at the end, or beside a gap, may hold few samples.
         complete = np.logical_and.reduceat(np.isfinite(self.z).all(axis=1), starts)
         good = complete & (counts >= 0.5 * np.median(counts))
-        means = np.add.reduceat(np.where(np.isfinite(self.z), self.z, 0.0), starts, axis=0)[good] / counts[good, None]
+        means = (
+            np.add.reduceat(np.where(np.isfinite(self.z), self.z, 0.0), starts, axis=0)[
+                good
+            ]
+            / counts[good, None]
+        )
         return np.asarray(means - np.median(means, axis=0)) if len(means) else means
 
 
@@ -69,7 +80,9 @@ def prepare(block: Block, max_rate: Array) -> Data:
         "out_of_range": received & finite & ~inside,
         "repeated": old,
     }
-    data.unusable.update({why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()})
+    data.unusable.update(
+        {why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()}
+    )
     return data
 
 
@@ -105,7 +118,9 @@ def least_run(step: float) -> int:
 
 def run_lengths(values: Array) -> NDArray[np.int64]:
     """Lengths of the runs of one value in values (N,), N > 0, in order."""
-    return np.diff(np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]])))
+    return np.diff(
+        np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]]))
+    )
 
 
 def repeated(z: Array, step: float) -> Mask:
@@ -116,7 +131,9 @@ def repeated(z: Array, step: float) -> Mask:
         long = np.repeat(lengths >= least, lengths)
         if long.any():
             others = values[np.isfinite(values) & ~long]
-            spans = np.sort(others[: len(others) // least * least].reshape(-1, least), axis=1)
+            spans = np.sort(
+                others[: len(others) // least * least].reshape(-1, least), axis=1
+            )
             different = (np.diff(spans, axis=1) > 0).sum(axis=1) + 1
             # Where all values hardly change when it is quiet, one that stays is rest.
             coarse = len(spans) > 0 and np.percentile(different, 10.0) <= 3.0
@@ -140,7 +157,9 @@ class Repeats:
             if column[0] == self._last[k]:
                 before = int(self._run[k])
                 lengths[0] += before
-            self.count[k] += lengths[lengths >= least].sum() - (before if before >= least else 0)
+            self.count[k] += lengths[lengths >= least].sum() - (
+                before if before >= least else 0
+            )
             self._last[k], self._run[k] = column[-1], lengths[-1]
 
 
@@ -158,15 +177,25 @@ class Blocks:
     mean: Array  # (B, n) rad/s; NaN where a channel lacks a sample
     start: Int  # (W,) first block of each window
     samples: Array  # (W, n, n) covariance of single samples in each window, (rad/s)^2; NaN: a channel is missing
-    white: Array  # (n,) what interpolation has left of the variance of white noise in them
+    white: (
+        Array  # (n,) what interpolation has left of the variance of white noise in them
+    )
     count: Int  # (W,) samples that it is of
 
     def __post_init__(self) -> None:
         self.windows = len(self.start)
-        self.size = np.diff(self.start, append=len(self.mean))  # (W,) blocks of each window
-        self.window = np.repeat(np.arange(self.windows), self.size)  # (B,) that each block is in
-        self.length = float(np.median(np.diff(self.seconds)))  # usual time from block to block, s
-        self.time = np.add.reduceat(self.seconds, self.start) / self.size  # (W,) middle of each window, s
+        self.size = np.diff(
+            self.start, append=len(self.mean)
+        )  # (W,) blocks of each window
+        self.window = np.repeat(
+            np.arange(self.windows), self.size
+        )  # (B,) that each block is in
+        self.length = float(
+            np.median(np.diff(self.seconds))
+        )  # usual time from block to block, s
+        self.time = (
+            np.add.reduceat(self.seconds, self.start) / self.size
+        )  # (W,) middle of each window, s
 
 
 def make_blocks(data: Data, delay: Array) -> Blocks:
@@ -177,7 +206,10 @@ def make_blocks(data: Data, delay: Array) -> Blocks:
     first = np.flatnonzero(np.diff(number, prepend=-1))
     start = np.flatnonzero(np.diff(number[first] // REST_BLOCKS, prepend=-1))
     z, white = resampled(data, delay)
-    samples, used = np.full((len(start), *z.shape[1:] * 2), np.nan), np.zeros(len(start), dtype=np.int64)
+    samples, used = (
+        np.full((len(start), *z.shape[1:] * 2), np.nan),
+        np.zeros(len(start), dtype=np.int64),
+    )
     for w, part in enumerate(np.split(z, first[start[1:]])):
         there = np.isfinite(part)
         columns = np.flatnonzero(there.mean(axis=0) >= PRESENT)
@@ -187,7 +219,10 @@ def make_blocks(data: Data, delay: Array) -> Blocks:
             part = part - part.mean(axis=0)
             samples[w][np.ix_(columns, columns)] = part.T @ part / (len(part) - 1)
     count = np.diff(first, append=len(z))
-    mean, seconds = np.add.reduceat(z, first, axis=0) / count[:, None], np.add.reduceat(data.seconds, first) / count
+    mean, seconds = (
+        np.add.reduceat(z, first, axis=0) / count[:, None],
+        np.add.reduceat(data.seconds, first) / count,
+    )
     return Blocks(seconds, mean, start, samples, white, used)
 
 
@@ -196,22 +231,39 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
 
     Returns values (N, n) rad/s, NaN: not known; and what is left (n,) of the variance of white noise.
     """
-    seconds, there, z, white = data.seconds, np.isfinite(data.z), data.z.copy(), np.ones(len(delay))
-    left = [i for i in range(len(delay)) if not there[:, i].all() or abs(delay[i]) >= NOT_SHIFTED]
+    seconds, there, z, white = (
+        data.seconds,
+        np.isfinite(data.z),
+        data.z.copy(),
+        np.ones(len(delay)),
+    )
+    left = [
+        i
+        for i in range(len(delay))
+        if not there[:, i].all() or abs(delay[i]) >= NOT_SHIFTED
+    ]
     while left:
         i = left[0]
         # Channels alike in delay and in samples that they have.
-        alike = [j for j in left if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()]
+        alike = [
+            j
+            for j in left
+            if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()
+        ]
         left = [j for j in left if j not in alike]
         rows = np.flatnonzero(there[:, i])
         knots, squares, count = seconds[rows], 0.0, 0
         usual = float(np.median(np.diff(knots))) if len(rows) > 1 else 0.0
         z[:, alike] = np.nan
         for begin in range(0, len(z), PORTION):
-            first, weight = lagrange_weights(knots, seconds[begin : begin + PORTION] + delay[i], usual)
+            first, weight = lagrange_weights(
+                knots, seconds[begin : begin + PORTION] + delay[i], usual
+            )
             known = np.flatnonzero(first >= 0)
             around = rows[first[known, None] + np.arange(POINTS)]
-            values = np.einsum("mp,mpc->mc", weight[known], data.z[around[..., None], alike])
+            values = np.einsum(
+                "mp,mpc->mc", weight[known], data.z[around[..., None], alike]
+            )
             z[np.ix_(begin + known, np.array(alike))] = values
             squares, count = squares + (weight[known] ** 2).sum(), count + len(known)
         white[alike] = squares / count if count else 1.0
@@ -228,8 +280,14 @@ def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
     first = np.clip(np.searchsorted(knots, x) - POINTS // 2, 0, len(knots) - POINTS)
     around = knots[first[:, None] + np.arange(POINTS)]
     # With a sample missing they span one interval more.
-    there = (np.ptp(around, axis=1) < (POINTS - 0.5) * usual) & (around[:, 0] <= x) & (x <= around[:, -1])
+    there = (
+        (np.ptp(around, axis=1) < (POINTS - 0.5) * usual)
+        & (around[:, 0] <= x)
+        & (x <= around[:, -1])
+    )
     # Each with itself gives the factor 1.
     apart = around[:, :, None] - around[:, None, :] + np.eye(POINTS)
-    from_x = np.where(np.eye(POINTS, dtype=bool), 1.0, (x[:, None] - around)[:, None, :])
+    from_x = np.where(
+        np.eye(POINTS, dtype=bool), 1.0, (x[:, None] - around)[:, None, :]
+    )
     return np.where(there, first, -1), np.asarray((from_x / apart).prod(axis=2))

@@ -23,29 +23,63 @@ from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.monitor.pipeline import CHANNEL_DELAY, UNIT_DELAY, Pipeline, build_geometry, build_noise
+from fdi_ros.monitor.pipeline import (
+    CHANNEL_DELAY,
+    UNIT_DELAY,
+    Pipeline,
+    build_geometry,
+    build_noise,
+)
 from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
-from fdi_ros.setup.agreement import LEAST_RATE, LEAST_ROTATION, LEAST_WINDOWS, SHOWN, check_agreement
-from fdi_ros.setup.blocks import NOT_SHIFTED, Data, flag_runs, prepare, resampled, spikes
+from fdi_ros.setup.agreement import (
+    LEAST_RATE,
+    LEAST_ROTATION,
+    LEAST_WINDOWS,
+    SHOWN,
+    check_agreement,
+)
+from fdi_ros.setup.blocks import (
+    NOT_SHIFTED,
+    Data,
+    flag_runs,
+    prepare,
+    resampled,
+    spikes,
+)
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.noise import projector
 
-UNKNOWN_MOUNT = 0.58  # of each component of an axis that may point anywhere: the root of a third
-UNMEASURED = SCALE_STD / 2  # uncertainty of the axes along a direction of the body from which they are not measured
+UNKNOWN_MOUNT = (
+    0.58  # of each component of an axis that may point anywhere: the root of a third
+)
+UNMEASURED = (
+    SCALE_STD / 2
+)  # uncertainty of the axes along a direction of the body from which they are not measured
 UNKNOWN_AXES = 0.1  # the same of an array; axes from the motion alone are taken if they are off by more
 REFERENCE_STD = 1e-6  # of channels that are taken for as configured
-LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = 10.0, 100, 1.0  # s, samples, and s from one to the next
+LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
+    10.0,
+    100,
+    1.0,
+)  # s, samples, and s from one to the next
 LEAST_USABLE = 0.3  # share of its samples that a channel must give
 MOST_FAULTY = 0.35  # share of the recording; of a channel faulty for longer it cannot be said which is right
-MOST_LEFT_OUT = 1 / 3  # share of the channels of a set that is left out: of a larger one nobody knows which are right
+MOST_LEFT_OUT = (
+    1 / 3
+)  # share of the channels of a set that is left out: of a larger one nobody knows which are right
 LOUDER = 4.0
 """A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
 would not believe, as the motion begins, that it is vibration."""
-LEAD = 1.0  # s before a declaration that a fault may have begun: most are declared sooner
+LEAD = (
+    1.0  # s before a declaration that a fault may have begun: most are declared sooner
+)
 LEAST_SKEW = 5e-5  # what imus.max_skew is at least where delays smaller than it are to be taken off, s
 WAITS = 2.5  # what imus.timeout is at least, in differences of the delays of units
-REPLACED = ("imus.mounts", "geometry.cone_channels")  # parameters that say nothing any more beside geometry.axes
+REPLACED = (
+    "imus.mounts",
+    "geometry.cone_channels",
+)  # parameters that say nothing any more beside geometry.axes
 
 
 class StampDelay(NamedTuple):
@@ -79,17 +113,27 @@ class Calibration:
     timing: float  # what is not known of the sampling instants, s, as written
     delays: tuple[StampDelay, ...]  # of all units but the first
     faults: tuple[Span, ...]
-    unusable: dict[str, Int]  # (n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes
+    unusable: dict[
+        str, Int
+    ]  # (n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes
     duration: float  # of the recording, s
-    settings: dict[str, object]  # parameters to be changed, ``{"section.field": value}``
-    spectrum: Spectrum  # of what channels differ by from the fused rate with these settings
+    settings: dict[
+        str, object
+    ]  # parameters to be changed, ``{"section.field": value}``
+    spectrum: (
+        Spectrum  # of what channels differ by from the fused rate with these settings
+    )
 
     def __post_init__(self) -> None:
         found, n = self.estimate, len(self.names)
         self.axes = axes = found.axes  # (n, 3)
         self.axes_std = np.sqrt(np.diag(found.axes_covariance)).reshape(-1, 3)
-        self.bias_std = np.sqrt(np.diag(found.bias_covariance))  # (n,) of the mean biases, rad/s
-        self.scale = found.disagreement()  # scale error left between channels, as written, and its uncertainty
+        self.bias_std = np.sqrt(
+            np.diag(found.bias_covariance)
+        )  # (n,) of the mean biases, rad/s
+        self.scale = (
+            found.disagreement()
+        )  # scale error left between channels, as written, and its uncertainty
         # (n,) angle between calibrated and nominal axes, rad, and its standard error in each of two directions.
         sine = np.linalg.norm(np.cross(axes, self.nominal), axis=1)
         self.angle = np.arctan2(sine, (axes * self.nominal).sum(axis=1))
@@ -103,16 +147,23 @@ class Calibration:
         self.angle_error = np.sqrt(np.maximum(across, 0) / 2) / length
         # (3,) uncertainty of the disagreement of axes along x, y and z of the body.
         apart = projector(axes)
-        squares = [np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)]
+        squares = [
+            np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)
+        ]
         self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
         # (n,) channels whose scale factor the recording shows, against the others.
         self.measured = np.sqrt(along**2 @ self.axis_errors**2) < UNMEASURED
         # Places of the channels of each unit; of an array without units each channel is alone.
         unit_of = [name.rpartition(".")[0] or name for name in self.names]
-        self.units = [[i for i, one in enumerate(unit_of) if one == unit] for unit in dict.fromkeys(unit_of)]
+        self.units = [
+            [i for i, one in enumerate(unit_of) if one == unit]
+            for unit in dict.fromkeys(unit_of)
+        ]
 
 
-def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:
+def calibrate(
+    block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()
+) -> Calibration:
     """Calibrate all channels that are not excluded: the more rest and rotation about all axes, the more is shown.
 
     ``reference``: name of the triad that is taken for as configured, or of three channels with commas between; empty:
@@ -121,11 +172,15 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
     contradict each other, naming which.
     """
     full = build_geometry(config)
-    used = np.array([name not in config.excluded_channels for name in full.channel_names])
+    used = np.array(
+        [name not in config.excluded_channels for name in full.channel_names]
+    )
     active, nominal = np.flatnonzero(used), full.subset(used)
     chosen = reference_channels(config, nominal, reference)
     rates = np.broadcast_to(np.array(config.health.max_rate), full.n)
-    data = prepare(Block(block.stamp, block.z[:, used], block.delivered[:, used]), rates[used])
+    data = prepare(
+        Block(block.stamp, block.z[:, used], block.delivered[:, used]), rates[used]
+    )
     _check_amount(data, nominal.channel_names)
     spiky = spikes(data.z, nominal.axes)
     data.z[spiky] = np.nan
@@ -146,14 +201,24 @@ def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequen
         if faults:
             found = estimate(_without(faults, data, nominal.channel_names), sensors)
     except np.linalg.LinAlgError as error:
-        raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
-    units = [tuple(np.flatnonzero(sensors.unit == k).tolist()) for k in range(1, sensors.units)]
+        raise CalibrationError(
+            f"the recording leaves the fit undetermined ({error})"
+        ) from error
+    units = [
+        tuple(np.flatnonzero(sensors.unit == k).tolist())
+        for k in range(1, sensors.units)
+    ]
     return Calibration(
         names=nominal.channel_names,
         nominal=nominal.axes,
         estimate=found,
         timing=float(_timing(config, active, found).max()),
-        delays=tuple(StampDelay(unit, float(found.delay[unit[0]]), float(found.delay_std[unit[0]])) for unit in units),
+        delays=tuple(
+            StampDelay(
+                unit, float(found.delay[unit[0]]), float(found.delay_std[unit[0]])
+            )
+            for unit in units
+        ),
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
@@ -179,7 +244,10 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
         share = len(seconds) * usual / (samples * data.step)
         if share < LEAST_USABLE:
-            lost = ", ".join(f"{count[i]} {why.replace('_', ' ')}" for why, count in data.unusable.items())
+            lost = ", ".join(
+                f"{count[i]} {why.replace('_', ' ')}"
+                for why, count in data.unusable.items()
+            )
             raise CalibrationError(
                 f"{name} gives a usable value in {share:.0%} of its samples, expected at least {LEAST_USABLE:.0%}"
                 f" ({lost}): mend it or name it in excluded_channels"
@@ -191,10 +259,22 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
     names, units = geometry.channel_names, source_of(config).units
     if not name:
         threes = map(list, itertools.combinations(range(geometry.n), 3))
-        return [] if units else next(three for three in threes if spans_space(geometry.axes[three]))
-    wanted = [f"{name}.{axis}" for axis in "xyz"] if name in units else [part.strip() for part in name.split(",")]
+        return (
+            []
+            if units
+            else next(three for three in threes if spans_space(geometry.axes[three]))
+        )
+    wanted = (
+        [f"{name}.{axis}" for axis in "xyz"]
+        if name in units
+        else [part.strip() for part in name.split(",")]
+    )
     chosen = [names.index(part) for part in wanted if part in names]
-    if len(wanted) != 3 or len(set(chosen)) != 3 or not spans_space(geometry.axes[chosen]):
+    if (
+        len(wanted) != 3
+        or len(set(chosen)) != 3
+        or not spans_space(geometry.axes[chosen])
+    ):
         triads = f"one of: {', '.join(units)}; or " if units else ""
         raise ConfigError(
             f"--reference is {name!r}, expected {triads}three of: {', '.join(names)}, in use and not in one plane"
@@ -202,9 +282,15 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
     return chosen
 
 
-def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], lost: list[int]) -> Priors:
+def _sensors(
+    config: Config, nominal: Geometry, data: Data, chosen: list[int], lost: list[int]
+) -> Priors:
     """Take axes as configured; of an array, and of lost channels, those that the motion shows."""
-    source, axes, scale = source_of(config), nominal.axes.copy(), np.full(nominal.n, SCALE_STD)
+    source, axes, scale = (
+        source_of(config),
+        nominal.axes.copy(),
+        np.full(nominal.n, SCALE_STD),
+    )
     means = data.slow_rates()
     if not source.units and len(means) >= LEAST_WINDOWS:
         x = means[:, chosen]
@@ -217,13 +303,17 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], l
         others = [i for i in range(nominal.n) if i not in lost]
         rate = means[:, others] @ np.linalg.pinv(axes[others]).T
         weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
-        axes[lost] = np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T
+        axes[lost] = np.linalg.solve(
+            rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T
+        ).T
     scale[chosen], scale[lost] = REFERENCE_STD, UNKNOWN_MOUNT
     # Channels that belong to no unit are of the first.
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
     delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
-    return Priors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
+    return Priors(
+        axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay
+    )
 
 
 class _Watched(Kept):
@@ -241,7 +331,9 @@ class _Watched(Kept):
         self.spectrum.add(output.residual)
 
 
-def _watch(block: Block, config: Config, active: Int) -> tuple[tuple[Span, ...], Spectrum]:
+def _watch(
+    block: Block, config: Config, active: Int
+) -> tuple[tuple[Span, ...], Spectrum]:
     """Find when the monitor itself, with the settings found, has something declared, and the spectrum of residuals."""
     # So that what was declared ends when it has gone.
     pipeline = Pipeline.from_config(config.replaced({"decision.latch": False}))
@@ -249,17 +341,29 @@ def _watch(block: Block, config: Config, active: Int) -> tuple[tuple[Span, ...],
     Walk(pipeline, [watched]).take(block)
     stamp, state = watched.columns
     among = np.asarray(state == ChannelState.AMBIGUOUS)
-    runs = [([k], run) for k, states in enumerate(state.T) for run in flag_runs(states == ChannelState.FAULTY)]
+    runs = [
+        ([k], run)
+        for k, states in enumerate(state.T)
+        for run in flag_runs(states == ChannelState.FAULTY)
+    ]
     doubted = flag_runs(np.asarray(among.any(axis=1)))
-    runs += [(np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run) for run in doubted]
+    runs += [
+        (np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run)
+        for run in doubted
+    ]
     seconds = (stamp - stamp[0]) * 1e-9
-    spans = [Span(tuple(channels), float(seconds[first]), float(seconds[end - 1])) for channels, (first, end) in runs]
+    spans = [
+        Span(tuple(channels), float(seconds[first]), float(seconds[end - 1]))
+        for channels, (first, end) in runs
+    ]
     return tuple(sorted(spans, key=lambda span: span.start)), watched.spectrum
 
 
 def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data:
     """Leave faults out that are of so few channels that the others are known to be right; refuse one that lasts."""
-    clear = [span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)]
+    clear = [
+        span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)
+    ]
     z, share = data.z.copy(), np.zeros(len(names))
     for span in clear:
         share[list(span.channels)] += (span.end - span.start) / data.duration
@@ -276,13 +380,18 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
     return replace(data, z=z)
 
 
-def _settings(config: Config, active: Int, step: float, found: StateEstimate) -> dict[str, object]:
+def _settings(
+    config: Config, active: Int, step: float, found: StateEstimate
+) -> dict[str, object]:
     """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
     geometry = build_geometry(config)
     before, source = build_noise(config, geometry.n), source_of(config)
 
     def changed(values: ArrayLike, new: ArrayLike) -> Array:
-        whole = np.broadcast_to(np.asarray(values, dtype=float), np.shape(geometry.axes)[: np.ndim(new) or 1]).copy()
+        whole = np.broadcast_to(
+            np.asarray(values, dtype=float),
+            np.shape(geometry.axes)[: np.ndim(new) or 1],
+        ).copy()
         whole[active] = new
         return whole
 
@@ -292,21 +401,30 @@ def _settings(config: Config, active: Int, step: float, found: StateEstimate) ->
     settings: dict[str, object] = {
         "geometry.preset": "axes",
         "geometry.axes": _rounded(changed(geometry.axes, found.axes).ravel(), 6),
-        "noise.noise_std": [float(f"{value:.4g}") for value in changed(before.noise_std, np.maximum(std, LEAST_NOISE))],
+        "noise.noise_std": [
+            float(f"{value:.4g}")
+            for value in changed(before.noise_std, np.maximum(std, LEAST_NOISE))
+        ],
         "noise.scale_std": _short(changed(before.scale_std, found.disagreement()[0])),
-        "noise.timing_std": _short(changed(before.timing_std, _timing(config, active, found))),
+        "noise.timing_std": _short(
+            changed(before.timing_std, _timing(config, active, found))
+        ),
         "bias.fixed": _rounded(changed(config.bias.fixed or 0.0, found.bias), 7),
         "bias.startup_bias_duration": 0.0,
         # No single recording shows how biases differ from one start to the next.
         "bias.turn_on_std": config.bias.turn_on_std,
     }
     if found.bias_walk.value > 0:
-        settings["noise.bias_walk"] = _short(changed(config.noise.bias_walk, found.bias_walk.value))
+        settings["noise.bias_walk"] = _short(
+            changed(config.noise.bias_walk, found.bias_walk.value)
+        )
     if source.stamped:
         total = np.array(source.delays)
         shown = np.abs(found.delay) > np.maximum(LEAST_SKEW, SHOWN * found.delay_std)
         # Of all channels of a unit the first is taken.
-        units, first = np.unique([source.chip_of(int(channel)) for channel in active], return_index=True)
+        units, first = np.unique(
+            [source.chip_of(int(channel)) for channel in active], return_index=True
+        )
         total[units] += np.where(shown, found.delay, 0.0)[first]
         settings["imus.delays"] = _rounded(total - total[0], 6)
         if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
@@ -322,7 +440,11 @@ def _settings(config: Config, active: Int, step: float, found: StateEstimate) ->
 def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
     """Find what is not known of the sampling instants (n,), s; as configured where no motion shows it."""
     before = build_noise(config, build_geometry(config).n).timing_std[active]
-    error = float(np.sqrt(np.mean(found.delay_std**2))) if source_of(config).stamped else 0.0
+    error = (
+        float(np.sqrt(np.mean(found.delay_std**2)))
+        if source_of(config).stamped
+        else 0.0
+    )
     return np.where(error < np.maximum(before, LEAST_SKEW), error, before)
 
 

@@ -28,31 +28,57 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.estimator.blocks import QUIET, REST_STD, UNLEARNED, rests
-from fdi_ros.estimator.error_states import ERROR_KINDS, ONE, SIGNALS, Layout, fill_signals, places_of, prepare_layout
+from fdi_ros.estimator.error_states import (
+    ERROR_KINDS,
+    ONE,
+    SIGNALS,
+    Layout,
+    fill_signals,
+    places_of,
+    prepare_layout,
+)
 from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.pipeline import UNIT_DELAY
 from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
-from fdi_ros.setup.noise import Floor, find_floor, gains, information, levels, of_the_moment, projector
+from fdi_ros.setup.noise import (
+    Floor,
+    find_floor,
+    gains,
+    information,
+    levels,
+    of_the_moment,
+    projector,
+)
 
 SCALE_STD = 0.008  # of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg
 PASSES = 12
 TRUSTING = PASSES // 3
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
-SETTLED = 2e-5  # s of delays, and share of the rate of axes: what changes less has settled
+SETTLED = (
+    2e-5  # s of delays, and share of the rate of axes: what changes less has settled
+)
 SHOWN_DELAY = 0.001  # s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that moves no bias
 LARGEST_DELAY = PARAMETERS["imus.delays"].high  # s
-STEP_DELAY = 2.0 * UNIT_DELAY  # by how much a delay changes in one pass at most, s: a slope is that of the motion near
+STEP_DELAY = (
+    2.0 * UNIT_DELAY
+)  # by how much a delay changes in one pass at most, s: a slope is that of the motion near
 MOST_STEPS = 400  # windows are joined until there are no more than this
 ABSENT = 1e12  # variance of a channel that is not there, (rad/s)^2
 ALIKE = 5.0  # means of the windows at rest are at most so many of their standard deviations apart: hardly one by chance
 USUAL_WALK = 2e-5  # rad/s/sqrt(s); of biases that show none
 WIDER = 1.5  # axes that are farther off than expected by so much are known less: once in 60 by chance, of two units
-LEAST_BLOCKS = SUBS = 5  # of a window that tells its noise, and of windows that tell its colour by longer means
+LEAST_BLOCKS = SUBS = (
+    5  # of a window that tells its noise, and of windows that tell its colour by longer means
+)
 BASE = 7  # one, the rate, the angular acceleration
-ESTIMATED = ("bias", "scale", "delay")  # kinds of error states, whose signals are linear in these
+ESTIMATED = (
+    "bias",
+    "scale",
+    "delay",
+)  # kinds of error states, whose signals are linear in these
 (BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")
 
 
@@ -107,25 +133,53 @@ class StateEstimate:
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
-    motion = 3 * n + units - 1  # of the constants, the first are those that motion shows
-    axes, biases, colour, priors = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n)), sensors
-    taken, moved = np.zeros(units), np.inf  # delays that are off the blocks, and by how much they were to be others
+    motion = (
+        3 * n + units - 1
+    )  # of the constants, the first are those that motion shows
+    axes, biases, colour, priors = (
+        sensors.axes.copy(),
+        np.zeros((1, n)),
+        np.ones((2, n)),
+        sensors,
+    )
+    taken, moved = (
+        np.zeros(units),
+        np.inf,
+    )  # delays that are off the blocks, and by how much they were to be others
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
     for number in range(PASSES):
         one = _Pass(blocks, priors, axes, taken, biases, number > 1, colour)
-        if number > 1 and (number == PASSES - 1 or (walk is None and moved < SHOWN_DELAY)):
+        if number > 1 and (
+            number == PASSES - 1 or (walk is None and moved < SHOWN_DELAY)
+        ):
             walk = find_random_walk(one.evidence)
-        usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
+        usual = (
+            USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
+        )
         shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
-        found = smooth(one.evidence, usual, (shown.constant[:motion], shown.constant_covariance[:motion, :motion]))
+        found = smooth(
+            one.evidence,
+            usual,
+            (shown.constant[:motion], shown.constant_covariance[:motion, :motion]),
+        )
         scale = found.constant[: 3 * n].reshape(n, 3)
-        step = np.append(0.0, np.clip(found.constant[3 * n : motion], -STEP_DELAY, STEP_DELAY))
+        step = np.append(
+            0.0, np.clip(found.constant[3 * n : motion], -STEP_DELAY, STEP_DELAY)
+        )
         axes = axes + scale
-        delay, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), one.curve_of(found)
+        delay, biases = (
+            np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY),
+            one.curve_of(found),
+        )
         colour = one.colours(axes)
         moved = float(np.abs(delay - taken).max())
-        if number > TRUSTING and walk is not None and moved < SETTLED and np.abs(scale).max() < SETTLED:
+        if (
+            number > TRUSTING
+            and walk is not None
+            and moved < SETTLED
+            and np.abs(scale).max() < SETTLED
+        ):
             break
         if moved > SETTLED:
             taken = delay
@@ -136,7 +190,9 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
         times = size / max(float(np.median(sensors.scale_std)), 1e-9)
         priors = replace(
-            sensors, scale_std=sensors.scale_std * (times if times > WIDER and number >= TRUSTING else 1.0)
+            sensors,
+            scale_std=sensors.scale_std
+            * (times if times > WIDER and number >= TRUSTING else 1.0),
         )
     assert walk is not None
     covariance = found.constant_covariance * _misfit(one.careful, shown)
@@ -173,44 +229,78 @@ class _Pass:
     """
 
     def __init__(
-        self, blocks: Blocks, sensors: Priors, axes: Array, delay: Array, biases: Array, known: bool, colour: Array
+        self,
+        blocks: Blocks,
+        sensors: Priors,
+        axes: Array,
+        delay: Array,
+        biases: Array,
+        known: bool,
+        colour: Array,
     ) -> None:
         self.blocks, self.axes, self.window = blocks, axes, blocks.window
         finite = np.isfinite(blocks.mean)
-        present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * blocks.size[:, None]
+        present = (
+            np.add.reduceat(finite, blocks.start, axis=0)
+            >= PRESENT * blocks.size[:, None]
+        )
         # Blocks (B,) with all channels that are present in their window.
         self.used: Mask = np.asarray((finite | ~present[self.window]).all(axis=1))
         y = np.where(finite & present[self.window], blocks.mean, 0.0)
         count = np.add.reduceat(self.used, blocks.start)
-        mean = np.add.reduceat(y * self.used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]
+        mean = (
+            np.add.reduceat(y * self.used[:, None], blocks.start, axis=0)
+            / np.maximum(count, 1)[:, None]
+        )
         apart = (y - mean[self.window]) * self.used[:, None]
-        covariance = self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
+        covariance = (
+            self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
+        )
         enough = count >= LEAST_BLOCKS
         # (W, n); and those of whose single samples the windows tell.
         self.present = present & enough[:, None]
-        self.sampled = self.present & np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
+        self.sampled = (
+            self.present
+            & np.isfinite(np.einsum("wii->wi", blocks.samples))
+            & (blocks.count > 3)[:, None]
+        )
         moment = of_the_moment(covariance, self.present, axes)
         self.floor = find_floor(blocks.samples, blocks.count, self.sampled, axes)
         steady = np.where(self.present, moment, ABSENT)
         # Biases of every window, of those of joined ones.
-        bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[: blocks.windows]
+        bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[
+            : blocks.windows
+        ]
         gain = gains(steady, axes)
-        self.rate: Array = np.einsum("bai,bi->ba", gain[self.window], y - bias[self.window])
+        self.rate: Array = np.einsum(
+            "bai,bi->ba", gain[self.window], y - bias[self.window]
+        )
         self.rest = self._find_rest(gain, steady, known)
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
         self.variance: Array = np.where(self.present, moment * factor, ABSENT)
         # Angular acceleration, rad/s^2, where it is known.
-        acceleration, inside = np.zeros_like(self.rate), np.zeros(len(self.rate), dtype=bool)
+        acceleration, inside = (
+            np.zeros_like(self.rate),
+            np.zeros(len(self.rate), dtype=bool),
+        )
         span = blocks.seconds[2:] - blocks.seconds[:-2]
         inside[1:-1] = (span < 2.5 * blocks.length) & self.used[2:] & self.used[:-2]
         acceleration[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
         self.used = self.used & (inside | self.rest[self.window]) & enough[self.window]
         each = -(-blocks.windows // MOST_STEPS)
-        self.groups = [slice(first, first + each) for first in range(0, blocks.windows, each)]
-        self.middle: Array = np.array([blocks.time[group].mean() for group in self.groups])
-        self.times = blocks.time[0] + self.middle - self.middle[0]  # (K,) of the joined windows, s from the first
-        self.evidence, self.careful = self._find_evidence(sensors, delay, y, acceleration * inside[:, None])
+        self.groups = [
+            slice(first, first + each) for first in range(0, blocks.windows, each)
+        ]
+        self.middle: Array = np.array(
+            [blocks.time[group].mean() for group in self.groups]
+        )
+        self.times = (
+            blocks.time[0] + self.middle - self.middle[0]
+        )  # (K,) of the joined windows, s from the first
+        self.evidence, self.careful = self._find_evidence(
+            sensors, delay, y, acceleration * inside[:, None]
+        )
 
     def curve_of(self, found: Smoothed) -> Array:
         """Biases (K, n) over time, rad/s."""
@@ -221,23 +311,39 @@ class _Pass:
         """Sum (W, l, r) products over the blocks of every window."""
         found = np.empty((self.blocks.windows, first.shape[1], second.shape[1]))
         for i, j in np.ndindex(found.shape[1:]):
-            found[:, i, j] = np.add.reduceat(first[:, i] * second[:, j], self.blocks.start)
+            found[:, i, j] = np.add.reduceat(
+                first[:, i] * second[:, j], self.blocks.start
+            )
         return found
 
     def _find_rest(self, gain: Array, variance: Array, known: bool) -> Mask:
         """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
-        blocks, rate, found = self.blocks, self.rate, np.zeros(self.blocks.windows, dtype=bool)
-        noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
+        blocks, rate, found = (
+            self.blocks,
+            self.rate,
+            np.zeros(self.blocks.windows, dtype=bool),
+        )
+        noise = np.einsum(
+            "wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0)
+        )
         level = levels(blocks.samples, self.sampled, self.axes)
         quiet = level < QUIET * np.average(level[self.floor.windows])
         unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
-        for w in np.flatnonzero(quiet & (blocks.size == REST_BLOCKS)) if blocks.windows > 1 else ():
+        for w in (
+            np.flatnonzero(quiet & (blocks.size == REST_BLOCKS))
+            if blocks.windows > 1
+            else ()
+        ):
             rows = slice(blocks.start[w], blocks.start[w] + REST_BLOCKS)
             there = self.used[rows]
             if there.mean() >= PRESENT:
                 # A block that is missing shows no motion.
-                part = np.where(there[:, None], rate[rows], rate[rows][there].mean(axis=0))
-                found[w] = rests(part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
+                part = np.where(
+                    there[:, None], rate[rows], rate[rows][there].mean(axis=0)
+                )
+                found[w] = rests(
+                    part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2
+                )
         if not found.any():
             return found
         mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
@@ -251,38 +357,69 @@ class _Pass:
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array
     ) -> tuple[NormalEquations, NormalEquations]:
         """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
-        blocks, axes, variance, rest, n = self.blocks, self.axes, self.variance, self.rest, len(self.axes)
+        blocks, axes, variance, rest, n = (
+            self.blocks,
+            self.axes,
+            self.variance,
+            self.rest,
+            len(self.axes),
+        )
         coefficients, prior = coefficients_of(sensors, axes)
         moving = (~rest[self.window])[:, None]
-        base = np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving]) * self.used[:, None]
+        base = (
+            np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving])
+            * self.used[:, None]
+        )
         # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
         moments, cross = self._by_window(base, base), self._by_window(base, residual)
         # The noise power of rate and acceleration is subtracted.
         count = np.add.reduceat(self.used, blocks.start) * ~rest
-        noise = count[:, None, None] * np.linalg.inv(np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes))
+        noise = count[:, None, None] * np.linalg.inv(
+            np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes)
+        )
         moments[:, 1:4, 1:4] -= noise
         moments[:, 4:7, 4:7] -= noise / (2.0 * blocks.length**2)
         values, vectors = np.linalg.eigh(moments)
-        moments = np.einsum("wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors)
+        moments = np.einsum(
+            "wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors
+        )
         a = information(variance, axes)
         a[rest] = _at_rest(variance[rest], axes)
-        start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -delay[1:], np.zeros(n)])
+        start = np.concatenate(
+            [np.zeros(n), (sensors.axes - axes).ravel(), -delay[1:], np.zeros(n)]
+        )
         prior = np.concatenate([prior, np.full(n, BIAS_RATE.prior)])
         flat = coefficients.reshape(-1, n * BASE)
 
         def summed(moments: Array, cross: Array) -> NormalEquations:
-            normal, right = np.zeros((len(self.groups), len(flat), len(flat))), np.zeros((len(self.groups), len(flat)))
+            normal, right = (
+                np.zeros((len(self.groups), len(flat), len(flat))),
+                np.zeros((len(self.groups), len(flat))),
+            )
             for k, group in enumerate(self.groups):
                 # (n, n, 7, 7): sum of the products of A and s s'.
-                products = a[group].reshape(-1, n * n).T @ moments[group].reshape(-1, BASE * BASE)
-                products = products.reshape(n, n, BASE, BASE).transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE)
+                products = a[group].reshape(-1, n * n).T @ moments[group].reshape(
+                    -1, BASE * BASE
+                )
+                products = (
+                    products.reshape(n, n, BASE, BASE)
+                    .transpose(0, 2, 1, 3)
+                    .reshape(n * BASE, n * BASE)
+                )
                 normal[k] = flat @ products @ flat.T
-                right[k] = flat @ (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(axis=0).reshape(-1)
+                right[k] = flat @ (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(
+                    axis=0
+                ).reshape(-1)
             # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
             since = (self.middle - self.middle.mean())[:, None, None]
             rates = since * normal[:, :n]
-            whole = np.block([[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]])
+            whole = np.block(
+                [
+                    [normal, np.swapaxes(rates, 1, 2)],
+                    [rates, since**2 * normal[:, :n, :n]],
+                ]
+            )
             rights = np.hstack([right, since[:, 0] * right[:, :n]])
             apart = np.diff(self.middle, append=self.middle[-1])
             return NormalEquations(n, whole, rights, apart, prior, start)
@@ -296,14 +433,20 @@ class _Pass:
         In docs/calibration.md, "What vibration explains", K is W count^2 min(U, s^2), in units of e^2.
         """
         variance, moving = self.variance, ~self.rest
-        at_rest = np.median(variance[self.rest], axis=0) if self.rest.any() else np.zeros(len(self.axes))
+        at_rest = (
+            np.median(variance[self.rest], axis=0)
+            if self.rest.any()
+            else np.zeros(len(self.axes))
+        )
         there = (variance < ABSENT / 2) & moving[:, None]
         beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
         share = (beyond / variance).max(axis=1)[:, None]
         most = np.zeros((len(moments), BASE))
         most[:, 1:4] = (self.axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
         # Half of it is in differences of two blocks at most.
-        most[:, 4:7] = 0.5 * most[:, 1:4].max(axis=1, keepdims=True) / self.blocks.length**2
+        most[:, 4:7] = (
+            0.5 * most[:, 1:4].max(axis=1, keepdims=True) / self.blocks.length**2
+        )
         square = np.einsum("wkk->wk", moments) / np.maximum(count, 1)[:, None]
         off = moving.sum() * count[:, None] ** 2 * share * np.minimum(most, square)
         # A signal that is not there has neither.
@@ -320,7 +463,11 @@ class _Pass:
             if len(chosen) < LEAST_BLOCKS:
                 continue
             rows = blocks.start[chosen][:, None] + np.arange(REST_BLOCKS)
-            t = np.einsum("wij,wbj->wbi", information(self.variance[chosen], axes), blocks.mean[rows])
+            t = np.einsum(
+                "wij,wbj->wbi",
+                information(self.variance[chosen], axes),
+                blocks.mean[rows],
+            )
             means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
             short, long = (part.var(axis=1, ddof=1).sum(axis=0) for part in (t, means))
             found[regime] = np.maximum(SUBS * long / np.maximum(short, 1e-30), 1.0)
@@ -346,11 +493,19 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
     prepare_layout(layout, sensors.unit, sensors.units, priors, {"bias": 0.0})
     # Each of the base alone: rates, and accelerations along the channels.
     signals = np.zeros((BASE, n, SIGNALS))
-    rates, accelerations = np.eye(BASE, 3, -1), np.hstack([np.zeros((n, 4)), axes]).T.copy()
+    rates, accelerations = (
+        np.eye(BASE, 3, -1),
+        np.hstack([np.zeros((n, 4)), axes]).T.copy(),
+    )
     for k in range(BASE):
         fill_signals(layout, rates[k], accelerations[k], signals[k])
     signals[1:, :, layout["by"] == ONE] = 0.0
-    shown = [p for kind in ESTIMATED for places in places_of(kind, n, sensors.units) for p in places]
+    shown = [
+        p
+        for kind in ESTIMATED
+        for places in places_of(kind, n, sensors.units)
+        for p in places
+    ]
     order = {place: k for k, place in enumerate(shown)}
     coefficients = np.zeros((len(shown), n, BASE))
     for i, k in np.ndindex(n, SIGNALS):
@@ -362,7 +517,10 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
 def _misfit(of: NormalEquations, found: Smoothed) -> float:
     """Scatter of what single windows say of the constants, over what the noise explains."""
     n = of.n
-    x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))]) / of.prior
+    x = (
+        np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))])
+        / of.prior
+    )
     residual = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
     covariance = found.constant_covariance / np.outer(of.prior[n:], of.prior[n:])
     shown = float(np.einsum("ki,ij,kj->", residual, covariance, residual))
@@ -387,9 +545,21 @@ class NormalEquations:
     ``start`` (s,): standard deviations, of all biases the same, and means before.
     """
 
-    def __init__(self, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> None:
+    def __init__(
+        self,
+        n: int,
+        normal: Array,
+        right: Array,
+        apart: Array,
+        prior: Array,
+        start: Array,
+    ) -> None:
         self.n, self.apart, self.prior = n, apart, prior
-        self.normal, self.right, self.start = normal * np.outer(prior, prior), right * prior, start / prior
+        self.normal, self.right, self.start = (
+            normal * np.outer(prior, prior),
+            right * prior,
+            start / prior,
+        )
 
 
 @dataclass(frozen=True)
@@ -431,13 +601,23 @@ def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, f
     h[0] += of.start[:n]
     factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
     mean = np.tile(np.eye(n) / count, (count, 1))
-    solved = cho_solve_banded((factor, True), np.column_stack([mean, border, h.ravel()]))
+    solved = cho_solve_banded(
+        (factor, True), np.column_stack([mean, border, h.ravel()])
+    )
     from_constants, alone = solved[:, n:-1], solved[:, -1]
-    information = np.eye(border.shape[1]) + of.normal[:, n:, n:].sum(axis=0) - border.T @ from_constants
+    information = (
+        np.eye(border.shape[1])
+        + of.normal[:, n:, n:].sum(axis=0)
+        - border.T @ from_constants
+    )
     information = 0.5 * (information + information.T)
     side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
     fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
-    volume = 2.0 * np.log(factor[0]).sum() - n * np.log(stiffness).sum() + np.linalg.slogdet(information)[1]
+    volume = (
+        2.0 * np.log(factor[0]).sum()
+        - n * np.log(stiffness).sum()
+        + np.linalg.slogdet(information)[1]
+    )
     return solved, information, side, 0.5 * (fits - float(volume))
 
 
@@ -458,7 +638,9 @@ def find_random_walk(of: NormalEquations) -> RandomWalk:
     return RandomWalk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
 
 
-def smooth(of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
+def smooth(
+    of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None
+) -> Smoothed:
     """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
 
     Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
@@ -470,7 +652,10 @@ def smooth(of: NormalEquations, walk: float, known: tuple[Array, Array] | None =
         constant = covariance @ side
     else:
         k = len(known[0])
-        first, p = known[0] / of.prior[n : n + k], known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
+        first, p = (
+            known[0] / of.prior[n : n + k],
+            known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k]),
+        )
         free = np.linalg.inv(information[k:, k:])
         by = -free @ information[k:, :k]
         constant = np.concatenate([first, free @ side[k:] + by @ first])

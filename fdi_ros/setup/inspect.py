@@ -18,7 +18,15 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.core.health import copies_among
 from fdi_ros.core.sources import Source, source_of_type
 from fdi_ros.model.samples import Array, Int
-from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
+from fdi_ros.report.layout import (
+    RADIANS,
+    Column,
+    Unit,
+    figures_of,
+    indented,
+    table,
+    told,
+)
 from fdi_ros.setup.blocks import Repeats
 from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.system.text import date_of, shown
@@ -26,7 +34,9 @@ from fdi_ros.system.text import date_of, shown
 GAP = 3.0  # intervals longer than this many usual ones are gaps
 FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
 RECENT = 256  # messages in a row in which copies are looked for
-BELIEVED = 1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
+BELIEVED = (
+    1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
+)
 
 
 @dataclass
@@ -34,7 +44,9 @@ class TopicReport:
     """What was seen of one topic."""
 
     topic: Topic
-    kind: type[Source] | None  # how gyros are read from messages of its type; None: they are not
+    kind: (
+        type[Source] | None
+    )  # how gyros are read from messages of its type; None: they are not
     received: int = 0
     malformed: int = 0
     first: int = 0  # time of recording of the first message, ns
@@ -46,8 +58,12 @@ class TopicReport:
     ahead: float = math.nan  # how far the first stamps are ahead of their times of recording, s; NaN: there are none
     channels: int = 0  # values in a message, of what could be gyros; else 0
     announced: int = 0  # values that a message says it has: whatever its bytes claim
-    largest: float = math.nan  # largest value that can be a rate, rad/s; NaN: there is none
-    intervals: list[Array] = field(default_factory=list)  # s, of the first million messages
+    largest: float = (
+        math.nan
+    )  # largest value that can be a rate, rad/s; NaN: there is none
+    intervals: list[Array] = field(
+        default_factory=list
+    )  # s, of the first million messages
     copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
 
     def __post_init__(self) -> None:
@@ -56,9 +72,15 @@ class TopicReport:
     def expect(self, channels: int) -> None:
         """Take messages of so many values for gyros."""
         self.channels, self.repeats = channels, Repeats(channels)
-        self.segments = NoiseSegments(channels)  # of messages in which every value can be a rate
-        self.not_finite, self.beyond = np.zeros((2, channels), dtype=np.int64)  # (c,) values; beyond: all rates
-        self.recent = np.zeros((0, channels))  # (K, c) values of the last messages, at most `RECENT`
+        self.segments = NoiseSegments(
+            channels
+        )  # of messages in which every value can be a rate
+        self.not_finite, self.beyond = np.zeros(
+            (2, channels), dtype=np.int64
+        )  # (c,) values; beyond: all rates
+        self.recent = np.zeros(
+            (0, channels)
+        )  # (K, c) values of the last messages, at most `RECENT`
 
     @property
     def rate(self) -> float:
@@ -68,7 +90,9 @@ class TopicReport:
     @property
     def places(self) -> list[str]:
         """Names of the values in a message."""
-        return list(self.kind.value_names(self.channels)) if self.kind is not None else []
+        return (
+            list(self.kind.value_names(self.channels)) if self.kind is not None else []
+        )
 
     @property
     def copied(self) -> str:
@@ -78,7 +102,9 @@ class TopicReport:
     @property
     def could_be_gyros(self) -> bool:
         """Whether it carries angular rates, or as many numbers as there may be channels."""
-        return self.channels > 0 and (self.complete or bool((self.not_finite + self.beyond).any()))
+        return self.channels > 0 and (
+            self.complete or bool((self.not_finite + self.beyond).any())
+        )
 
     @property
     def complete(self) -> bool:
@@ -86,7 +112,9 @@ class TopicReport:
         return not self.segments.empty
 
 
-def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], tuple[str, ...]]:
+def inspect(
+    path: Path, topics: Sequence[str] = ()
+) -> tuple[list[TopicReport], tuple[str, ...]]:
     """Read a recording through: all topics, or those of these names, with or without the first slash.
 
     Returns what was seen of each topic, and what of the recording is damaged. `BagError` if it cannot be read.
@@ -101,9 +129,15 @@ def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], 
         for batch in recording.batches([report.topic.name for report in reports]):
             for k in np.unique(batch.topic).tolist():
                 _update(reports[k], batch, np.flatnonzero(batch.topic == k))
-            possible = [one for one in reports if not one.copy_of and one.kind is not None and one.kind.stamped]
+            possible = [
+                one
+                for one in reports
+                if not one.copy_of and one.kind is not None and one.kind.stamped
+            ]
             for first, second in copies_among([one.recent for one in possible]):
-                possible[second].copy_of = possible[second].copy_of or possible[first].topic.name
+                possible[second].copy_of = (
+                    possible[second].copy_of or possible[first].topic.name
+                )
         return reports, recording.damage.report()
 
 
@@ -115,7 +149,9 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.received += len(rows)
     if len(steps):
         report.interval = report.interval or float(np.median(steps))
-        report.gaps += int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
+        report.gaps += (
+            int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
+        )
         report.longest = max(report.longest, float(steps.max()))
         if report.received - len(rows) < 1_000_000:
             report.intervals.append(steps)
@@ -153,18 +189,26 @@ def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     words = "no messages"
     if (first := figures["start_ns"]) is not None:
         date = date_of(first)
-        begun = f"{first * 1e-9:.1f} s after a start, date unknown" if date is None else f"{date:%Y-%m-%d %H:%M:%S} UTC"
+        begun = (
+            f"{first * 1e-9:.1f} s after a start, date unknown"
+            if date is None
+            else f"{date:%Y-%m-%d %H:%M:%S} UTC"
+        )
         words = f"{figures['duration_s']:.1f} s from {begun}"
     return f"{shown(bag.name)}: {words}, {figures['size_bytes'] / 1e6:.1f} MB\n\n"
 
 
-def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, Any]:
+def recording_figures(
+    reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]
+) -> dict[str, Any]:
     """All figures by name, SI units: for programs."""
     recorded = [report for report in reports if report.received]
     first = min((report.first for report in recorded), default=None)
     last = max((report.last for report in recorded), default=None)
     date = None if first is None else date_of(first)
-    files = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    files = (
+        [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    )
     topics = figures_of(topic_columns(reports))
     return {
         "bag": str(bag),
@@ -173,13 +217,18 @@ def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequenc
         "duration_s": None if first is None or last is None else (last - first) * 1e-9,
         "size_bytes": sum(path.stat().st_size for path in files),
         "damage": list(damage),
-        "topics": [{name: value for name, value in row.items() if value is not None} for row in topics],
+        "topics": [
+            {name: value for name, value in row.items() if value is not None}
+            for row in topics
+        ],
     }
 
 
 def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
     """Figures of every topic; those of values only where they could be of gyros."""
-    gyros = [report.segments.noise() if report.could_be_gyros else None for report in reports]
+    gyros = [
+        report.segments.noise() if report.could_be_gyros else None for report in reports
+    ]
 
     def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
         return [figure(report) if report.could_be_gyros else None for report in reports]
@@ -194,11 +243,21 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
 
     return [
         Column("name", [report.topic.name for report in reports], ("topic",), shown),
-        Column("type", [report.topic.type for report in reports], ("type",), lambda kind: shown(kind or "unknown")),
+        Column(
+            "type",
+            [report.topic.type for report in reports],
+            ("type",),
+            lambda kind: shown(kind or "unknown"),
+        ),
         Column("messages", [report.received for report in reports], ("messages",)),
         Column("rate_hz", [report.rate for report in reports], ("rate",), ".1f"),
         Column("gaps", [report.gaps for report in reports], ("gaps",)),
-        Column("longest_gap_s", [report.longest for report in reports], ("longest gap",), ".3f"),
+        Column(
+            "longest_gap_s",
+            [report.longest for report in reports],
+            ("longest gap",),
+            ".3f",
+        ),
         Column("malformed", [report.malformed for report in reports]),
         Column("could_be_gyros", [report.could_be_gyros for report in reports]),
         Column("values", of_values(lambda report: report.channels)),
@@ -208,20 +267,33 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
         Column("largest", of_values(lambda report: report.largest)),
-        Column("quiet_noise", [one and one.quiet for one in gyros], ("noise, quietest",), noise),
-        Column("moving_noise", [one and one.moving for one in gyros], ("in motion",), noise),
+        Column(
+            "quiet_noise",
+            [one and one.quiet for one in gyros],
+            ("noise, quietest",),
+            noise,
+        ),
+        Column(
+            "moving_noise", [one and one.moving for one in gyros], ("in motion",), noise
+        ),
         Column("moving_share", [one and one.share for one in gyros]),
         Column("", [_gyros(report, unit) for report in reports], ("gyros?",)),
     ]
 
 
-def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
+def topics_text(
+    reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS
+) -> str:
     """Lay out the topics."""
     notes = [f"note: {line}\n" for line in damage]
     units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
         units += f"; noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out"
-    return indented(table(*told(topic_columns(reports, unit)), figures=False)) + f"{units}\n" + "".join(notes)
+    return (
+        indented(table(*told(topic_columns(reports, unit)), figures=False))
+        + f"{units}\n"
+        + "".join(notes)
+    )
 
 
 def _gyros(report: TopicReport, unit: Unit) -> str:
@@ -229,10 +301,21 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     if not report.could_be_gyros:
         return "no"
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
-    words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
-    words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
+    words = [
+        f"{report.channels} values",
+        largest if math.isfinite(report.largest) else "none of them a rate",
+    ]
+    words += (
+        ["never all of them usable"]
+        if math.isfinite(report.largest) and not report.complete
+        else []
+    )
     words += [report.copied] if report.copy_of else []
-    words += [f"in motion for {report.segments.noise().share:.0%}"] if report.complete else []
+    words += (
+        [f"in motion for {report.segments.noise().share:.0%}"]
+        if report.complete
+        else []
+    )
     return ", ".join([*words, *troubles(report, unit)])
 
 
@@ -240,9 +323,17 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """Say what is wrong with the values of a topic, by their places in the message."""
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words = []
-    for why, counts in (("not finite", report.not_finite), (beyond, report.beyond), ("frozen", report.repeats.count)):
+    for why, counts in (
+        ("not finite", report.not_finite),
+        (beyond, report.beyond),
+        ("frozen", report.repeats.count),
+    ):
         counted = zip(report.places, counts.tolist(), strict=True)
-        words += [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"] if counts.any() else []
+        words += (
+            [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"]
+            if counts.any()
+            else []
+        )
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return words

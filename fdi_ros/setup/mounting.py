@@ -16,7 +16,13 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
-from fdi_ros.model.noise import DETECTION, NoiseModel, assumption_words, smallest_detectable, summary_line
+from fdi_ros.model.noise import (
+    DETECTION,
+    NoiseModel,
+    assumption_words,
+    smallest_detectable,
+    summary_line,
+)
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.pipeline import alarm_probability, build_geometry, build_noise
 from fdi_ros.report.layout import (
@@ -49,7 +55,9 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
     turn lasts: they stay the same from sample to sample and add to the variance of the mean.
     """
     limits, V, white = config.integrity, geometry.parity, noise.noise_std**2
-    turning = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
+    turning = (noise.scale_std * limits.max_rate) ** 2 + (
+        noise.timing_std * limits.max_acceleration
+    ) ** 2
 
     def found_within(wait: float, white: Array, lasting: Array | float) -> Array:
         samples = wait * config.sample_rate
@@ -63,10 +71,16 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
 
     conditions: dict[str, tuple[Array, Array | float]] = {
         "at rest": (white, 0.0),
-        f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2": (white, turning),
+        f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2": (
+            white,
+            turning,
+        ),
         f"in vibration, noise {VIBRATION:g} times": (VIBRATION**2 * white, 0.0),
     }
-    return {name: np.array([found_within(wait, *each) for wait in WAITS]) for name, each in conditions.items()}
+    return {
+        name: np.array([found_within(wait, *each) for wait in WAITS])
+        for name, each in conditions.items()
+    }
 
 
 def smallest_shift(samples: float, run_length: float) -> float:
@@ -93,7 +107,9 @@ class Loss(NamedTuple):
 
     lost: tuple[int, ...]
     gdop: float = math.inf  # infinite where the rest does not span space
-    std: Array = np.full(3, np.inf)  # (3,) of the rate about each body axis at rest, rad/s
+    std: Array = np.full(
+        3, np.inf
+    )  # (3,) of the rate about each body axis at rest, rad/s
     detectable: tuple[int, ...] = ()
     isolable: tuple[int, ...] = ()
 
@@ -106,7 +122,9 @@ class Mounting:
     noise: NoiseModel
     false_alarm_probability: float  # per sample
     smallest: Array  # (n,) error that one sample shows with probability DETECTION, rad/s; infinite: never
-    waiting: dict[str, Array]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
+    waiting: dict[
+        str, Array
+    ]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
     losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
 
     def __post_init__(self) -> None:
@@ -122,8 +140,15 @@ def assess(config: Config) -> Mounting:
     """Assess the mounting of a configuration; `FdiError` if the settings do not fit each other."""
     geometry = build_geometry(config)
     noise, probability = build_noise(config, geometry.n), alarm_probability(config)
-    smallest, waited = smallest_detectable(geometry, noise, probability), waiting(config, geometry, noise)
-    sets = [lost for count in range(3) for lost in itertools.combinations(range(geometry.n), count)]
+    smallest, waited = (
+        smallest_detectable(geometry, noise, probability),
+        waiting(config, geometry, noise),
+    )
+    sets = [
+        lost
+        for count in range(3)
+        for lost in itertools.combinations(range(geometry.n), count)
+    ]
     losses = tuple(loss(geometry, noise, lost) for lost in sets)
     return Mounting(geometry, noise, probability, smallest, waited, losses)
 
@@ -141,7 +166,13 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     except GeometryError:
         # Three channels still give a rate; nothing checks it.
         return Loss(lost, gdop, std)
-    return Loss(lost, gdop, std, tuple(numbers[rest.detectable].tolist()), tuple(numbers[rest.isolable].tolist()))
+    return Loss(
+        lost,
+        gdop,
+        std,
+        tuple(numbers[rest.detectable].tolist()),
+        tuple(numbers[rest.isolable].tolist()),
+    )
 
 
 RHO_TITLE = "|rho| of the normalised residuals: 1 cannot be told apart"
@@ -158,10 +189,18 @@ def _channels(result: Mounting, unit: Unit = RADIANS) -> list[Column]:
     return [
         Column("name", g.channel_names, ("channel",)),
         Column("axis", g.axes, ("axis x", "y", "z"), ".4f"),
-        Column("noise_std", result.noise.noise_std, ("noise rad/s",), ".5f", unit.factor),
+        Column(
+            "noise_std", result.noise.noise_std, ("noise rad/s",), ".5f", unit.factor
+        ),
         Column("detectable", g.detectable),
         Column("isolable", g.isolable),
-        Column("smallest_in_one_sample", result.smallest, ("smallest rad/s",), _size, unit.factor),
+        Column(
+            "smallest_in_one_sample",
+            result.smallest,
+            ("smallest rad/s",),
+            _size,
+            unit.factor,
+        ),
     ]
 
 
@@ -169,7 +208,9 @@ def _size(value: float) -> str:
     return "never" if np.isinf(value) else number(value, ".5f")
 
 
-def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[Column]:
+def _losses(
+    result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS
+) -> list[Column]:
     """Figures of losses."""
     names = result.geometry.channel_names
 
@@ -178,13 +219,27 @@ def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> l
 
     def words(found: list[list[str]]) -> list[str]:
         left = [len(names) - len(one.lost) for one in losses]
-        return ["all" if len(one) == most else _or_none(one) for one, most in zip(found, left, strict=True)]
+        return [
+            "all" if len(one) == most else _or_none(one)
+            for one, most in zip(found, left, strict=True)
+        ]
 
     seen, isolated = named(lambda one: one.detectable), named(lambda one: one.isolable)
     return [
         Column("lost", named(lambda one: one.lost), ("lost",), _or_none),
-        Column("gdop", [one.gdop for one in losses], ("GDOP",), lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate"),
-        Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), lambda v: number(v, ".5f"), unit.factor),
+        Column(
+            "gdop",
+            [one.gdop for one in losses],
+            ("GDOP",),
+            lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate",
+        ),
+        Column(
+            "std",
+            [one.std for one in losses],
+            ("std x rad/s", "y", "z"),
+            lambda v: number(v, ".5f"),
+            unit.factor,
+        ),
         Column("detectable", seen),
         Column("isolable", isolated),
         Column("", words(seen), ("still seen",)),
@@ -203,7 +258,11 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
         "channels": figures_of(_channels(result)),
         "false_alarm_probability": result.false_alarm_probability,
         "smallest_within": [
-            {"condition": condition, "within_s": list(WAITS), "rad_s": dict(zip(names, sizes.T, strict=True))}
+            {
+                "condition": condition,
+                "within_s": list(WAITS),
+                "rad_s": dict(zip(names, sizes.T, strict=True)),
+            }
             for condition, sizes in result.waiting.items()
         ],
         "gdop": g.gdop,
@@ -219,27 +278,43 @@ def pair_lines(result: Mounting) -> list[str]:
     """Describe pairs of channels that look alike."""
     g, names, lines = result.geometry, result.geometry.channel_names, []
     for i, j in result.alike:
-        cosine = float(g.axes[i] @ g.axes[j] / np.linalg.norm(g.axes[i]) / np.linalg.norm(g.axes[j]))
+        cosine = float(
+            g.axes[i]
+            @ g.axes[j]
+            / np.linalg.norm(g.axes[i])
+            / np.linalg.norm(g.axes[j])
+        )
         why = f"faults of {names[i]} and {names[j]} look the same"
         if abs(cosine) > SAME_DIRECTION:
             why = f"{names[i]} and {names[j]} measure the same axis"
         lines.append(f"{why}: a fault in either is seen, which one is not")
     hard = "{} and {} are hard to tell apart (|rho| {:.3f})"
-    lines += [hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar]
+    lines += [
+        hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar
+    ]
     blind = np.flatnonzero(~g.detectable).tolist()
-    lines += [f"a fault of {names[i]} is never seen: no other channel checks it" for i in blind]
+    lines += [
+        f"a fault of {names[i]} is never seen: no other channel checks it"
+        for i in blind
+    ]
     return lines or ["every single fault is seen and can be told from all others"]
 
 
 def _double_words(result: Mounting) -> str:
     """Summary of the losses of two channels."""
     names = result.geometry.channel_names
-    spanning = sorted((loss for loss in result.double if np.isfinite(loss.gdop)), key=lambda loss: loss.gdop)
+    spanning = sorted(
+        (loss for loss in result.double if np.isfinite(loss.gdop)),
+        key=lambda loss: loss.gdop,
+    )
     words = f"two lost: {len(spanning)} of {len(result.double)} pairs leave a rate"
     if not spanning:
         return words
     best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
-    seen, named = sum(bool(loss.detectable) for loss in spanning), sum(bool(loss.isolable) for loss in spanning)
+    seen, named = (
+        sum(bool(loss.detectable) for loss in spanning),
+        sum(bool(loss.isolable) for loss in spanning),
+    )
     return (
         f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
         f" of these, {seen} still see a third fault in some channel and {named} can isolate it in some"
@@ -250,7 +325,13 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
     """Say what a reader is to know first, with what no data can tell and every name rests on."""
     assumed = assumption_words(result.geometry)
     return [
-        summary_line(result.geometry, result.noise, result.false_alarm_probability, unit.name, unit.factor),
+        summary_line(
+            result.geometry,
+            result.noise,
+            result.false_alarm_probability,
+            unit.name,
+            unit.factor,
+        ),
         *([f"names rest on {assumed}"] if assumed else []),
         *pair_lines(result),
     ]
@@ -264,10 +345,18 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     )
     worst = np.array([sizes.max(axis=1) for sizes in result.waiting.values()])
     heads = [f"{wait:g} s" for wait in WAITS]
-    waited = [Column("", list(result.waiting), ("condition",), str), Column("", worst, heads, _size, unit.factor)]
+    waited = [
+        Column("", list(result.waiting), ("condition",), str),
+        Column("", worst, heads, _size, unit.factor),
+    ]
     return [
         Section("Smallest faults seen", hint, told(_channels(result, unit), unit)),
-        Section("Found by waiting", unit.named(WAITING_HINT), told(waited), [_waiting_figure(result, unit)]),
+        Section(
+            "Found by waiting",
+            unit.named(WAITING_HINT),
+            told(waited),
+            [_waiting_figure(result, unit)],
+        ),
     ]
 
 
@@ -275,12 +364,20 @@ def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
     """Draw the smallest errors found over the time waited: a band for all channels, a line for the worst."""
     data: list[dict[str, object]] = []
     for k, (condition, sizes) in enumerate(result.waiting.items()):
-        low, high = ([drawn(value * unit.factor) for value in values] for values in (sizes.min(1), sizes.max(1)))
+        low, high = (
+            [drawn(value * unit.factor) for value in values]
+            for values in (sizes.min(1), sizes.max(1))
+        )
         look = {"x": list(WAITS), "name": condition, "line": {"color": colour_of(k)}}
-        data.append({"type": "band", **look, "low": low, "high": high, "showlegend": False})
+        data.append(
+            {"type": "band", **look, "low": low, "high": high, "showlegend": False}
+        )
         data.append({"type": "scatter", "mode": "lines+markers", **look, "y": high})
     titles = {"xaxis": "time waited, s", "yaxis": f"smallest error, {unit.name}"}
-    axes = {name: {"type": "log", "title": {"text": words}} for name, words in titles.items()}
+    axes = {
+        name: {"type": "log", "title": {"text": words}}
+        for name, words in titles.items()
+    }
     return {"data": data, "layout": {"height": 320, **axes}}
 
 
@@ -290,12 +387,21 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     covariance = g.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
     rho = np.abs(g.rho)
-    heat = {"type": "heatmap", "z": np.round(rho, 4).tolist(), "x": list(names), "y": list(names)}
+    heat = {
+        "type": "heatmap",
+        "z": np.round(rho, 4).tolist(),
+        "x": list(names),
+        "y": list(names),
+    }
     drawn_rho = {"data": [heat], "layout": {"title": RHO_TITLE}}
     losses = told(_losses(result, result.single, unit), unit)
     return [
         *fault_sections(result, unit),
-        Section("Covariance of the rate", f"({unit.name})^2, at rest.", _matrix("xyz", covariance, ".3e")),
+        Section(
+            "Covariance of the rate",
+            f"({unit.name})^2, at rest.",
+            _matrix("xyz", covariance, ".3e"),
+        ),
         Section("Look-alikes", RHO_TITLE, _matrix(names, rho, ".3f"), [drawn_rho]),
         Section("After each possible first fault", _double_words(result), losses),
     ]
@@ -303,7 +409,9 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
 
 def _matrix(names: Sequence[str], values: Array, form: str) -> Rows:
     rows = zip(names, values, strict=True)
-    return ("", *names), [(name, *(f"{value:{form}}" for value in row)) for name, row in rows]
+    return ("", *names), [
+        (name, *(f"{value:{form}}" for value in row)) for name, row in rows
+    ]
 
 
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
@@ -314,14 +422,31 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
 def mounting_page(result: Mounting, title: str, unit: Unit = RADIANS) -> str:
     """Return everything, and the axes in space, as a page."""
 
-    def arrow(end: Array, text: str, line: dict[str, str], **named: str) -> dict[str, object]:
+    def arrow(
+        end: Array, text: str, line: dict[str, str], **named: str
+    ) -> dict[str, object]:
         x, y, z = ([0, round(float(v), 4)] for v in end)
-        return {"type": "scatter3d", **named, "x": x, "y": y, "z": z, "text": ["", text], "line": line}
+        return {
+            "type": "scatter3d",
+            **named,
+            "x": x,
+            "y": y,
+            "z": z,
+            "text": ["", text],
+            "line": line,
+        }
 
     g = result.geometry
-    arrows = [arrow(1.2 * end, f"body {axis}", {"dash": "dash"}) for end, axis in zip(np.eye(3), "xyz", strict=True)]
+    arrows = [
+        arrow(1.2 * end, f"body {axis}", {"dash": "dash"})
+        for end, axis in zip(np.eye(3), "xyz", strict=True)
+    ]
     for i, name in enumerate(g.channel_names):
-        arrows.append(arrow(g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name))
+        arrows.append(
+            arrow(
+                g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name
+            )
+        )
     turned = "In the body frame; drag, or press the arrow keys, to turn."
     sections = [
         Section("Axes", turned, "", [{"data": arrows, "layout": {"height": 560}}]),

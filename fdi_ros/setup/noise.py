@@ -24,10 +24,15 @@ from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.estimator.noise import QUIETEST, THREE_SIGMA
 from fdi_ros.model.samples import Array, Int, Mask
 
-LENGTH = BLOCK_TIME * REST_BLOCKS  # of a segment, s; longer where so few samples are in it that blocks were empty
+LENGTH = (
+    BLOCK_TIME * REST_BLOCKS
+)  # of a segment, s; longer where so few samples are in it that blocks were empty
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-AS_QUIET, ROUNDS = 1.5, 10  # noise this many times that of the quietest is as quiet; rounds in which these are found
+AS_QUIET, ROUNDS = (
+    1.5,
+    10,
+)  # noise this many times that of the quietest is as quiet; rounds in which these are found
 LOUDER = 2.0  # noise this many times that of rest is vibration, and slower noise no more than it of the other
 LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
 MOST = 4096  # segments kept; of a longer recording every second one, and so on: memory does not grow with its length
@@ -52,12 +57,22 @@ class NoiseSegments:
         self._kept: list[NoiseSegment] = []
         self._passed = 0
         # Values (K, c) that do not make a segment yet, and their times, ns.
-        self._waiting, self._times = np.empty((0, channels)), np.empty(0, dtype=np.int64)
+        self._waiting, self._times = (
+            np.empty((0, channels)),
+            np.empty(0, dtype=np.int64),
+        )
 
     def add(self, values: Array, times: Int, rate: float) -> None:
         """Take in values (K, c) rad/s of a rate, Hz (0: not known yet), all finite, at times (K,) ns."""
-        values, times = np.vstack([self._waiting, values]), np.concatenate([self._times, times])
-        size = REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1) if rate else len(values) + 1
+        values, times = (
+            np.vstack([self._waiting, values]),
+            np.concatenate([self._times, times]),
+        )
+        size = (
+            REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1)
+            if rate
+            else len(values) + 1
+        )
         full = len(values) // size * size
         for k in range(0, full, size):
             if self._passed % self.every == 0:
@@ -75,12 +90,16 @@ class NoiseSegments:
     def all_segments(self) -> list[NoiseSegment]:
         """Segments, with the values at the end if there is no other."""
         whole = len(self._waiting) // REST_BLOCKS * REST_BLOCKS
-        return self._kept or ([_segment(self._waiting[:whole], int(self._times[0]))] if whole else [])
+        return self._kept or (
+            [_segment(self._waiting[:whole], int(self._times[0]))] if whole else []
+        )
 
     @property
     def means(self) -> Array:
         """Means of blocks (B, c), rad/s."""
-        return np.concatenate([one.means for one in self.all_segments()] or [np.zeros((1, self.channels))])
+        return np.concatenate(
+            [one.means for one in self.all_segments()] or [np.zeros((1, self.channels))]
+        )
 
     def noise(self, largest_bias: float = LARGEST_BIAS) -> Noise:
         """Work out the noise of all so far, of gyros with biases of so much, rad/s."""
@@ -91,13 +110,24 @@ class NoiseSegments:
         known = np.full(self.channels, largest_bias**2 / THREE_SIGMA)
         rest = [
             bool((one.noise <= LOUDER * least).all())
-            and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
+            and rests(
+                np.ascontiguousarray(one.means),
+                REST_BLOCKS - 1,
+                block**2,
+                known,
+                REST_STD**2,
+            )
             for one in segments
         ]
         still = [one.std for one, lies in zip(segments, rest, strict=True) if lies]
         quiet = np.maximum(least, np.median(still, axis=0)) if still else least
-        moving = np.array([one.noise for one, lies in zip(segments, rest, strict=True) if not lies])
-        usual = [np.median(column[column > 0.0]) if column.any() else 0.0 for column in moving.T]
+        moving = np.array(
+            [one.noise for one, lies in zip(segments, rest, strict=True) if not lies]
+        )
+        usual = [
+            np.median(column[column > 0.0]) if column.any() else 0.0
+            for column in moving.T
+        ]
         return Noise(quiet, np.array(usual) if len(moving) else unknown, rest)
 
 
@@ -106,7 +136,9 @@ class Noise(NamedTuple):
 
     quiet: Array  # at rest, or else when quietest
     moving: Array  # in motion, vibration included
-    rest: list[bool]  # whether nothing moves in a segment: by the monitor's own test, and as quiet as the quietest
+    rest: list[
+        bool
+    ]  # whether nothing moves in a segment: by the monitor's own test, and as quiet as the quietest
 
     @property
     def share(self) -> float:
@@ -116,7 +148,10 @@ class Noise(NamedTuple):
 
 def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     """Noise (c,) of a sample and of a block when quietest, rad/s."""
-    noise, block = np.array([one.noise for one in segments]), np.array([one.block_noise for one in segments])
+    noise, block = (
+        np.array([one.noise for one in segments]),
+        np.array([one.block_noise for one in segments]),
+    )
     # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
     for column in (*noise.T, *block.T):
         if column.any():
@@ -124,7 +159,9 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     quiet = np.argsort((noise**2).sum(axis=1))[: max(3, len(noise) // 100)]
     # The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
     for _ in range(ROUNDS):
-        alike = np.flatnonzero((noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1))
+        alike = np.flatnonzero(
+            (noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1)
+        )
         if len(alike) <= len(quiet):
             break
         quiet = alike
@@ -134,13 +171,24 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
 def _segment(values: Array, first: int) -> NoiseSegment:
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
     least, std = _noise(means), values.std(axis=0)
-    return NoiseSegment(first, means, std, _noise(values), np.clip(means.std(axis=0), least, LOUDER * least))
+    return NoiseSegment(
+        first,
+        means,
+        std,
+        _noise(values),
+        np.clip(means.std(axis=0), least, LOUDER * least),
+    )
 
 
 def _noise(values: Array) -> Array:
-    inside, smooth = len(SMOOTH) // 2, np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T])
+    inside, smooth = (
+        len(SMOOTH) // 2,
+        np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T]),
+    )
     # Of white noise the parabola takes its share with it.
-    noise = np.sqrt(np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside]))
+    noise = np.sqrt(
+        np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside])
+    )
     return np.where(noise > LEAST_NOISE, noise, 0.0)
 
 
@@ -178,7 +226,11 @@ def information(variance: Array, axes: Array) -> Array:
 def gains(variance: Array, axes: Array) -> Array:
     """G (..., 3, n): the weighted least squares rate."""
     weighted = axes / variance[..., :, None]
-    return np.asarray(np.linalg.solve(np.swapaxes(axes, -1, -2) @ weighted, np.swapaxes(weighted, -1, -2)))
+    return np.asarray(
+        np.linalg.solve(
+            np.swapaxes(axes, -1, -2) @ weighted, np.swapaxes(weighted, -1, -2)
+        )
+    )
 
 
 def variances(covariance: Array, axes: Array) -> Array:
@@ -192,7 +244,12 @@ def variances(covariance: Array, axes: Array) -> Array:
         ratio = np.where(checked > 1e-6, t * v / np.maximum(checked, 1e-6), 1.0)
         v = v * np.clip(ratio, 0.1, 10.0)
         # Less than the monitor believes of one channel is a split that nothing decides.
-        v = np.maximum(v, np.maximum(QUIETEST * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE))
+        v = np.maximum(
+            v,
+            np.maximum(
+                QUIETEST * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE
+            ),
+        )
     return v
 
 
@@ -204,17 +261,24 @@ def projector(axes: Array) -> Array:
 def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     """Variance (W, n) of channels that are there (W, n), by covariances (W, n, n) of windows and their neighbours."""
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
-    near, beside = np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))), np.pad(there, ((MEMORY, MEMORY), (0, 0)))
+    near, beside = (
+        np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))),
+        np.pad(there, ((MEMORY, MEMORY), (0, 0))),
+    )
     total, weight = np.zeros_like(filled), np.zeros(len(filled))
     for shift in reversed(range(2 * MEMORY + 1)):
         # The mean of covariances of other channels would be none.
         same = (there == beside[shift : shift + len(there)]).all(axis=1)
         total += np.where(same[:, None, None], near[shift : shift + len(there)], 0.0)
         weight += same
-    found = _by_pattern(variances, total / np.maximum(weight, 1)[:, None, None], there, axes)
+    found = _by_pattern(
+        variances, total / np.maximum(weight, 1)[:, None, None], there, axes
+    )
     known = np.isfinite(found)
     if not known.any():
-        raise CalibrationError("more than three channels never give values at the same time: none checks another")
+        raise CalibrationError(
+            "more than three channels never give values at the same time: none checks another"
+        )
     some = known.any(axis=0)
     medians = np.nanmedian(found[:, some], axis=0)
     usual = np.full(found.shape[1], np.median(medians))
@@ -222,18 +286,24 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     return np.where(known, found, usual)
 
 
-def _by_pattern(of: Callable[[Array, Array], Array], covariance: Array, there: Mask, axes: Array) -> Array:
+def _by_pattern(
+    of: Callable[[Array, Array], Array], covariance: Array, there: Mask, axes: Array
+) -> Array:
     """Work out a figure (W, n) of windows of the same channels, from covariances and axes; NaN: too few are there."""
     found = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
-        found[np.ix_(rows, columns)] = of(covariance[np.ix_(rows, columns, columns)], axes[columns])
+        found[np.ix_(rows, columns)] = of(
+            covariance[np.ix_(rows, columns, columns)], axes[columns]
+        )
     return found
 
 
 def _residual_variances(covariance: Array, axes: Array) -> Array:
     """Variance (W, n) of what the rate does not explain of each channel."""
     apart = projector(axes)
-    return np.asarray(np.einsum("ia,wab,bi->wi", apart, covariance, apart, optimize=True))
+    return np.asarray(
+        np.einsum("ia,wab,bi->wi", apart, covariance, apart, optimize=True)
+    )
 
 
 def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
@@ -250,7 +320,11 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
     known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
     if known.any():
-        logs = np.log(np.maximum(residual[known][:, np.isfinite(residual).any(axis=0)], LEAST_VARIANCE))
+        logs = np.log(
+            np.maximum(
+                residual[known][:, np.isfinite(residual).any(axis=0)], LEAST_VARIANCE
+            )
+        )
         # The geometric mean of the channels: one that is always noisy hides nothing.
         found[known] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
     return found
@@ -274,7 +348,10 @@ def _quietest(level: Array, count: Int) -> Mask:
 
 def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor:
     """Find the lower envelope of the noise, by covariances (W, n, n) of so many (W,) samples of channels (W, n)."""
-    level, (sums, precision, weight) = levels(covariance, there, axes), np.zeros((3, len(axes)))
+    level, (sums, precision, weight) = (
+        levels(covariance, there, axes),
+        np.zeros((3, len(axes))),
+    )
     windows = np.zeros(len(level), dtype=bool)
     # A unit that comes late has quiet windows of its own.
     for pattern in np.unique(there, axis=1).T:
@@ -282,8 +359,13 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
         windows |= quiet
         alike = (there == pattern[:, None]).all(axis=0)
         for rows, columns in patterns_of(there & quiet[:, None]):
-            samples, part = count[rows].sum(), covariance[np.ix_(rows, columns, columns)]
-            (v,) = variances(np.average(part, axis=0, weights=count[rows])[None], axes[columns])
+            samples, part = (
+                count[rows].sum(),
+                covariance[np.ix_(rows, columns, columns)],
+            )
+            (v,) = variances(
+                np.average(part, axis=0, weights=count[rows])[None], axes[columns]
+            )
             # Of A_ii v_i of the variance the redundancy shows; the rest is as the others have it.
             shown = np.maximum(np.diag(information(v, axes[columns])) * v, 0.1)
             chosen = alike[columns]
@@ -294,4 +376,8 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
     known = weight > 0
     variance = sums / np.maximum(weight, 1)
     variance[~known] = np.median(variance[known]) if known.any() else LEAST_VARIANCE
-    return Floor(np.sqrt(variance), np.sqrt(variance / (2.0 * np.maximum(precision, 1.0))), windows)
+    return Floor(
+        np.sqrt(variance),
+        np.sqrt(variance / (2.0 * np.maximum(precision, 1.0))),
+        windows,
+    )

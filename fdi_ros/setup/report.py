@@ -48,10 +48,18 @@ from fdi_ros.setup.starting_config import (
 )
 from fdi_ros.system.text import LINE, shown
 
-SHOWN_AXES = UNMEASURED / 2  # uncertainty of the axes along a direction of the body from which they are not well shown
+SHOWN_AXES = (
+    UNMEASURED / 2
+)  # uncertainty of the axes along a direction of the body from which they are not well shown
 LEAST_SHARE = 0.2  # part of a recording that supports its noise
-LARGE_ANGLE, LARGE_SCALE = float(np.radians(5.0)), 0.05  # of axes against nominal, that are worth a look
-LARGE_SWING, LARGE_BIAS = float(np.radians(0.03)), 0.2  # of biases, within a recording and at all, rad/s
+LARGE_ANGLE, LARGE_SCALE = (
+    float(np.radians(5.0)),
+    0.05,
+)  # of axes against nominal, that are worth a look
+LARGE_SWING, LARGE_BIAS = (
+    float(np.radians(0.03)),
+    0.2,
+)  # of biases, within a recording and at all, rad/s
 MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
 LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
@@ -62,7 +70,9 @@ NOISE_HINT = (
 BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
 
 
-def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADIANS) -> Iterator[Finding]:
+def calibration_findings(
+    result: Calibration, body_frame: str, unit: Unit = RADIANS
+) -> Iterator[Finding]:
     """List what was found, what is not known, and what to look at."""
     yield from _found(result, unit)
     yield from _unknown(result, body_frame, unit)
@@ -72,27 +82,53 @@ def calibration_findings(result: Calibration, body_frame: str, unit: Unit = RADI
 def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
     found, name, factor = result.estimate, unit.name, unit.factor
-    rest, walk, floor, usual = found.rest_seconds, found.bias_walk, found.floor, np.median(found.moment, axis=0)
+    rest, walk, floor, usual = (
+        found.rest_seconds,
+        found.bias_walk,
+        found.floor,
+        np.median(found.moment, axis=0),
+    )
     words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
     yield Finding(Role.FOUND, "time at rest", words, value=rest)
-    (least, most), (low, high) = ((std.min() * factor, std.max() * factor) for std in (floor.std, usual))
+    (least, most), (low, high) = (
+        (std.min() * factor, std.max() * factor) for std in (floor.std, usual)
+    )
     words = f"noise_std {least:.2g} to {most:.2g} {name}, from the quietest {floor.share:.0%} of the recording; usually"
     words += f" {low:.2g} to {high:.2g}"
     largest = int(floor.std.argmax())
-    yield Finding(Role.FOUND, "noise", words, (), float(floor.std[largest]), float(floor.error[largest]))
+    yield Finding(
+        Role.FOUND,
+        "noise",
+        words,
+        (),
+        float(floor.std[largest]),
+        float(floor.error[largest]),
+    )
     words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
     words += "biases walk" if walk.value else "no walk of the biases shown, below"
     words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
-        side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+        side = (
+            "late (measured earlier than stamped)"
+            if delay.value > 0
+            else "early (measured later than stamped)"
+        )
         taken = "taken off" if delay.shown else "not taken off: it may be none"
         if "imus.delays" not in result.settings:
             taken = "not taken off: one message"
         words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
         words += f" the first unit, {taken}"
-        yield Finding(Role.FOUND, "delay", words, names, delay.value, delay.error, SHOWN * delay.error)
+        yield Finding(
+            Role.FOUND,
+            "delay",
+            words,
+            names,
+            delay.value,
+            delay.error,
+            SHOWN * delay.error,
+        )
 
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
@@ -110,17 +146,40 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
     error, rms = result.axis_errors, np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
         which = " and ".join(unmeasured)
-        along, about = ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
+        along, about = (
+            ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
+        )
         words = f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near"
         words += " those configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
-        yield Finding(Role.UNKNOWN, "scale factors", words, unmeasured, None, float(error.max()), UNMEASURED)
+        yield Finding(
+            Role.UNKNOWN,
+            "scale factors",
+            words,
+            unmeasured,
+            None,
+            float(error.max()),
+            UNMEASURED,
+        )
     if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
-        turns = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})" for a in poor)
+        turns = ", ".join(
+            f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})"
+            for a in poor
+        )
         words = f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
         words += " Turn it back and forth about them, some 1 rad/s"
-        yield Finding(Role.UNKNOWN, "axes", words, ["xyz"[a] for a in poor], None, float(error[poor].max()), SHOWN_AXES)
+        yield Finding(
+            Role.UNKNOWN,
+            "axes",
+            words,
+            ["xyz"[a] for a in poor],
+            None,
+            float(error[poor].max()),
+            SHOWN_AXES,
+        )
     if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
-        names = list(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
+        names = list(
+            dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late)
+        )
         worst = max(d.error for d in late)
         words = f"delays of {', '.join(names)} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth"
         yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
@@ -130,58 +189,117 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """List what to look at before the settings are trusted: faults, values lost, and channels beyond a bound."""
     found, names = result.estimate, result.names
     if result.faults:
-        spans = [f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s" for who, a, b in result.faults]
+        spans = [
+            f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s"
+            for who, a, b in result.faults
+        ]
         words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
         struck = sorted({i for span in result.faults for i in span.channels})
-        yield Finding(Role.WARNING, "declared", words, [names[i] for i in struck], headline="USABLE, BUT LOOK")
+        yield Finding(
+            Role.WARNING,
+            "declared",
+            words,
+            [names[i] for i in struck],
+            headline="USABLE, BUT LOOK",
+        )
     lost = [
         f"{int(count.sum())} {'frozen' if why == 'repeated' else why.replace('_', ' ')}"
         f" ({'every channel' if count.all() else ', '.join(names[i] for i in np.flatnonzero(count))})"
         for why, count in result.unusable.items()
-        if count.max() > (MANY * found.blocks.count.sum() if why in ("missing", "spikes") else 0)
+        if count.max()
+        > (MANY * found.blocks.count.sum() if why in ("missing", "spikes") else 0)
     ]
     if lost:
-        yield Finding(Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}")
+        yield Finding(
+            Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}"
+        )
     moving = np.median(found.moment, axis=0)
-    for when, noise, headline in (("in motion", moving, "USABLE, BUT LOOK"), ("at rest", found.floor.std, "")):
+    for when, noise, headline in (
+        ("in motion", moving, "USABLE, BUT LOOK"),
+        ("at rest", found.floor.std, ""),
+    ):
         if noisy := much_noisier(noise, result.units):
             words = noisier_words(names, noise, result.units, unit.name, unit.factor)
             words += f" {when}: loose, badly isolated, of another make, or faulty"
             worst, beside = max(noisy, key=lambda one: noise[one[0]])
             who = [names[i] for i, _ in noisy]
-            yield Finding(Role.WARNING, "noise", words, who, float(noise[worst]), None, beside, headline)
+            yield Finding(
+                Role.WARNING,
+                "noise",
+                words,
+                who,
+                float(noise[worst]),
+                None,
+                beside,
+                headline,
+            )
     rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
     for what, values, bound, form, factor in (
-        ("axes turned from their nominal ones", result.angle, LARGE_ANGLE, "{:.1f} deg", np.degrees(1.0)),
-        ("scale factors off their nominal ones", result.factor - 1.0, LARGE_SCALE, "{:+.1%}", 1.0),
+        (
+            "axes turned from their nominal ones",
+            result.angle,
+            LARGE_ANGLE,
+            "{:.1f} deg",
+            np.degrees(1.0),
+        ),
+        (
+            "scale factors off their nominal ones",
+            result.factor - 1.0,
+            LARGE_SCALE,
+            "{:+.1%}",
+            1.0,
+        ),
         ("biases moved within the recording", swing, LARGE_SWING, rate, unit.factor),
         ("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
     ):
         if len(beyond := np.flatnonzero(np.abs(values) > bound)):
             words = f"{what}: {', '.join(f'{names[i]} by {form.format(values[i] * factor)}' for i in beyond)}"
             largest = float(values[np.abs(values).argmax()])
-            yield Finding(Role.WARNING, what, words, [names[i] for i in beyond], largest, None, bound)
+            yield Finding(
+                Role.WARNING,
+                what,
+                words,
+                [names[i] for i in beyond],
+                largest,
+                None,
+                bound,
+            )
 
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
     """List everything: what the settings are from and are worth, what is not known, what to look at."""
-    result, mounting, units = found.calibration, found.mounting, source_of(found.config).units
+    result, mounting, units = (
+        found.calibration,
+        found.mounting,
+        source_of(found.config).units,
+    )
     g, rate = mounting.geometry, found.config.sample_rate
     yield from _worth(found, unit)
     where = f"{len(units)} units" if units else "one array"
-    yield Finding(Role.FOUND, "channels", f"{g.n} channels in {where} at {rate:.4g} Hz", value=rate)
+    yield Finding(
+        Role.FOUND,
+        "channels",
+        f"{g.n} channels in {where} at {rate:.4g} Hz",
+        value=rate,
+    )
     if known := sum(mount.rotation is not None for mount in found.mounts[1:]):
         words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
         yield Finding(Role.FOUND, "mounts", words, value=known)
     if result is not None:
         yield from calibration_findings(result, found.config.body_frame, unit)
     noise = (mounting.noise, mounting.false_alarm_probability, unit.name, unit.factor)
-    yield Finding(Role.FOUND, "mounting", summary_line(g, *noise, agree=not found.disagree))
+    yield Finding(
+        Role.FOUND, "mounting", summary_line(g, *noise, agree=not found.disagree)
+    )
     yield from _not_shown(found, unit)
     if words := copy_words(found.reports):
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
     yield from topic_findings(found.chosen, unit)
-    limits = [line for line in pair_lines(mounting) if "not" in line.split(":")[-1] or "never" in line]
+    limits = [
+        line
+        for line in pair_lines(mounting)
+        if "not" in line.split(":")[-1] or "never" in line
+    ]
     if limits:
         yield Finding(Role.WARNING, "mounting", "; ".join(limits))
 
@@ -194,39 +312,61 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     if found.disagree:
         yield Finding(warning, "agreement", found.refused, headline="DO NOT USE")
     elif found.calibration is None and not units:
-        words = f"the axes of the array are not known (a cone is assumed): {found.refused}"
+        words = (
+            f"the axes of the array are not known (a cone is assumed): {found.refused}"
+        )
         yield Finding(warning, "axes", words, headline="DO NOT USE")
     elif tried.judged < LEAST_JUDGED:
         note = tried.note or "channels are missing"
-        words = f"only {tried.judged:.0%} of the samples of the proof are judged: {note}"
-        yield Finding(warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE")
+        words = (
+            f"only {tried.judged:.0%} of the samples of the proof are judged: {note}"
+        )
+        yield Finding(
+            warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
+        )
     elif tried.declared:
         words = f"the monitor declares {times_words(tried.declared)} on {proof.source}: a gyro is faulty there, or the"
         words += " settings do not fit it"
-        yield Finding(warning, "declared", words, list(tried.declared), headline="DO NOT USE")
+        yield Finding(
+            warning, "declared", words, list(tried.declared), headline="DO NOT USE"
+        )
     elif found.kept:
         words = f"on {proof.source}, {found.kept}; the settings before are written"
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
-        words, isolated, biases = "nothing is declared without a fault", *tried.isolated_of
+        words, isolated, biases = (
+            "nothing is declared without a fault",
+            *tried.isolated_of,
+        )
         if not found.mounting.losses[0].isolable:
             words += "; a fault is detected, which channel it is not"
         elif biases:
             sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
-            words += f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
+            words += (
+                f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
+            )
         yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
     if found.calibration is None and not found.disagree and units:
         words = f"{found.refused}: axes, delays and noise in motion are not known"
-        yield Finding(Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED")
+        yield Finding(
+            Role.UNKNOWN, "calibration", words, headline="USABLE, NOT CALIBRATED"
+        )
 
 
 def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     """List what the recording does not show, what is taken instead, and how to get it."""
     yield from (Finding(Role.UNKNOWN, "damage", line) for line in found.damage)
     named = zip(found.config.imu_names, found.mounts, strict=False)
-    if unshown := {name: mount.words for name, mount in named if mount.rotation is None}:
+    if unshown := {
+        name: mount.words for name, mount in named if mount.rotation is None
+    }:
         words = "; ".join(f"{name} ({why})" for name, why in unshown.items())
-        yield Finding(Role.UNKNOWN, "mounts", f"mounts taken for the identity: {words}", list(unshown))
+        yield Finding(
+            Role.UNKNOWN,
+            "mounts",
+            f"mounts taken for the identity: {words}",
+            list(unshown),
+        )
     if not found.chosen:
         return
     if source_of(found.config).units:
@@ -243,8 +383,14 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     words = "the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
     words += f" (bias.turn_on_std: {turn_on * unit.factor:.3g} {unit.name} is assumed)"
     yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on)
-    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
-    if others := [report.topic.name for report in possible if report not in found.chosen]:
+    possible = [
+        report
+        for report in found.reports
+        if report.could_be_gyros and report.kind is not None
+    ]
+    if others := [
+        report.topic.name for report in possible if report not in found.chosen
+    ]:
         words = f"topics that were not used, though they could be gyros: {', '.join(others)}"
         yield Finding(Role.UNKNOWN, "topics", words, others)
 
@@ -253,7 +399,11 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
     names, found, rest = result.names, result.estimate, result.estimate.rest_seconds
     return {
-        "seconds": {"all": result.duration, "rest": rest, "motion": result.duration - rest},
+        "seconds": {
+            "all": result.duration,
+            "rest": rest,
+            "motion": result.duration - rest,
+        },
         "channels": figures_of(channel_columns(result)),
         "noise": {
             "share_of_recording": found.floor.share,
@@ -264,11 +414,20 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
             "bias_walk_possible": found.bias_walk.possible,
         },
         "delays": [
-            {"channels": [names[i] for i in d.channels], "late_s": d.value, "std_s": d.error, "shown": d.shown}
+            {
+                "channels": [names[i] for i in d.channels],
+                "late_s": d.value,
+                "std_s": d.error,
+                "shown": d.shown,
+            }
             for d in result.delays
         ],
         "faults": [
-            {"channels": [names[i] for i in span.channels], "start_s": span.start, "end_s": span.end}
+            {
+                "channels": [names[i] for i in span.channels],
+                "start_s": span.start,
+                "end_s": span.end,
+            }
             for span in result.faults
         ],
         "settings": result.settings,
@@ -280,9 +439,15 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
 
     def measured(values: Array, form: str) -> list[str]:
-        return [f"{v:{form}}" if known else "not measured" for v, known in zip(values, result.measured, strict=True)]
+        return [
+            f"{v:{form}}" if known else "not measured"
+            for v, known in zip(values, result.measured, strict=True)
+        ]
 
-    lost = [{why: count[i] for why, count in result.unusable.items()} for i in range(len(result.names))]
+    lost = [
+        {why: count[i] for why, count in result.unusable.items()}
+        for i in range(len(result.names))
+    ]
     return [
         Column("name", result.names, ("channel",)),
         Column("axis", result.axes, ("axis x", "y", "z"), ".5f"),
@@ -298,9 +463,17 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
         Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
         Column("noise_std", found.floor.std, ("noise rad/s",), ".5f", rate),
         Column("noise_std_error", found.floor.error, ("+-",), ".5f", rate),
-        Column("noise_median", np.median(found.moment, axis=0), ("usually rad/s",), ".5f", rate),
+        Column(
+            "noise_median",
+            np.median(found.moment, axis=0),
+            ("usually rad/s",),
+            ".5f",
+            rate,
+        ),
         Column("noise_largest", found.moment.max(axis=0)),
-        Column("not_used", lost, ("not used",), lambda counts: str(sum(counts.values()))),
+        Column(
+            "not_used", lost, ("not used",), lambda counts: str(sum(counts.values()))
+        ),
     ]
 
 
@@ -308,12 +481,26 @@ def _mounts(found: SetupResult) -> list[Column]:
     """Figures of the mount of every unit."""
     mounts = found.mounts
     known = [mount.rotation is not None for mount in mounts]
-    shared = [f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)]
+    shared = [
+        f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)
+    ]
     return [
         Column("unit", found.config.imu_names[: len(mounts)], ("unit",)),
         Column("known", known),
-        Column("rotation", [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]),
-        Column("error_rad", [mount.error if shows else None for mount, shows in zip(mounts, known, strict=True)]),
+        Column(
+            "rotation",
+            [
+                np.eye(3) if mount.rotation is None else mount.rotation
+                for mount in mounts
+            ],
+        ),
+        Column(
+            "error_rad",
+            [
+                mount.error if shows else None
+                for mount, shows in zip(mounts, known, strict=True)
+            ],
+        ),
         Column("off_rad", [mount.off for mount in mounts]),
         Column("", [mount.words for mount in mounts], ("mount",)),
         Column("", shared, ("motion in common with the first",)),
@@ -323,9 +510,15 @@ def _mounts(found: SetupResult) -> list[Column]:
 def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
     """Figures of the settings before and after on the recording of the proof."""
     both = [found.proof.before, found.proof.after]
-    declared = ["-" if one.baseline is None else times_words(one.declared) or "nothing" for one in both]
+    declared = [
+        "-" if one.baseline is None else times_words(one.declared) or "nothing"
+        for one in both
+    ]
     shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
-    isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
+    isolated = [
+        [{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()]
+        for one in both
+    ]
     heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in SIZES]
     return [
         Column("", ("before", "new"), ("settings",)),
@@ -333,7 +526,12 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
         Column("judged", [one.judged for one in both], ("judged",), ".0%"),
         Column("declared", [declared_figures(one.baseline) for one in both]),
         Column("isolated", isolated),
-        Column("", shares, heads, lambda share: f"{share[0]} of {share[1]}" if share[1] else "-"),
+        Column(
+            "",
+            shares,
+            heads,
+            lambda share: f"{share[0]} of {share[1]}" if share[1] else "-",
+        ),
     ]
 
 
@@ -350,7 +548,12 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
         "no_better": found.kept,
         **({} if result is None else calibration_figures(result)),
         "parameters": found.parameters,
-        "proof": {"source": proof.source, "kept_aside": proof.apart, "seconds": proof.seconds, **tried},
+        "proof": {
+            "source": proof.source,
+            "kept_aside": proof.apart,
+            "seconds": proof.seconds,
+            **tried,
+        },
     }
 
 
@@ -368,7 +571,10 @@ def _sections(
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
-    steps = [shown(line, LINE) for line in (steps[:1] if first.severity is Severity.BAD else steps)]
+    steps = [
+        shown(line, LINE)
+        for line in (steps[:1] if first.severity is Severity.BAD else steps)
+    ]
     sections = [
         Section("Warnings", "", lines_of(findings, Role.WARNING)),
         Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),
@@ -377,14 +583,24 @@ def _sections(
     ]
     if result is not None:
         channels = told(channel_columns(result, unit), unit)
-        sections.insert(0, Section("Axes, biases and noise", "With standard errors (+-).", channels))
+        sections.insert(
+            0, Section("Axes, biases and noise", "With standard errors (+-).", channels)
+        )
     return [shown(first.words, LINE), *lines_of(findings, Role.FOUND)], sections
 
 
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    (first, *lines), sections = _sections(found, list(setup_findings(found, unit)), bag, config, unit)
-    return text_of([first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)], sections) + "\n\n"
+    (first, *lines), sections = _sections(
+        found, list(setup_findings(found, unit)), bag, config, unit
+    )
+    return (
+        text_of(
+            [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in lines)],
+            sections,
+        )
+        + "\n\n"
+    )
 
 
 def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
@@ -392,16 +608,35 @@ def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
     findings = list(setup_findings(found, unit))
     topics = [report for report in found.reports if report.could_be_gyros]
     (first, *lines), sections = _sections(found, findings, bag, config, unit)
-    used = Column("", ["yes" if report in found.chosen else "no" for report in topics], ("used",))
+    used = Column(
+        "", ["yes" if report in found.chosen else "no" for report in topics], ("used",)
+    )
     sections += _courses(found.refused, found.calibration, unit)
     if found.mounts:
         sections.append(Section("Mounts", "", told(_mounts(found))))
     if topics:
-        sections.append(Section("Topics", "The whole recording.", told([*topic_columns(topics, unit), used])))
+        sections.append(
+            Section(
+                "Topics",
+                "The whole recording.",
+                told([*topic_columns(topics, unit), used]),
+            )
+        )
     sections += fault_sections(found.mounting, unit)
-    sections.append(Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'))
+    sections.append(
+        Section(
+            "The config",
+            CONFIG_HINT,
+            f'<div class="scroll"><pre>{escape(found.text)}</pre></div>',
+        )
+    )
     summary = [first, *(f"Found: {line}." for line in lines)]
-    return page(f"fdi_ros: settings from {bag}", summary, sections, severity=verdict_of(findings).severity)
+    return page(
+        f"fdi_ros: settings from {bag}",
+        summary,
+        sections,
+        severity=verdict_of(findings).severity,
+    )
 
 
 def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Section]:
@@ -412,28 +647,54 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
     times = found.blocks.time
     half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     rests = [
-        {"type": "rect", "kind": "rest", "x0": float(times[a]) - half, "x1": float(times[b - 1]) + half}
+        {
+            "type": "rect",
+            "kind": "rest",
+            "x0": float(times[a]) - half,
+            "x1": float(times[b - 1]) + half,
+        }
         for a, b in flag_runs(found.rest)
     ]
 
-    def course(title: str, hint: str, what: str, curves: list[dict[str, object]], **axis: str) -> Section:
-        layout = time_layout(280, yaxis={"title": {"text": f"{what}, {unit.name}"}, **axis}, shapes=rests)
+    def course(
+        title: str, hint: str, what: str, curves: list[dict[str, object]], **axis: str
+    ) -> Section:
+        layout = time_layout(
+            280, yaxis={"title": {"text": f"{what}, {unit.name}"}, **axis}, shapes=rests
+        )
         return Section(title, hint, "", [{"data": curves, "layout": layout}])
 
-    def curves(names: Sequence[str], x: Array, y: Array, **more: object) -> list[dict[str, object]]:
+    def curves(
+        names: Sequence[str], x: Array, y: Array, **more: object
+    ) -> list[dict[str, object]]:
         step = max(len(x) // 2000, 1)
-        at, look = np.round(x[::step], 3).tolist(), {"type": "scatter", "mode": "lines", **more}
-        lines = [{"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look} for i, name in enumerate(names)]
+        at, look = (
+            np.round(x[::step], 3).tolist(),
+            {"type": "scatter", "mode": "lines", **more},
+        )
+        lines = [
+            {"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look}
+            for i, name in enumerate(names)
+        ]
         values = [list(map(drawn, column * unit.factor)) for column in y[::step].T]
-        return [{**line, "x": at, "y": column} for line, column in zip(lines, values, strict=True)]
+        return [
+            {**line, "x": at, "y": column}
+            for line, column in zip(lines, values, strict=True)
+        ]
 
     noise = curves(names, times, found.moment)
-    noise += curves(names, times[:1], found.floor.std[None], mode="markers", showlegend=False)
-    shaded = f"Shaded: at rest, {found.rest_seconds:.1f} s." if rests else "Nowhere at rest."
+    noise += curves(
+        names, times[:1], found.floor.std[None], mode="markers", showlegend=False
+    )
+    shaded = (
+        f"Shaded: at rest, {found.rest_seconds:.1f} s." if rests else "Nowhere at rest."
+    )
     walks = curves(names, found.times, found.curve - found.bias)
     spectrum = result.spectrum.section(unit)
     return [
-        course("Motion", shaded, "rate", curves("xyz", found.blocks.seconds, found.rate)),
+        course(
+            "Motion", shaded, "rate", curves("xyz", found.blocks.seconds, found.rate)
+        ),
         course("Noise over time", NOISE_HINT, "noise", noise, type="log"),
         course("Biases over time", BIAS_HINT, "bias minus its mean", walks),
         *([] if spectrum is None else [spectrum]),

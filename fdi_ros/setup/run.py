@@ -30,15 +30,36 @@ from fdi_ros.replay.sweep import Baseline, Plan, Subject, parse_swept, sweep
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.calibrate import LEAST_DURATION, REPLACED, UNKNOWN_MOUNT, Calibration, calibrate, reference_channels
+from fdi_ros.setup.calibrate import (
+    LEAST_DURATION,
+    REPLACED,
+    UNKNOWN_MOUNT,
+    Calibration,
+    calibrate,
+    reference_channels,
+)
 from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.setup.starting_config import candidates, clocks_apart, copy_words, needs, refuse_degrees, starting_config
+from fdi_ros.setup.starting_config import (
+    candidates,
+    clocks_apart,
+    copy_words,
+    needs,
+    refuse_degrees,
+    starting_config,
+)
 from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
-WITHIN, TIMES = 4.0, 2  # s in which they are to be isolated, and how often each is tried
-KEPT, LEAST_KEPT, MOST_KEPT = 0.25, TIMES * WITHIN, 120.0  # part kept aside, and its bounds, s: all biases have room
+WITHIN, TIMES = (
+    4.0,
+    2,
+)  # s in which they are to be isolated, and how often each is tried
+KEPT, LEAST_KEPT, MOST_KEPT = (
+    0.25,
+    TIMES * WITHIN,
+    120.0,
+)  # part kept aside, and its bounds, s: all biases have room
 LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
 
 
@@ -48,15 +69,23 @@ class Tried:
 
     baseline: Baseline | None  # as it is; None: the monitor judges nothing
     note: str
-    isolated: dict[float, tuple[int, int]]  # by size, rad/s: biases isolated, and tried; empty: too short
+    isolated: dict[
+        float, tuple[int, int]
+    ]  # by size, rad/s: biases isolated, and tried; empty: too short
 
     def __post_init__(self) -> None:
-        self.judged = 0.0 if self.baseline is None else self.baseline.judged  # share of the samples
-        self.declared: dict[str, float] = {}  # channels declared, without a fault, and when first, s
+        self.judged = (
+            0.0 if self.baseline is None else self.baseline.judged
+        )  # share of the samples
+        self.declared: dict[
+            str, float
+        ] = {}  # channels declared, without a fault, and when first, s
         for event in self.baseline.declared if self.baseline is not None else ():
             self.declared.setdefault(event.channel, event.at_s)
         # Biases isolated, and tried, of all sizes.
-        self.isolated_of = tuple(map(sum, zip(*self.isolated.values(), strict=True))) or (0, 0)
+        self.isolated_of = tuple(
+            map(sum, zip(*self.isolated.values(), strict=True))
+        ) or (0, 0)
 
 
 def times_words(declared: Mapping[str, float]) -> str:
@@ -79,7 +108,11 @@ class Proof:
         """By what the new settings are worse than those before; empty: they are as good, or better."""
         before, after = self.before, self.after
         (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
-        new = {name: at for name, at in after.declared.items() if name not in before.declared}
+        new = {
+            name: at
+            for name, at in after.declared.items()
+            if name not in before.declared
+        }
         if before.baseline is None:
             return ""
         if after.baseline is None:
@@ -97,18 +130,26 @@ class Proof:
 
 def _tried(block: Block, config: Config) -> Tried:
     """Replay a recording as it is, and with biases of all sizes."""
-    plan = Plan(tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")), TIMES, WITHIN)
+    plan = Plan(
+        tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")),
+        TIMES,
+        WITHIN,
+    )
     one = Subject("settings", config, block)
     try:
         sweep([one], plan)
     except FdiError as error:
         if (baseline := one.baseline) is None:
             raise FdiError(one.refused) from error
-        return Tried(baseline if baseline.judged else None, baseline.note or str(error), {})
+        return Tried(
+            baseline if baseline.judged else None, baseline.note or str(error), {}
+        )
     # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
     missed, isolated = len(one.skipped) * len(one.used), {}
     for size in SIZES:
-        outcomes = [trial.scored.outcome for trial in one.trials if trial.swept.size == size]
+        outcomes = [
+            trial.scored.outcome for trial in one.trials if trial.swept.size == size
+        ]
         isolated[size] = outcomes.count(OutcomeKind.ISOLATED), len(outcomes) + missed
     return Tried(one.baseline, one.refused, isolated)
 
@@ -124,7 +165,9 @@ class LearnedSettings:
     config: Config
     calibration: Calibration | None = None
     why: FdiError | None = None  # for which there is no calibration
-    mounts: tuple[Mount, ...] = ()  # of each unit; empty: channels in one array, or mounts that were given
+    mounts: tuple[
+        Mount, ...
+    ] = ()  # of each unit; empty: channels in one array, or mounts that were given
 
     @property
     def refused(self) -> str:
@@ -152,7 +195,9 @@ class SetupResult(LearnedSettings):
     def remarks(self) -> dict[str, str]:
         """How the parameters were found, by parameter: for the parameter file."""
         calibrated = self.calibration is not None and not self.kept
-        rested = self.calibration is not None and self.calibration.estimate.rest_seconds > 0
+        rested = (
+            self.calibration is not None and self.calibration.estimate.rest_seconds > 0
+        )
         noise = "at rest" if rested else "the lower envelope in motion"
         guess = "measured" if calibrated else "a guess"
         remarks = {
@@ -160,7 +205,9 @@ class SetupResult(LearnedSettings):
             "imus.mounts": "see the page for what is known of them",
             "imus.delays": "against the first: measured",
             "geometry.axes": "mounts included: measured",
-            "noise.noise_std": f"{noise}: measured" if calibrated else "measured, roughly",
+            "noise.noise_std": f"{noise}: measured"
+            if calibrated
+            else "measured, roughly",
             "noise.scale_std": guess,
             "noise.timing_std": guess,
             "noise.bias_walk": "measured",
@@ -179,7 +226,11 @@ class SetupResult(LearnedSettings):
 
 
 def set_up(
-    bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "", proof: Path | None = None
+    bag: Path,
+    start: float = 0.0,
+    end: float = math.inf,
+    reference: str = "",
+    proof: Path | None = None,
 ) -> SetupResult:
     """Make the fullest config that a recording gives.
 
@@ -196,15 +247,23 @@ def set_up(
             for one in reports
         ]
         words = first_of(topics, 12, "; ") or "none"
-        raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {words}")
+        raise BagError(
+            f"{bag} has no gyros for a monitor: needs {lacking}; there are: {words}"
+        )
     if lacking:
         raise BagError(f"{bag} needs {lacking}; mend the driver")
     parameters: Parameters = {**starting_config(chosen, bag).parameters}
-    begun = LearnedSettings(parameters=parameters, config=Config.from_parameters(parameters))
+    begun = LearnedSettings(
+        parameters=parameters, config=Config.from_parameters(parameters)
+    )
     units = source_of(begun.config).units
     reference_channels(begun.config, build_geometry(begun.config), reference)
     block = read_block(bag, begun.config, start, end)
-    if units and not np.isfinite(block.z).all(axis=1).any() and (apart := clocks_apart(chosen, 0.0)):
+    if (
+        units
+        and not np.isfinite(block.z).all(axis=1).any()
+        and (apart := clocks_apart(chosen, 0.0))
+    ):
         raise BagError(f"{bag}: {apart}")
 
     def learn(part: Block) -> tuple[LearnedSettings, LearnedSettings]:
@@ -216,24 +275,47 @@ def set_up(
 
 
 def recalibrate(
-    bag: Path, config: Config, start: float = 0.0, end: float = math.inf, reference: str = "", proof: Path | None = None
+    bag: Path,
+    config: Config,
+    start: float = 0.0,
+    end: float = math.inf,
+    reference: str = "",
+    proof: Path | None = None,
 ) -> SetupResult:
     """Calibrate a config on a recording; parameters as of `set_up`.
 
     `FdiError` if it cannot be read, lacks a topic, or its channels contradict each other.
     """
     if copies := copy_words(refuse_degrees(bag, config)):
-        raise CalibrationError(f"{bag}: {copies}; look at topics and remappings, or leave one out of the config")
+        raise CalibrationError(
+            f"{bag}: {copies}; look at topics and remappings, or leave one out of the config"
+        )
     block = read_block(bag, config, start, end)
     names = build_geometry(config).channel_names
-    if silent := [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]:
+    if silent := [
+        name
+        for name, values in zip(names, block.z.T, strict=True)
+        if not np.isfinite(values).any()
+    ]:
         words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
-        raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
+        raise CalibrationError(
+            f"the recording has no value of {', '.join(silent)}: {words}"
+        )
     given = LearnedSettings(parameters=dict(config.parameters()), config=config)
-    return _proved(block, bag, start, end, proof, lambda part: (given, _calibrated(part, given, reference)), True)
+    return _proved(
+        block,
+        bag,
+        start,
+        end,
+        proof,
+        lambda part: (given, _calibrated(part, given, reference)),
+        True,
+    )
 
 
-Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]  # settings before, and those of a recording
+Learn = Callable[
+    [Block], tuple[LearnedSettings, LearnedSettings]
+]  # settings before, and those of a recording
 
 
 def _kept_from(block: Block) -> tuple[float, float] | None:
@@ -249,25 +331,47 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
 
 
 def _proved(
-    block: Block, bag: Path, start: float, end: float, proof: Path | None, learn: Learn, needed: bool = False
+    block: Block,
+    bag: Path,
+    start: float,
+    end: float,
+    proof: Path | None,
+    learn: Learn,
+    needed: bool = False,
 ) -> SetupResult:
     """Prove what a recording gives on another one, or what a part of it gives on the rest, if it is long enough.
 
     Then take what all of it gives, or the settings before. If needed, a first part without a calibration is an error.
     """
-    learned, apart, source = block, proof is not None, "the same recording: too short to keep a part of it aside"
+    learned, apart, source = (
+        block,
+        proof is not None,
+        "the same recording: too short to keep a part of it aside",
+    )
     if proof is not None:
         bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
     elif (kept := _kept_from(block)) is not None:
         since, seconds = kept
-        learned = block[: int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))]
-        start, apart, source = start + since, True, f"the last {seconds:.0f} s, kept aside"
+        learned = block[
+            : int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
+        ]
+        start, apart, source = (
+            start + since,
+            True,
+            f"the last {seconds:.0f} s, kept aside",
+        )
     before, found = learn(learned)
     if needed and found.why is not None:
         raise found.why
     # Delays are taken off as it is read.
-    tried = [_tried(read_block(bag, one.config, start, end), one.config) for one in (before, found)]
-    lasts = max((one.baseline.duration for one in tried if one.baseline is not None), default=0.0)
+    tried = [
+        _tried(read_block(bag, one.config, start, end), one.config)
+        for one in (before, found)
+    ]
+    lasts = max(
+        (one.baseline.duration for one in tried if one.baseline is not None),
+        default=0.0,
+    )
     proved = Proof(source, apart, lasts, *tried)
     worse = proved.worse if found.calibration is not None else ""
     if learned is not block:
@@ -276,13 +380,17 @@ def _proved(
             before, found = whole_before, whole
     if worse:
         found = replace(found, parameters=before.parameters, config=before.config)
-    return SetupResult(**vars(found), kept=worse, mounting=assess(found.config), proof=proved)
+    return SetupResult(
+        **vars(found), kept=worse, mounting=assess(found.config), proof=proved
+    )
 
 
 def _mounted(block: Block, start: LearnedSettings) -> LearnedSettings:
     """Find how units are mounted against each other."""
     mounts = find_mounts(prepare(block, np.array(start.config.health.max_rate)))
-    rotations = [np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts]
+    rotations = [
+        np.eye(3) if mount.rotation is None else mount.rotation for mount in mounts
+    ]
     known = {**start.parameters, "imus.mounts": np.ravel(rotations).tolist()}
     return replace(_if_built(known, start), mounts=mounts)
 
@@ -297,35 +405,55 @@ def _if_built(known: Parameters, before: LearnedSettings) -> LearnedSettings:
     return replace(before, parameters=known, config=new)
 
 
-def _with_mounts(block: Block, before: LearnedSettings, reference: str) -> LearnedSettings:
+def _with_mounts(
+    block: Block, before: LearnedSettings, reference: str
+) -> LearnedSettings:
     """Calibrate with the mounts found, or refuse by what they contradict."""
     names, mounts = before.config.imu_names, before.mounts
-    if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
+    if odd := [
+        name for name, mount in zip(names, mounts, strict=False) if mount.mirrored
+    ]:
         # Where most are mirrored against the first, it is the first.
         if len(odd) > len(mounts) - 1 - len(odd):
             odd = [names[0]] if len(mounts) > 2 else [f"{names[0]} or {odd[0]}"]
         words = f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"
         words += " swapped; no mount does that: mend its driver, or leave its topic out"
         return replace(before, why=DisagreementError(words))
-    lost = [k for k, mount in enumerate(mounts) if mount.rotation is None and not mount.contradicts]
-    found = _calibrated(block, before, reference, [3 * k + axis for k in lost for axis in range(3)])
+    lost = [
+        k
+        for k, mount in enumerate(mounts)
+        if mount.rotation is None and not mount.contradicts
+    ]
+    found = _calibrated(
+        block, before, reference, [3 * k + axis for k in lost for axis in range(3)]
+    )
     if not lost or found.calibration is not None:
         return found
     # Nothing may be declared because of mounts that nobody knows.
-    careful = _if_built({**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before)
+    careful = _if_built(
+        {**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before
+    )
     who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
-    why = CalibrationError(f"the recording does not show how {who} mounted against {names[0]}")
+    why = CalibrationError(
+        f"the recording does not show how {who} mounted against {names[0]}"
+    )
     return replace(careful, why=why)
 
 
-def _calibrated(block: Block, before: LearnedSettings, reference: str, unknown: Sequence[int] = ()) -> LearnedSettings:
+def _calibrated(
+    block: Block, before: LearnedSettings, reference: str, unknown: Sequence[int] = ()
+) -> LearnedSettings:
     try:
         calibration = calibrate(block, before.config, reference, unknown)
     except FdiError as error:
         return replace(before, why=error)
     # The axes hold the mounts: beside them these would be read, and not be used.
-    known = {name: value for name, value in before.parameters.items() if name not in REPLACED}
+    known = {
+        name: value for name, value in before.parameters.items() if name not in REPLACED
+    }
     full = _if_built({**known, **calibration.settings}, before)
     if full is before:
-        return replace(before, why=CalibrationError("no monitor can be built from what it gives"))
+        return replace(
+            before, why=CalibrationError("no monitor can be built from what it gives")
+        )
     return replace(full, calibration=calibration)

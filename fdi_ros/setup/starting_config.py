@@ -23,7 +23,13 @@ import numpy as np
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.compiled import MAX_CHANNELS
-from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config, is_plain_name, parameter_file
+from fdi_ros.config.config import (
+    MIN_LEARNED,
+    PARAMETERS,
+    Config,
+    is_plain_name,
+    parameter_file,
+)
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import SOURCES, input_of
 from fdi_ros.errors import BagError
@@ -33,7 +39,14 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import DEGREES, RADIANS, Severity, Unit, Verdict, first_of
-from fdi_ros.setup.agreement import LEAST_ROTATION, LEAST_WINDOWS, SHARED, SQUARE, angle_of, find_turn
+from fdi_ros.setup.agreement import (
+    LEAST_ROTATION,
+    LEAST_WINDOWS,
+    SHARED,
+    SQUARE,
+    angle_of,
+    find_turn,
+)
 from fdi_ros.setup.blocks import WINDOW
 from fdi_ros.setup.inspect import BELIEVED, FASTEST, GAP, TopicReport, inspect, troubles
 from fdi_ros.setup.noise import LARGEST_BIAS, LENGTH
@@ -87,7 +100,9 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
         words.setdefault(one.headline, []).append(one.words)
     headline = next(headline for headline in HEADLINES if headline in words)
     between = " " if headline == "NEEDS" else ": "
-    return Verdict(HEADLINES[headline], f"{headline}{between}{'; '.join(words[headline])}")
+    return Verdict(
+        HEADLINES[headline], f"{headline}{between}{'; '.join(words[headline])}"
+    )
 
 
 def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
@@ -95,7 +110,11 @@ def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
     first = verdict_of(findings)
     return {
         "verdict": {"severity": first.severity.value, "words": first.words},
-        **{role.value: lines_of(findings, role) for role in Role if role is not Role.WORTH},
+        **{
+            role.value: lines_of(findings, role)
+            for role in Role
+            if role is not Role.WORTH
+        },
         "findings": [one._asdict() for one in findings],
     }
 
@@ -103,8 +122,13 @@ def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
 # What a recording is fit for ------------------------------------------------------------------------------------------
 
 
-_OF_A_MONITOR = {topic.name.rpartition("/")[2] for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)}
-_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)  # kinds of input, first those with stamps
+_OF_A_MONITOR = {
+    topic.name.rpartition("/")[2]
+    for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
+}
+_PREFERRED = sorted(
+    SOURCES.values(), key=lambda kind: not kind.stamped
+)  # kinds of input, first those with stamps
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
@@ -129,8 +153,18 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
     Less than 1 s may be the time that messages take.
     """
     first = next((report for report in reports if math.isfinite(report.ahead)), None)
-    off = [] if first is None else [(shown(report.topic.name), report.ahead - first.ahead) for report in reports]
-    words = [f"{name} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
+    off = (
+        []
+        if first is None
+        else [
+            (shown(report.topic.name), report.ahead - first.ahead) for report in reports
+        ]
+    )
+    words = [
+        f"{name} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}"
+        for name, v in off
+        if abs(v) > beyond
+    ]
     if first is None or not words:
         return ""
     return (
@@ -148,10 +182,13 @@ def _unusable(report: TopicReport) -> str:
     reasons = {
         "no messages": not received,
         # The fused rate must not be its own witness.
-        "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
+        "a monitor has published it": report.topic.name.rpartition("/")[2]
+        in _OF_A_MONITOR,
         "no name that ROS allows": not is_plain_name(report.topic.name),
-        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels and not kind.stamped,
-        f"all {received} messages are malformed, or have stamps before 1970": report.malformed == received,
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels
+        and not kind.stamped,
+        f"all {received} messages are malformed, or have stamps before 1970": report.malformed
+        == received,
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
@@ -164,14 +201,22 @@ def needs(reports: Sequence[TopicReport]) -> str:
     """Say what a recording needs, and what is wrong with each topic that could do; empty: a config can be made."""
     if chosen := candidates(reports):
         return in_degrees(chosen)
-    why = [(shown(report.topic.name), _unusable(report)) for report in reports if report.kind is not None]
+    why = [
+        (shown(report.topic.name), _unusable(report))
+        for report in reports
+        if report.kind is not None
+    ]
     good = [name for name, words in why if not words]
     bad = [f"{name}: {words}" for name, words in why if words]
     usable = [f"usable: only {', '.join(good)}"] if good else []
-    return "; ".join([NEEDED, *usable, *([first_of(bad, 8, "; ", "; and")] if bad else [])])
+    return "; ".join(
+        [NEEDED, *usable, *([first_of(bad, 8, "; ", "; and")] if bad else [])]
+    )
 
 
-def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS) -> Iterator[Finding]:
+def recording_findings(
+    reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS
+) -> Iterator[Finding]:
     """Say what a recording is fit for; refused: why no config can be made of it, where it needs nothing."""
     chosen = candidates(reports)
     lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
@@ -180,25 +225,48 @@ def recording_findings(reports: Sequence[TopicReport], refused: str = "", unit: 
         yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
         return
     if copies := copy_words(reports):
-        yield Finding(Role.WARNING, "copy", f"{copies}; the copy is left out", headline="NEEDS A LOOK")
+        yield Finding(
+            Role.WARNING,
+            "copy",
+            f"{copies}; the copy is left out",
+            headline="NEEDS A LOOK",
+        )
     units = len(chosen) > 1
-    names = [f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places]
-    groups = np.split(np.arange(len(names)), np.cumsum([one.channels for one in chosen])[:-1] if units else len(names))
-    words = f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
+    names = [
+        f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places
+    ]
+    groups = np.split(
+        np.arange(len(names)),
+        np.cumsum([one.channels for one in chosen])[:-1] if units else len(names),
+    )
+    words = (
+        f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
+    )
     words += f" at {max(one.rate for one in chosen):.3g} Hz"
     noise = np.concatenate([one.segments.noise().moving for one in chosen])
-    if noisy := noisier_words(names, noise, [group.tolist() for group in groups], unit.name, unit.factor):
-        yield Finding(Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK")
+    if noisy := noisier_words(
+        names, noise, [group.tolist() for group in groups], unit.name, unit.factor
+    ):
+        yield Finding(
+            Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK"
+        )
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)
 
 
-def topic_findings(chosen: Sequence[TopicReport], unit: Unit = RADIANS) -> Iterator[Finding]:
+def topic_findings(
+    chosen: Sequence[TopicReport], unit: Unit = RADIANS
+) -> Iterator[Finding]:
     """Say what is wrong with the messages of each topic."""
     for one in chosen:
         words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
         if words := words + troubles(one, unit):
-            yield Finding(Role.WARNING, "messages", f"{one.topic.name}: {', '.join(words)}", (one.topic.name,))
+            yield Finding(
+                Role.WARNING,
+                "messages",
+                f"{one.topic.name}: {', '.join(words)}",
+                (one.topic.name,),
+            )
 
 
 _NO_REDUNDANCY = "one sensor on two topics is no redundancy"
@@ -214,18 +282,34 @@ def copy_words(reports: Sequence[TopicReport]) -> str:
 
 
 NEAR = 0.2  # a factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less
-QUANTILES = (0.5, 0.7, 0.9, 0.97, 0.99)  # of the rates of a unit, that are compared with those of another
-FAST_SHARE, FAST_TIME = 0.01, 0.5  # share of the time, or s, beyond every gyro's range: less is a shock or damage
-STILL, NOISIEST = 0.3, 0.02  # share of a recording that lies still; noise there, rad/s, that no gyro at rest has
+QUANTILES = (
+    0.5,
+    0.7,
+    0.9,
+    0.97,
+    0.99,
+)  # of the rates of a unit, that are compared with those of another
+FAST_SHARE, FAST_TIME = (
+    0.01,
+    0.5,
+)  # share of the time, or s, beyond every gyro's range: less is a shock or damage
+STILL, NOISIEST = (
+    0.3,
+    0.02,
+)  # share of a recording that lies still; noise there, rad/s, that no gyro at rest has
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
     """Say which topics, of one body, are in deg/s, and what shows it, of gyros of a range; empty: nothing does."""
     chosen = [one for one in chosen if one.complete]
     # The size of the rate: a bias is no rotation.
-    apart = [one.segments.means - np.median(one.segments.means, axis=0) for one in chosen]
+    apart = [
+        one.segments.means - np.median(one.segments.means, axis=0) for one in chosen
+    ]
     rates = [np.quantile(np.linalg.norm(each, axis=1), QUANTILES) for each in apart]
-    for (fast_one, fast), (slow_one, slow) in itertools.product(zip(chosen, rates, strict=True), repeat=2):
+    for (fast_one, fast), (slow_one, slow) in itertools.product(
+        zip(chosen, rates, strict=True), repeat=2
+    ):
         moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
         factors = fast[moving] / slow[moving]
         if moving.sum() > 1 and (np.abs(factors / DEGREES.factor - 1.0) < NEAR).all():
@@ -255,10 +339,20 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
 
 def _no_gyro_at_rest(report: TopicReport) -> bool:
     """Whether it lies still, and with more noise and bias than any gyro in rad/s has."""
-    noise, segments = report.segments.noise(largest_bias=FASTEST), report.segments.all_segments()
-    if noise.share >= 1.0 - STILL or not (report.segments.noise().quiet > NOISIEST).all():
+    noise, segments = (
+        report.segments.noise(largest_bias=FASTEST),
+        report.segments.all_segments(),
+    )
+    if (
+        noise.share >= 1.0 - STILL
+        or not (report.segments.noise().quiet > NOISIEST).all()
+    ):
         return False
-    still = [one.means.mean(axis=0) for one, lies in zip(segments, noise.rest, strict=True) if lies]
+    still = [
+        one.means.mean(axis=0)
+        for one, lies in zip(segments, noise.rest, strict=True)
+        if lies
+    ]
     return bool(np.abs(np.median(still, axis=0)).max() > LARGEST_BIAS)
 
 
@@ -273,10 +367,16 @@ def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
 # A config to start from -----------------------------------------------------------------------------------------------
 
 
-_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")  # topics of flight logs, which name units as a config does
+_NUMBERED = re.compile(
+    r"/imu_[0-9]{1,3}"
+)  # topics of flight logs, which name units as a config does
 _REST = 3.0  # time at the start over which the bias could be learned, s
-_TIMEOUT = float(PARAMETERS["imus.timeout"].default)  # s; that of health.stale_timeout is the same
-_BRIDGED = 1.1 / MAX_BRIDGE  # message intervals in a timeout: so that alignment draws a line from one to the next
+_TIMEOUT = float(
+    PARAMETERS["imus.timeout"].default
+)  # s; that of health.stale_timeout is the same
+_BRIDGED = (
+    1.1 / MAX_BRIDGE
+)  # message intervals in a timeout: so that alignment draws a line from one to the next
 
 
 @dataclass(frozen=True)
@@ -312,9 +412,13 @@ def assumed_config(path: Path) -> tuple[Config, str]:
     found = starting_config_of(path, refused)
     config = Config.from_parameters(found.parameters)
     if not config.imus.topics:
-        raise BagError(f"{refused}: the axes of an array of channels are in no message; --config says them")
+        raise BagError(
+            f"{refused}: the axes of an array of channels are in no message; --config says them"
+        )
     if turned := _turned_units(path, config):
-        raise BagError(f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes")
+        raise BagError(
+            f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes"
+        )
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
     copies = f"{found.look}, the second is left out; " if found.look else ""
     return config, (
@@ -329,7 +433,9 @@ def _turned_units(path: Path, config: Config) -> str:
     size, names = max(1, round(WINDOW * config.sample_rate)), config.imus.names
     with Recording(path) as recording:
         means = [
-            block.z[: len(block) // size * size].reshape(-1, size, 3 * len(names)).mean(axis=1)
+            block.z[: len(block) // size * size]
+            .reshape(-1, size, 3 * len(names))
+            .mean(axis=1)
             for block in Samples(recording, config).blocks()
         ]
     slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
@@ -341,9 +447,13 @@ def _turned_units(path: Path, config: Config) -> str:
     for name, rate in zip(names[1:], others, strict=True):
         rotation = find_turn(first, rate)[0]
         # A fault stays, whatever the rotation.
-        explained = np.std(rate @ rotation.T - first) < (1.0 - SHARED) * np.std(rate - first)
+        explained = np.std(rate @ rotation.T - first) < (1.0 - SHARED) * np.std(
+            rate - first
+        )
         if explained and angle_of(rotation) > SQUARE:
-            turned.append(f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}")
+            turned.append(
+                f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}"
+            )
     return ", ".join(turned)
 
 
@@ -351,15 +461,23 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     """Make a config to start from, of the topics of gyros in a recording."""
     kind = chosen[0].kind
     assert kind is not None
-    rate, largest = max(report.rate for report in chosen), max(report.largest for report in chosen)
+    rate, largest = (
+        max(report.rate for report in chosen),
+        max(report.largest for report in chosen),
+    )
     at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
-    largest_rate = _rounded_up(max(*PARAMETERS["health.max_rate"].default, 1.001 * largest))
+    largest_rate = _rounded_up(
+        max(*PARAMETERS["health.max_rate"].default, 1.001 * largest)
+    )
     # Values of parameters, and remarks on them.
     known: dict[str, tuple[Any, str]] = {
         "input": (input_of(kind), ""),
         "sample_rate": (float(f"{rate:.4g}"), ""),
         "noise.noise_std": _noise_setting(chosen),
-        "noise.scale_std": ([0.01], "a guess, for scale factors and axes that are not calibrated"),
+        "noise.scale_std": (
+            [0.01],
+            "a guess, for scale factors and axes that are not calibrated",
+        ),
         "noise.timing_std": ([float(f"{0.05 / chosen[0].rate:.2g}")], "a guess"),
         "bias.startup_bias_duration": (
             _REST if at_rest else 0.0,
@@ -367,7 +485,10 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         ),
         "detector.name": (PARAMETERS["detector.name"].default, ""),
         "detector.false_alarms_per_hour": (0.001, ""),
-        "health.max_rate": ([largest_rate], "NOT KNOWN: put in what the data sheet says"),
+        "health.max_rate": (
+            [largest_rate],
+            "NOT KNOWN: put in what the data sheet says",
+        ),
     }
     topics = [report.topic.name for report in chosen]
     if kind.stamped:
@@ -377,7 +498,9 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             " three of them, isolate it"
         )
         numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
-        names = [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)]
+        names = [
+            topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)
+        ]
         known["imus.topics"], known["imus.names"] = (topics, ""), (names, "")
         known["imus.mounts"] = np.tile(np.eye(3).ravel(), len(chosen)).tolist(), words
         known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
@@ -385,7 +508,10 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
             known["decision.latch"] = False, words
         if timeout := _longer(chosen, _BRIDGED, 10.0):
-            slowest, none = min(report.rate for report in chosen), "none would be aligned between two"
+            slowest, none = (
+                min(report.rate for report in chosen),
+                "none would be aligned between two",
+            )
             words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
             known["imus.timeout"] = timeout, words
     else:
@@ -393,18 +519,28 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
             " but for those of three reference channels: these must be right"
         )
-        known["channels.topic"], known["geometry.preset"] = (topics[0], ""), ("cone", words)
+        known["channels.topic"], known["geometry.preset"] = (
+            (topics[0], ""),
+            ("cone", words),
+        )
         known["geometry.cone_channels"] = chosen[0].channels, ""
     if silent := _longer(chosen, GAP, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
     parameters = {name: value for name, (value, _) in known.items()}
-    return StartingConfig(shown(bag.name), parameters, {name: words for name, (_, words) in known.items() if words})
+    return StartingConfig(
+        shown(bag.name),
+        parameters,
+        {name: words for name, (_, words) in known.items() if words},
+    )
 
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
     noise = [report.segments.noise() for report in chosen]
-    share, levels = min(one.share for one in noise), np.concatenate([one.moving for one in noise])
+    share, levels = (
+        min(one.share for one in noise),
+        np.concatenate([one.moving for one in noise]),
+    )
     words = f"in motion ({share:.0%} of the recording), vibration included"
     if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
         quiet = np.concatenate([one.quiet for one in noise])
@@ -419,15 +555,23 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
 
 def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
     """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
-    nearly_all = [float(np.quantile(np.concatenate(one.intervals), 0.999)) for one in chosen if one.intervals]
+    nearly_all = [
+        float(np.quantile(np.concatenate(one.intervals), 0.999))
+        for one in chosen
+        if one.intervals
+    ]
     needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
     return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
 
 
 def _starts_at_rest(report: TopicReport) -> bool:
     """Whether nothing moves over the time in which biases could be learned."""
-    segments = zip(report.segments.all_segments(), report.segments.noise().rest, strict=True)
-    begin = [rest for segment, rest in segments if segment.first - report.first < _REST * 1e9]
+    segments = zip(
+        report.segments.all_segments(), report.segments.noise().rest, strict=True
+    )
+    begin = [
+        rest for segment, rest in segments if segment.first - report.first < _REST * 1e9
+    ]
     return bool(begin) and all(begin)
 
 

@@ -36,7 +36,11 @@ def shipped_folder() -> Path | None:
 def shipped_files() -> list[Path]:
     """Return all shipped files."""
     place = shipped_folder()
-    return sorted(path for path in place.rglob("*.*") if path.is_file()) if place is not None else []
+    return (
+        sorted(path for path in place.rglob("*.*") if path.is_file())
+        if place is not None
+        else []
+    )
 
 
 def resolve(path: str) -> Path:
@@ -49,7 +53,9 @@ def resolve(path: str) -> Path:
         return given
     place = shipped_folder()
     for shipped in shipped_files():
-        if path == shipped.name or (place is not None and given == Path("config") / shipped.relative_to(place)):
+        if path == shipped.name or (
+            place is not None and given == Path("config") / shipped.relative_to(place)
+        ):
             print(visible(f"fdi: no {given} here, taking {shipped}"), file=sys.stderr)
             return shipped
     return given
@@ -59,7 +65,9 @@ BAGS = ("mcap", "rosbags", "lz4", "zstandard")  # what reads and writes recordin
 PROGRESS = ("tqdm",)
 POOL = (*PROGRESS, "joblib")  # what shares work among processes
 REQUIRED = (*BAGS, *POOL)  # of setup.py, for every installation by pip
-PACKAGES = {"serial": "pyserial"}  # what pip calls a library that it calls otherwise than Python does
+PACKAGES = {
+    "serial": "pyserial"
+}  # what pip calls a library that it calls otherwise than Python does
 
 
 def require(who: str, libraries: Sequence[str]) -> None:
@@ -89,4 +97,8 @@ def _pip() -> str:
     """Return the command by which pip installs here: the Python of a distribution refuses the plain one (PEP 668)."""
     managed = Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED"
     own = sys.prefix != sys.base_prefix
-    return "pip install" if own or not managed.is_file() else "pip install --user --break-system-packages"
+    return (
+        "pip install"
+        if own or not managed.is_file()
+        else "pip install --user --break-system-packages"
+    )

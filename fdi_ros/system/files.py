@@ -37,21 +37,33 @@ from fdi_ros.errors import BagError
 
 CHUNK_BYTES = 1 << 26  # of one chunk or message of a recording, decompressed
 PORTION_BYTES = 1 << 24  # messages of a database are handed on when they hold so much
-FREE_BYTES, FREE_RATIO = 1 << 28, 50  # a recording may unpack to so many bytes, and so many times its own size more
+FREE_BYTES, FREE_RATIO = (
+    1 << 28,
+    50,
+)  # a recording may unpack to so many bytes, and so many times its own size more
 RECORDS, RECORD_BYTES = 300_000, 4096
 """An MCAP file may hold so many records outside chunks, and one for each so many of its bytes more."""
-CHANNELS = 4096  # topics of one recording, and descriptions of topics and of types in one file
+CHANNELS = (
+    4096  # topics of one recording, and descriptions of topics and of types in one file
+)
 DESCRIPTION_BYTES = 1 << 20  # of the description of a topic or a type
 NAME = 255  # characters of the name of a topic or a type, as in DDS
 FILES = 800  # files of one recording; they are open together
-LATEST = 2**31 * 10**9 - 1  # ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say
+LATEST = (
+    2**31 * 10**9 - 1
+)  # ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say
 EARLIEST = 946_684_800 * 10**9
 """ns: a time before this, the year 2000, is no date: it counts from a start (of an autopilot, of a simulation)."""
 LOG_SPAN = 10**13
 """us: times of a flight log lie between 0, the start of the autopilot, and this, 115 days; or they are dates."""
 ULOG_BYTES, TLOG_BYTES = 1 << 28, 1 << 27
 """Of a log that a library reads whole: PX4's, hours of it, and that of a ground station, a day of it."""
-ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = 1000, 1 << 26, 1 << 8, 1 << 16
+ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = (
+    1000,
+    1 << 26,
+    1 << 8,
+    1 << 16,
+)
 """Of PX4's: fields of a message; bytes of messages that are no samples, each counted as so many more, for a library
 makes an object of each, and of a topic one for each field."""
 ROS1_INDEX_BYTES = 48 << 20
@@ -94,7 +106,9 @@ def check_trusted(path: Path | str, about: os.stat_result | None = None) -> None
     if about.st_uid not in (0, os.geteuid()):
         raise DistrustError(path, f"it belongs to another user ({about.st_uid})")
     if about.st_mode & OTHERS:
-        raise DistrustError(path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})")
+        raise DistrustError(
+            path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})"
+        )
 
 
 def close_to_others(folder: Path | str) -> None:
@@ -103,7 +117,11 @@ def close_to_others(folder: Path | str) -> None:
     `DistrustError` if it belongs to another user, or is a link; `OSError` if there is none, or it cannot be changed.
     """
     about = os.lstat(folder)
-    if about.st_mode & OTHERS and about.st_uid == os.geteuid() and stat.S_ISDIR(about.st_mode):
+    if (
+        about.st_mode & OTHERS
+        and about.st_uid == os.geteuid()
+        and stat.S_ISDIR(about.st_mode)
+    ):
         os.chmod(folder, stat.S_IMODE(about.st_mode) & ~OTHERS, follow_symlinks=False)
         about = os.lstat(folder)
     check_trusted(folder, about)
@@ -117,7 +135,9 @@ def check_ancestor(folder: Path | str) -> None:
     mode = os.stat(folder).st_mode
     # That a group can is usual where every user has one of their own.
     if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-        raise DistrustError(folder, f"everybody can write it (mode {stat.S_IMODE(mode):o})")
+        raise DistrustError(
+            folder, f"everybody can write it (mode {stat.S_IMODE(mode):o})"
+        )
 
 
 @contextlib.contextmanager
@@ -179,7 +199,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     with open(os.open(part, flags, 0o644), "wb") as file:
         try:
-            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS)
+            os.fchmod(
+                file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS
+            )
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -195,8 +217,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 # through, once all that goes there is known.
 
 STANDARD_OUTPUT = Path("-")
-MADE_BY = {"generator": "fdi_ros"}  # first in every file of figures: a mark by which a former result is recognised
-_OPEN_DESCRIPTOR = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
+MADE_BY = {
+    "generator": "fdi_ros"
+}  # first in every file of figures: a mark by which a former result is recognised
+_OPEN_DESCRIPTOR = re.compile(
+    r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+"
+)
 """Names of what is open already, by whatever name it lies on the disk."""
 JUST_MADE = 1.0  # s; so young a folder may not be locked yet by who has made it
 
@@ -257,7 +283,10 @@ def write_text(target: Path, text: str) -> None:
 def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
     """Write figures as JSON, marked as of this package; None: not asked for. `BagError` if it cannot be written."""
     if target is not None:
-        write_text(target, json.dumps(plain({**MADE_BY, **figures}), indent=2, allow_nan=False) + "\n")
+        write_text(
+            target,
+            json.dumps(plain({**MADE_BY, **figures}), indent=2, allow_nan=False) + "\n",
+        )
 
 
 def plain(value: Any) -> Any:
@@ -268,7 +297,9 @@ def plain(value: Any) -> Any:
     if hasattr(value, "as_json"):
         return plain(value.as_json())
     if is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return {
+            field.name: plain(getattr(value, field.name)) for field in fields(value)
+        }
     if isinstance(value, Mapping):
         return {str(name): plain(one) for name, one in value.items()}
     if hasattr(value, "tolist"):
@@ -319,7 +350,10 @@ def _remove_abandoned(path: Path, parent: Path) -> None:
         for folder in parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}"):
             with contextlib.suppress(OSError), _opened(folder) as descriptor:
                 about = os.fstat(descriptor)
-                if about.st_uid == os.geteuid() and time.time() - about.st_mtime > JUST_MADE:
+                if (
+                    about.st_uid == os.geteuid()
+                    and time.time() - about.st_mtime > JUST_MADE
+                ):
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     shutil.rmtree(folder, ignore_errors=True)
 
@@ -327,7 +361,9 @@ def _remove_abandoned(path: Path, parent: Path) -> None:
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int]:
     """Open a folder; a lock on it ends with the process."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    descriptor = os.open(
+        folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+    )
     try:
         yield descriptor
     finally:

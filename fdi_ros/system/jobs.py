@@ -26,7 +26,10 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from typing import Any
 
-from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
+from joblib.externals.loky.process_executor import (
+    BrokenProcessPool,
+    ProcessPoolExecutor,
+)
 
 from fdi_ros.errors import StudyError
 from fdi_ros.system import require
@@ -39,7 +42,9 @@ Lost = Callable[[int, str], Any]
 MAX_DEATHS = 3  # processes that a job may kill until it is given up; that a job on a cluster is tried again
 MOST_WORKERS = 256  # processes on this machine
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
-ONE_THREAD = dict.fromkeys((*(f"{name}_NUM_THREADS" for name in _THREADS), "VECLIB_MAXIMUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(
+    (*(f"{name}_NUM_THREADS" for name in _THREADS), "VECLIB_MAXIMUM_THREADS"), "1"
+)
 """Environment of a worker process: as many processes as cores are enough."""
 
 
@@ -56,7 +61,11 @@ def _give_up(k: int, words: str) -> Any:
 
 
 def run_jobs(
-    function: Function, jobs: Sequence[Job], workers: int, cluster: str | None, lost: Lost = _give_up
+    function: Function,
+    jobs: Sequence[Job],
+    workers: int,
+    cluster: str | None,
+    lost: Lost = _give_up,
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs, the arguments of a function that workers can import, and give (index, result) as they are done.
 
@@ -69,7 +78,9 @@ def run_jobs(
         return iter(())
     if cluster is not None:
         if not re.fullmatch(r"\w+://.+:\d+", cluster):
-            raise StudyError(f"scheduler is {cluster!r}, expected an address such as tcp://host:8786")
+            raise StudyError(
+                f"scheduler is {cluster!r}, expected an address such as tcp://host:8786"
+            )
         return _on_cluster(function, jobs, cluster, lost)
     # A single job that may kill its process is kept out of this one.
     if workers == 1 or (len(jobs) == 1 and lost is _give_up):
@@ -77,7 +88,9 @@ def run_jobs(
     return _on_processes(function, jobs, min(workers, len(jobs)), lost)
 
 
-def _on_processes(function: Function, jobs: Sequence[Job], workers: int, lost: Lost) -> Iterator[tuple[int, Any]]:
+def _on_processes(
+    function: Function, jobs: Sequence[Job], workers: int, lost: Lost
+) -> Iterator[tuple[int, Any]]:
     """Run each job in a process that has no other: if it dies, the cause is known and no other job is run again.
 
     The processes of one pool would all be ended together.
@@ -89,7 +102,10 @@ def _on_processes(function: Function, jobs: Sequence[Job], workers: int, lost: L
     def begin(k: int, process: ProcessPoolExecutor) -> None:
         """Begin a job; in a new process if the idle one died under its last job, or since."""
         try:
-            running[process.submit(_in_worker, os.getpid(), function, jobs[k])] = k, process
+            running[process.submit(_in_worker, os.getpid(), function, jobs[k])] = (
+                k,
+                process,
+            )
         except BrokenProcessPool:
             process.shutdown(kill_workers=True)
             begin(k, ProcessPoolExecutor(1, env=ONE_THREAD))
@@ -139,7 +155,9 @@ CONNECT_TIMEOUT = 10.0  # s
 TLS = "tls://"
 
 
-def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Lost) -> Iterator[tuple[int, Any]]:
+def _on_cluster(
+    function: Function, jobs: Sequence[Job], cluster: str, lost: Lost
+) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
     require("--scheduler", ("dask", "distributed"))
     import distributed
@@ -149,12 +167,22 @@ def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Los
 
         def run(numbers: Iterable[int]) -> Iterator[tuple[int, Any]]:
             # Not pure: the same arguments may be a block of another study's seed on the same cluster.
-            futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_DEATHS): k for k in numbers}
-            return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
+            futures = {
+                client.submit(function, *jobs[k], pure=False, retries=MAX_DEATHS): k
+                for k in numbers
+            }
+            return (
+                (futures[future], future)
+                for future in distributed.as_completed(futures, loop=client.loop)
+            )
 
         def deaths(future: Any) -> int:
             error = future.exception() if future.status == "error" else None
-            return error.allowed_failures + 1 if isinstance(error, distributed.KilledWorker) else 0
+            return (
+                error.allowed_failures + 1
+                if isinstance(error, distributed.KilledWorker)
+                else 0
+            )
 
         suspects: list[int] = []
         try:
@@ -169,7 +197,9 @@ def _on_cluster(function: Function, jobs: Sequence[Job], cluster: str, lost: Los
                     times = deaths(future)
                     yield k, lost(k, _died_words(times)) if times else future.result()
         except (distributed.client.FutureCancelledError, OSError) as error:
-            raise StudyError(f"the cluster at {cluster} was lost: {_line(error)}") from error
+            raise StudyError(
+                f"the cluster at {cluster} was lost: {_line(error)}"
+            ) from error
 
 
 @functools.cache
@@ -193,16 +223,31 @@ def _connected(distributed: Any, cluster: str) -> Iterator[Any]:
     import logging
 
     # A scheduler that is not there, or is lost, is reported in one line of ours, not in pages of retries.
-    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    names = [
+        name
+        for name in logging.root.manager.loggerDict
+        if name.partition(".")[0] == "distributed"
+    ]
     levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
     for logger in levels:
         logger.setLevel(logging.CRITICAL)
     try:
         try:
-            security = distributed.Security(require_encryption=True) if cluster.startswith(TLS) else None
-            client = distributed.Client(cluster, timeout=CONNECT_TIMEOUT, set_as_default=False, security=security)
+            security = (
+                distributed.Security(require_encryption=True)
+                if cluster.startswith(TLS)
+                else None
+            )
+            client = distributed.Client(
+                cluster,
+                timeout=CONNECT_TIMEOUT,
+                set_as_default=False,
+                security=security,
+            )
         except (OSError, ValueError, TypeError, TimeoutError) as error:
-            raise StudyError(f"no Dask scheduler at {cluster}: {_line(error)}") from error
+            raise StudyError(
+                f"no Dask scheduler at {cluster}: {_line(error)}"
+            ) from error
         with client:
             yield client
     finally:

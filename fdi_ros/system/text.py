@@ -12,7 +12,10 @@ from datetime import datetime, timezone
 
 from fdi_ros.system.files import EARLIEST, LATEST
 
-WORD, LINE = 120, 4000  # characters of a text from a file, and of a whole line with such texts, that are shown
+WORD, LINE = (
+    120,
+    4000,
+)  # characters of a text from a file, and of a whole line with such texts, that are shown
 
 
 def shown(text: object, most: int = WORD) -> str:
@@ -31,7 +34,12 @@ def visible(text: str, kept: str = "\n\t") -> str:
     """Return a text of any length with nothing in it that a terminal or browser obeys, but for some characters."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(
+        c
+        if c.isprintable() or c in kept
+        else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )
 
 
 def plus_minus(value: float, std: float) -> str:
@@ -43,7 +51,9 @@ def plus_minus(value: float, std: float) -> str:
     return f"{value:.{places}f} +- {std:.{places}f}"
 
 
-def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+def html_table(
+    caption: str, head: Sequence[str], rows: Iterable[Sequence[object]]
+) -> str:
     """Return a table as a notebook shows it."""
 
     def line(cells: Iterable[object], tag: str) -> str:
@@ -60,4 +70,8 @@ def storable(text: str) -> str:
 
 def date_of(ns: int) -> datetime | None:
     """Return the date of a stamp, UTC; None: it counts from the start of an autopilot or of a simulation."""
-    return datetime.fromtimestamp(ns * 1e-9, timezone.utc) if EARLIEST <= ns <= LATEST else None
+    return (
+        datetime.fromtimestamp(ns * 1e-9, timezone.utc)
+        if EARLIEST <= ns <= LATEST
+        else None
+    )

@@ -11,7 +11,13 @@ from typing import Any, ClassVar
 import yaml
 
 from fdi_ros.errors import FdiError
-from fdi_ros.system.files import YAML_BYTES, YAML_DEPTH, YAML_DIGITS, YAML_NODES, open_regular
+from fdi_ros.system.files import (
+    YAML_BYTES,
+    YAML_DEPTH,
+    YAML_DIGITS,
+    YAML_NODES,
+    open_regular,
+)
 
 try:
     from yaml import CSafeLoader as _SafeLoader
@@ -34,7 +40,11 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
     """Takes what a ROS 2 parameter file may hold: no dates, no binary data, no numbers beyond 64 bits."""
 
     yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag.removeprefix(_TAG) in _KINDS]
+        first: [
+            (tag, pattern)
+            for tag, pattern in resolvers
+            if tag.removeprefix(_TAG) in _KINDS
+        ]
         for first, resolvers in _SafeLoader.yaml_implicit_resolvers.items()
     }
     yaml_constructors: ClassVar = {
@@ -47,10 +57,17 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
         """Value of a number."""
         text = self.construct_scalar(node)
         if len(text) > YAML_DIGITS:
-            raise _Refused(node.start_mark, f"a number of {len(text)} characters, expected at most {YAML_DIGITS}")
+            raise _Refused(
+                node.start_mark,
+                f"a number of {len(text)} characters, expected at most {YAML_DIGITS}",
+            )
         kind = node.tag.removeprefix(_TAG)
         try:
-            value: int | float = self.construct_yaml_int(node) if kind == "int" else self.construct_yaml_float(node)
+            value: int | float = (
+                self.construct_yaml_int(node)
+                if kind == "int"
+                else self.construct_yaml_float(node)
+            )
         except (ValueError, IndexError, OverflowError) as error:
             raise _Refused(node.start_mark, f"{text!r} is no {kind}") from error
         if kind == "int" and not -(2**63) <= value < 2**64:
@@ -62,7 +79,9 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
         try:
             return bool(self.construct_yaml_bool(node))
         except KeyError as error:
-            raise _Refused(node.start_mark, f"{node.value!r} is neither true nor false") from error
+            raise _Refused(
+                node.start_mark, f"{node.value!r} is neither true nor false"
+            ) from error
 
 
 _Loader.add_constructor(f"{_TAG}int", _Loader.number)
@@ -84,7 +103,9 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
     except UnicodeDecodeError as refused:
         raise error(f"{what} {path} is not YAML: {refused}") from refused
     except (OSError, ValueError) as refused:
-        raise error(f"cannot read {what} {path}: {getattr(refused, 'strerror', None) or refused}") from refused
+        raise error(
+            f"cannot read {what} {path}: {getattr(refused, 'strerror', None) or refused}"
+        ) from refused
     return parse_yaml(text, f"{what} {path}", error)
 
 
@@ -104,7 +125,10 @@ def _problem(refused: yaml.YAMLError) -> str:
     """Say what is wrong, and where: a text has lines, and no name of its own."""
     if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:
         return " ".join(str(refused).replace(' in "<unicode string>"', "").split())
-    mark, why = refused.problem_mark, ", ".join(filter(None, (refused.context, refused.problem)))
+    mark, why = (
+        refused.problem_mark,
+        ", ".join(filter(None, (refused.context, refused.problem))),
+    )
     return " ".join(f"line {mark.line + 1}, column {mark.column + 1}: {why}".split())
 
 
@@ -121,7 +145,10 @@ def _check_size(text: str) -> None:
             anchor, before = event.anchor, count
             alias = isinstance(event, yaml.AliasEvent)
             if alias and event.anchor not in sizes:
-                raise _Refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
+                raise _Refused(
+                    event.start_mark,
+                    f"the alias *{event.anchor} stands for nothing before it",
+                )
             count += sizes[event.anchor] if alias else 1
         else:
             continue
@@ -132,4 +159,6 @@ def _check_size(text: str) -> None:
         if len(outer) > YAML_DEPTH:
             raise _Refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
         if count > YAML_NODES:
-            raise _Refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
+            raise _Refused(
+                event.start_mark, f"more than {YAML_NODES} values, aliases followed"
+            )

@@ -28,15 +28,52 @@ from pathlib import Path
 import lz4.frame
 import zstandard
 from bag import logs
-from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, Ros1Writer, array, imu, write_ros1
+from bag.recordings import (
+    ARRAY,
+    IMU,
+    PARAMETERS,
+    START,
+    STEP,
+    TOPICS,
+    Ros1Writer,
+    array,
+    imu,
+    write_ros1,
+)
 
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 
 MOST_SECONDS, MOST_GROWTH = 20.0, 700 << 20
-NUMBERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
-VALUES = (0.0, -0.0, 1e-320, 1e-8, 0.5, 1e6, 1e154, 1.7e308, -1.7e308, math.inf, -math.inf, math.nan)
+NUMBERS = (
+    0,
+    1,
+    255,
+    2**15,
+    2**16 - 1,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**62,
+    2**63 - 1,
+    2**63,
+    2**64 - 1,
+)
+VALUES = (
+    0.0,
+    -0.0,
+    1e-320,
+    1e-8,
+    0.5,
+    1e6,
+    1e154,
+    1.7e308,
+    -1.7e308,
+    math.inf,
+    -math.inf,
+    math.nan,
+)
 NAMES = (
     "/imu\n/**:\n  ros__parameters: {input: x}", "/\x1b[2J\x1b]0;owned\x07", "/a\u202eb\u2066c", "", "/" + "n" * 300,
     "/a/b/c", "true", "/\ud7ff\u2028x", "/~{x}", "fused", "/[a, b]: {", "/a//b", "/1", "/%s%n",
@@ -80,10 +117,15 @@ class Draw(random.Random):
 
     def pack(self, form, *values):
         widths = {"B": 1, "H": 2, "I": 4, "Q": 8}
-        return struct.pack(f"<{form}", *(self.number(v, widths[c]) for c, v in zip(form, values, strict=True)))
+        return struct.pack(
+            f"<{form}",
+            *(self.number(v, widths[c]) for c, v in zip(form, values, strict=True)),
+        )
 
     def text(self, text):
-        data = (self.choice(NAMES) if self.odd() else text).encode("utf-8", "surrogatepass")
+        data = (self.choice(NAMES) if self.odd() else text).encode(
+            "utf-8", "surrogatepass"
+        )
         data += b"\xff\xfe" if self.odd() else b""
         return self.pack("I", len(data)) + data
 
@@ -92,7 +134,14 @@ class Draw(random.Random):
         data = bytearray(data)
         for _ in range(self.choice((0, 1, 3, 30)) if self.oddness else 0):
             at = self.randrange(min(len(data), self.choice((700, 1500, len(data)))))
-            odd = (self.randbytes(1), b"\xff", b"\0", b"9" * 9, bytes(data[:200]), b"[65535]")
+            odd = (
+                self.randbytes(1),
+                b"\xff",
+                b"\0",
+                b"9" * 9,
+                bytes(data[:200]),
+                b"[65535]",
+            )
             data[at : at + 1] = self.choice(odd)
         return self.damaged(bytes(data))
 
@@ -106,8 +155,14 @@ class Draw(random.Random):
                 lambda: data[:end],
                 lambda: data[:at] + data[end:],
                 lambda: data[:end] + data[at:],
-                lambda: data[:at] + self.randbytes(self.choice((1, 8, 300))) + data[at:],
-                lambda: data[:at] + bytes([data[at] ^ 1 << self.randrange(8)]) + data[at + 1 :],
+                lambda: (
+                    data[:at] + self.randbytes(self.choice((1, 8, 300))) + data[at:]
+                ),
+                lambda: (
+                    data[:at]
+                    + bytes([data[at] ^ 1 << self.randrange(8)])
+                    + data[at + 1 :]
+                ),
             )
         )()
 
@@ -123,7 +178,9 @@ SOUND.oddness = 0.0
 def messages(draw):
     """Topics (name, type), and messages (topic, time, bytes) in one of many patterns."""
     topics = [(name, IMU) for name in TOPICS]
-    topics += [(draw.choice(NAMES), draw.choice((IMU, ARRAY, "std_msgs/msg/String", "")))] * (draw.random() < 0.4)
+    topics += [
+        (draw.choice(NAMES), draw.choice((IMU, ARRAY, "std_msgs/msg/String", "")))
+    ] * (draw.random() < 0.4)
     topics += [("/gyros", ARRAY)] * (draw.random() < 0.3)
     topics += [(f"/t{k}", IMU) for k in range(draw.choice((*[0] * 20, 5000)))]
     step = draw.choice((STEP, STEP, STEP, 0, 1, -STEP, 10**12))
@@ -135,8 +192,15 @@ def messages(draw):
         for topic, (_, kind) in enumerate(topics[:4]):
             rates = [draw.gauss(0, 0.01) if value is None else value for _ in range(6)]
             begin = draw.choice((first, START)) if draw.odd() else first
-            stamp = min(max(min(begin, 2**31 * 10**9 - 1) + k * stamp_step, 0), 2**31 * 10**9 - 1)
-            data = array(rates[: draw.choice((6, 6, 6, 4, 0))]) if kind == ARRAY else imu(stamp, rates[:3])
+            stamp = min(
+                max(min(begin, 2**31 * 10**9 - 1) + k * stamp_step, 0),
+                2**31 * 10**9 - 1,
+            )
+            data = (
+                array(rates[: draw.choice((6, 6, 6, 4, 0))])
+                if kind == ARRAY
+                else imu(stamp, rates[:3])
+            )
             found.append((topic, (first + k * step) % 2**64, draw.damaged(data)))
     if draw.random() < 0.1:
         draw.shuffle(found)
@@ -152,15 +216,31 @@ def mcap(draw):
     topics, sent = messages(draw)
     about = b""
     for number, (name, kind) in enumerate(topics):
-        schema = draw.pack("H", number + 1) + draw.text(kind) + draw.text("ros2msg") + draw.text("# none")
+        schema = (
+            draw.pack("H", number + 1)
+            + draw.text(kind)
+            + draw.text("ros2msg")
+            + draw.text("# none")
+        )
         about += record(draw, 3, schema)
-        channel = draw.pack("HH", number, number + 1) + draw.text(name) + draw.text("cdr") + draw.pack("I", 0)
+        channel = (
+            draw.pack("HH", number, number + 1)
+            + draw.text(name)
+            + draw.text("cdr")
+            + draw.pack("I", 0)
+        )
         about += record(draw, 4, channel)
     parts = [about]
     out = b"\x89MCAP0\r\n" + record(draw, 1, draw.text("ros2") + draw.text("fuzz"))
     for k, (topic, at, data) in enumerate(sent):
         if draw.odd():
-            parts.append(record(draw, draw.choice((2, 6, 7, 8, 11, 15, 200)), draw.randbytes(draw.choice((0, 9, 60)))))
+            parts.append(
+                record(
+                    draw,
+                    draw.choice((2, 6, 7, 8, 11, 15, 200)),
+                    draw.randbytes(draw.choice((0, 9, 60))),
+                )
+            )
         parts.append(record(draw, 5, draw.pack("HIQQ", topic, k, at, at) + data))
     kind = "none at all" if draw.odd() else draw.choice(("", "zstd", "lz4", "plain"))
     size = draw.choice((1, 7, 100, 1000))
@@ -172,16 +252,26 @@ def mcap(draw):
         counts = draw.choice((struct.pack("<IHQ", 10, 0, len(sent)), bytes(4)))
         out += record(draw, 15, draw.pack("I", 0))
         out += about if draw.random() < 0.5 else b""
-        out += record(draw, 11, draw.pack("QHIIIIQQ", len(sent), 1, 1, 0, 0, 1, START, START) + counts)
+        out += record(
+            draw,
+            11,
+            draw.pack("QHIIIIQQ", len(sent), 1, 1, 0, 0, 1, START, START) + counts,
+        )
         out += record(draw, 2, draw.pack("QQI", 0, 0, 0)) + b"\x89MCAP0\r\n"
     return draw.damaged(out)
 
 
 def chunk(draw, inside, kind, sent, k):
-    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(kind, bytes)(inside)
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(kind, bytes)(
+        inside
+    )
     start = sent[min(k, len(sent) - 1)][1] if sent else 0
     crc = zlib.crc32(inside) * draw.choice((0, 1))
-    head = draw.pack("QQQI", start, start, len(inside), crc) + draw.text(kind) + draw.pack("Q", len(packed))
+    head = (
+        draw.pack("QQQI", start, start, len(inside), crc)
+        + draw.text(kind)
+        + draw.pack("Q", len(packed))
+    )
     return record(draw, 6, head + draw.damaged(packed))
 
 
@@ -189,10 +279,14 @@ def database(draw, path):
     """A rosbag2 database with odd tables and values."""
     topics, sent = messages(draw)
     base = sqlite3.connect(path)
-    base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+    base.execute(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+    )
     for number, (name, kind) in enumerate(topics[:50]):
         odd = draw.choice((None, 3, b"\xff\xfe", 1e308, name)) if draw.odd() else name
-        base.execute("INSERT INTO topics VALUES(?, ?, ?, ?)", (number, odd, kind, "cdr"))
+        base.execute(
+            "INSERT INTO topics VALUES(?, ?, ?, ?)", (number, odd, kind, "cdr")
+        )
     if draw.odd():
         base.execute("UPDATE topics SET name = CAST(x'fffe2f00' AS TEXT)")
     form = draw.choice((*["plain"] * 6, "zeroblob", "untyped", *COMPUTED))
@@ -202,10 +296,20 @@ def database(draw, path):
         rows = []
         for topic, at, data in sent:
             data = zstandard.compress(data) if packed else data
-            at = draw.choice(("x", 1.5, None, -5)) if draw.odd() else at - 2**64 * (at >= 2**63)
-            rows.append((topic, at, draw.choice((3, "text", None, b"")) if draw.odd() else data))
-        rows += [(0, START, zstandard.compress(bytes(1 << 24)))] * draw.choice((0, 0, 0, 30))
-        base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
+            at = (
+                draw.choice(("x", 1.5, None, -5))
+                if draw.odd()
+                else at - 2**64 * (at >= 2**63)
+            )
+            rows.append(
+                (topic, at, draw.choice((3, "text", None, b"")) if draw.odd() else data)
+            )
+        rows += [(0, START, zstandard.compress(bytes(1 << 24)))] * draw.choice(
+            (0, 0, 0, 30)
+        )
+        base.executemany(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows
+        )
         if form == "zeroblob":
             base.execute("UPDATE messages SET data = zeroblob(30000000) WHERE id < 3")
     base.commit()
@@ -226,28 +330,62 @@ def recording(draw, folder):
     names = [file.name for file in files] * draw.choice((1, 1, 1, 2000))
     odd = ("../config.yaml", "/dev/zero", "\x00", "../bag/bag_0.mcap", "x" * 5000, ".")
     names += draw.choices(odd, k=draw.random() < 0.75)
-    about = {"version": 9, "relative_file_paths": names, "topics_with_message_count": []}
+    about = {
+        "version": 9,
+        "relative_file_paths": names,
+        "topics_with_message_count": [],
+    }
     if draw.random() < 0.9:
-        write(bag / "metadata.yaml", odd_yaml(draw, json.dumps({"rosbag2_bagfile_information": about}, indent=1)))
+        write(
+            bag / "metadata.yaml",
+            odd_yaml(
+                draw, json.dumps({"rosbag2_bagfile_information": about}, indent=1)
+            ),
+        )
     return bag
 
 
 def flight_log(draw, stem):
     """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
-    made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
+    made = logs.units(
+        draw.choice((1, 2, 3, 3)),
+        draw.choice((1.0, 5.0)),
+        draw.choice((2.0, 100.0, 100.0, 400.0)),
+    )
     dataflash = ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1")
-    kind = draw.choice((*dataflash, "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo", "tlog", *["csv"] * 4))
+    kind = draw.choice(
+        (
+            *dataflash,
+            "sensor_gyro",
+            "vehicle_imu",
+            "sensor_gyro_fifo",
+            "tlog",
+            *["csv"] * 4,
+        )
+    )
     for unit in made:
         if draw.odd() or draw.odd():
-            unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
-            unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
+            unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice(
+                (-(10**7), 10**12, 2**62)
+            )
+            unit.rate[draw.randrange(len(unit.rate))] = draw.choice(
+                (math.nan, math.inf, 1e30)
+            )
     if kind == "csv":
         path = table(draw, stem.with_name(f"{stem.name}.csv"), made)
     elif kind == "tlog":
-        path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), draw.choice((1.0, 5.0)))
+        path = logs.write_tlog(
+            stem.with_name(f"{stem.name}.tlog"), draw.choice((1.0, 5.0))
+        )
     else:
-        suffix, write_log = ("bin", logs.write_dataflash) if kind in dataflash else ("ulg", logs.write_ulog)
-        path = write_log(stem.with_name(f"{stem.name}.{suffix}"), made, kind, draw.random() < 0.7)
+        suffix, write_log = (
+            ("bin", logs.write_dataflash)
+            if kind in dataflash
+            else ("ulg", logs.write_ulog)
+        )
+        path = write_log(
+            stem.with_name(f"{stem.name}.{suffix}"), made, kind, draw.random() < 0.7
+        )
     path.write_bytes(draw.corrupted(path.read_bytes()))
     return path
 
@@ -255,35 +393,69 @@ def flight_log(draw, stem):
 def table(draw, path, made):
     """A table of text, with odd names and cells, and now and then a file that says what they are."""
     names = ["t", *(f"imu_{k}.{axis}" for k in range(len(made)) for axis in "xyz")]
-    about = {"time": "t", "time_unit": "s", "imus": [["imu_0.x", "imu_0.y", "imu_0.z"]] * draw.choice((1, 2, 900))}
+    about = {
+        "time": "t",
+        "time_unit": "s",
+        "imus": [["imu_0.x", "imu_0.y", "imu_0.z"]] * draw.choice((1, 2, 900)),
+    }
     if draw.odd() or draw.odd():
-        path.with_name("columns.yaml").write_text(odd_yaml(draw, json.dumps(about, indent=1)), errors="replace")
-    names = [draw.choice((*NAMES, "t", '"', "gyro_x [\x1b[2J]")) if draw.odd() else name for name in names]
+        path.with_name("columns.yaml").write_text(
+            odd_yaml(draw, json.dumps(about, indent=1)), errors="replace"
+        )
+    names = [
+        draw.choice((*NAMES, "t", '"', "gyro_x [\x1b[2J]")) if draw.odd() else name
+        for name in names
+    ]
     rows = [names]
     for k in range(min(len(made[0].stamp), draw.choice((0, 30, 300)))):
-        cells = [made[0].stamp[k] * 1e-6, *(value for unit in made for value in unit.rate[k])]
-        rows.append([draw.choice(("", '"', "x" * 200_000, *SCALARS)) if draw.odd() else repr(float(c)) for c in cells])
-    text = draw.choice(("\n", "\r\n")).join(draw.choice((",", ",", ";", "\t")).join(row) for row in rows)
+        cells = [
+            made[0].stamp[k] * 1e-6,
+            *(value for unit in made for value in unit.rate[k]),
+        ]
+        rows.append(
+            [
+                draw.choice(("", '"', "x" * 200_000, *SCALARS))
+                if draw.odd()
+                else repr(float(c))
+                for c in cells
+            ]
+        )
+    text = draw.choice(("\n", "\r\n")).join(
+        draw.choice((",", ",", ";", "\t")).join(row) for row in rows
+    )
     path.write_text(text + "\n" * (draw.random() < 0.8), errors="replace")
     return path
 
 
 def storage(draw, stem):
-    kind = draw.choice((*[".db3"] * 3, *[".bag"] * (stem.name == "bag"), *[".mcap"] * 6))
+    kind = draw.choice(
+        (*[".db3"] * 3, *[".bag"] * (stem.name == "bag"), *[".mcap"] * 6)
+    )
     path = stem.with_name(f"{stem.name}{kind}")
     if kind == ".db3":
         database(draw, path)
     elif kind == ".bag":
         topics, sent = messages(draw)
-        named = [(topics[k][0], at % 2**61, data) for k, at, data in sent if topics[k][0]]
-        packing = draw.choice((None, Ros1Writer.CompressionFormat.BZ2, Ros1Writer.CompressionFormat.LZ4))
-        path.write_bytes(draw.corrupted(write_ros1(path, named, packing, dict(topics[:2])).read_bytes()))
+        named = [
+            (topics[k][0], at % 2**61, data) for k, at, data in sent if topics[k][0]
+        ]
+        packing = draw.choice(
+            (None, Ros1Writer.CompressionFormat.BZ2, Ros1Writer.CompressionFormat.LZ4)
+        )
+        path.write_bytes(
+            draw.corrupted(
+                write_ros1(path, named, packing, dict(topics[:2])).read_bytes()
+            )
+        )
     else:
         path.write_bytes(mcap(draw))
     if draw.random() < 0.1:
         packer = zstandard.ZstdCompressor().compressobj()
         data = packer.compress(path.read_bytes())
-        data += b"".join(packer.compress(bytes(1 << 20)) for _ in range(draw.choice((0, 0, 0, 0, 0, 512))))
+        data += b"".join(
+            packer.compress(bytes(1 << 20))
+            for _ in range(draw.choice((0, 0, 0, 0, 0, 512)))
+        )
         path.unlink()
         path = path.with_name(f"{path.name}.zstd")
         path.write_bytes(draw.damaged(data + packer.flush()))
@@ -301,25 +473,54 @@ def odd_yaml(draw, text):
             head, colon, _ = line.rpartition(": ")
             lines[k] = f"{head}{colon}{draw.choice(SCALARS)}"
     if draw.odd():
-        lines.insert(0, draw.choice(("a: &a [1,1,1,1,1,1,1,1,1]", "%YAML 9.9", "\ufeff", "--- 1", "---", "...")))
+        lines.insert(
+            0,
+            draw.choice(
+                (
+                    "a: &a [1,1,1,1,1,1,1,1,1]",
+                    "%YAML 9.9",
+                    "\ufeff",
+                    "--- 1",
+                    "---",
+                    "...",
+                )
+            ),
+        )
     if draw.odd():
-        lines += [f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]" for a, b in itertools.pairwise("abcdefgh")]
+        lines += [
+            f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]"
+            for a, b in itertools.pairwise("abcdefgh")
+        ]
     return "\n".join(lines)
 
 
 def parameters(draw):
     settings = dict(PARAMETERS)
     if draw is not SOUND and draw.random() < 0.2:
-        settings = {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "two_triad_cone"}
+        settings = {
+            "input": "channels",
+            "channels.topic": "/gyros",
+            "geometry.preset": "two_triad_cone",
+        }
     if draw.odd() or draw.odd():
-        settings[draw.choice(list(Config().parameters()))] = draw.choice((1.0, -1, "x", [0.1], 10**9))
+        settings[draw.choice(list(Config().parameters()))] = draw.choice(
+            (1.0, -1, "x", [0.1], 10**9)
+        )
     lines = [f"    {name}: {json.dumps(value)}" for name, value in settings.items()]
     return odd_yaml(draw, "\n".join(["/**:", "  ros__parameters:", *lines]))
 
 
 def words_of(draw, folder):
     """Make the files of a case, and the command line that reads them."""
-    verb = draw.choice((*["replay"] * 27, *["inspect"] * 18, *["calibrate"] * 2, *["convert"] * 2, "geometry"))
+    verb = draw.choice(
+        (
+            *["replay"] * 27,
+            *["inspect"] * 18,
+            *["calibrate"] * 2,
+            *["convert"] * 2,
+            "geometry",
+        )
+    )
     source = recording(draw, folder) if verb != "geometry" else Path()
     of_config = parameters(draw if verb == "geometry" or draw.random() < 0.2 else SOUND)
     if source.suffix in (".bin", ".csv", ".tlog", ".ulg"):
@@ -331,7 +532,9 @@ def words_of(draw, folder):
     if verb == "convert":
         return [*words, "--output", str(folder / "out" / "bag")]
     if verb == "inspect":
-        return words + ["--write", str(folder / "out" / "made.yaml")] * (draw.random() < 0.7)
+        return words + ["--write", str(folder / "out" / "made.yaml")] * (
+            draw.random() < 0.7
+        )
     words += ["--config", str(folder / "config.yaml")]
     for option, values, share in (
         ("--start", ("0.1", "1e30", "-1", "nan", "1e-300"), 0.2),
@@ -348,7 +551,10 @@ def replay_words(draw, folder):
     for option, name in (("--json", "s.json"), ("--csv", "s.csv"), ("--output", "bag")):
         words += [option, str(folder / "out" / name)] * (draw.random() < 0.3)
     if draw.random() < 0.2:
-        size, start = draw.choice(("0.2", "1e308", "nan", "-5")), draw.choice(("0.1", "1e30", "0", "inf"))
+        size, start = (
+            draw.choice(("0.2", "1e308", "nan", "-5")),
+            draw.choice(("0.1", "1e30", "0", "inf")),
+        )
         kind = draw.choice(("bias", "drift", "stuck"))
         words += ["--fault", f"channel=imu_1.y kind={kind} size={size} start={start}"]
     if draw.random() < 0.1:
@@ -371,9 +577,16 @@ def run_case(number):
         (folder / "out").mkdir()
         words = words_of(Draw(f"fdi {number}"), folder)
         given = inputs(folder)
-        out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
+        out, err = (
+            io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
+            for _ in range(2)
+        )
         begun, before = time.process_time(), peak()
-        with warnings.catch_warnings(record=True) as warned, redirect_stdout(out), redirect_stderr(err):
+        with (
+            warnings.catch_warnings(record=True) as warned,
+            redirect_stdout(out),
+            redirect_stderr(err),
+        ):
             warnings.simplefilter("always")
             try:
                 code, wrong = command_line.main(words), ""
@@ -383,10 +596,21 @@ def run_case(number):
         said, errors = (stream.buffer.getvalue().decode() for stream in (out, err))
         return words, (
             wrong
-            or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
+            or "".join(
+                f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n"
+                for w in warned
+            )
             or look(folder, code, said, errors)
-            or ("" if inputs(folder) == given else f"changed what it read: {given}, now {inputs(folder)}")
-            or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
+            or (
+                ""
+                if inputs(folder) == given
+                else f"changed what it read: {given}, now {inputs(folder)}"
+            )
+            or (
+                f"took {seconds:.1f} s of the processor"
+                if seconds > MOST_SECONDS
+                else ""
+            )
             or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
         )
     finally:
@@ -395,8 +619,14 @@ def run_case(number):
 
 def inputs(folder):
     """Size and time of all files of a case, but for its outputs."""
-    files = {path: path.lstat() for path in folder.rglob("*") if (folder / "out") not in (path, *path.parents)}
-    return {str(path): (about.st_size, about.st_mtime_ns) for path, about in files.items()}
+    files = {
+        path: path.lstat()
+        for path in folder.rglob("*")
+        if (folder / "out") not in (path, *path.parents)
+    }
+    return {
+        str(path): (about.st_size, about.st_mtime_ns) for path, about in files.items()
+    }
 
 
 def peak():
@@ -412,7 +642,10 @@ def look(folder, code, said, errors):
         (f"exit code {code}: {errors}", code in (0, 2, 3, 4)),
         (f"refused in other than one line: {errors!r}", code != 2 or one_line),
         (f"success with words of trouble: {errors!r}", code != 0 or not errors),
-        (f"prints what a terminal obeys: {said + errors!r}", (said + errors).replace("\n", "").isprintable()),
+        (
+            f"prints what a terminal obeys: {said + errors!r}",
+            (said + errors).replace("\n", "").isprintable(),
+        ),
         (f"refused, and left {made}", code != 2 or not made),
     ):
         if not well:
@@ -420,7 +653,10 @@ def look(folder, code, said, errors):
     try:
         for name in made:
             if name == "s.json":
-                json.loads((folder / "out" / name).read_text(), parse_constant=lambda text: 1 / 0)
+                json.loads(
+                    (folder / "out" / name).read_text(),
+                    parse_constant=lambda text: 1 / 0,
+                )
             if name == "made.yaml":
                 Config.from_file(folder / "out" / name)
     except (FdiError, ValueError, ZeroDivisionError) as error:

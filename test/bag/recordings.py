@@ -28,7 +28,26 @@ PARAMETERS = {
     "input": "imus",
     "sample_rate": 100.0,
     "imus.topics": list(TOPICS),
-    "imus.mounts": [0.6, 0.8, 0.0, -0.8, 0.6, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 0.0, -0.8, 0.6],
+    "imus.mounts": [
+        0.6,
+        0.8,
+        0.0,
+        -0.8,
+        0.6,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+        0.6,
+        0.8,
+        0.0,
+        -0.8,
+        0.6,
+    ],
     "noise.noise_std": [0.003],
 }
 
@@ -42,7 +61,9 @@ def write_config(path, parameters=PARAMETERS):
 def imu(stamp, rate, frame="imu", order="<"):
     name = frame.encode() + b"\0"
     out = struct.pack(order + "iII", *divmod(stamp, 10**9), len(name)) + name
-    out += bytes(-len(out) % 8) + struct.pack(order + "37d", *range(13), *rate, *range(21))
+    out += bytes(-len(out) % 8) + struct.pack(
+        order + "37d", *range(13), *rate, *range(21)
+    )
     return bytes([0, order == "<", 0, 0]) + out
 
 
@@ -54,7 +75,11 @@ def array(values, labels=(), order="<"):
         out += bytes(-len(out) % 4) + struct.pack(order + "II", 3, 5)
     out += bytes(-len(out) % 4) + struct.pack(order + "II", 0, len(values))
     out += bytes(-len(out) % 8) if values else b""
-    return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
+    return (
+        bytes([0, order == "<", 0, 0])
+        + out
+        + struct.pack(f"{order}{len(values)}d", *values)
+    )
 
 
 def imu_messages(stamp, z, topics=TOPICS, apart=0):
@@ -71,9 +96,13 @@ def flight(samples=600, seed=0, rate=100.0):
     random = np.random.default_rng(seed)
     step = round(1e9 / rate)
     time = np.arange(samples) * step * 1e-9
-    omega = np.column_stack([np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)])
+    omega = np.column_stack(
+        [np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)]
+    )
     mounts = np.array(PARAMETERS["imus.mounts"]).reshape(2, 3, 3)
-    z = np.hstack([omega @ mount for mount in mounts]) + random.normal(0, 0.002, (samples, 6))
+    z = np.hstack([omega @ mount for mount in mounts]) + random.normal(
+        0, 0.002, (samples, 6)
+    )
     return imu_messages(START + step * np.arange(samples), z, apart=1000), z
 
 
@@ -86,12 +115,19 @@ def send(messages, types, connect, write):
         write(connections[topic], log_time, data)
 
 
-def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None):
+def write_bag(
+    path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None
+):
     """A rosbag2 folder written by rosbags."""
     writer = Writer(path, version=9, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        send(messages, types, partial(writer.add_connection, typestore=STORE), writer.write)
+        send(
+            messages,
+            types,
+            partial(writer.add_connection, typestore=STORE),
+            writer.write,
+        )
     return path
 
 
@@ -103,10 +139,17 @@ def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **o
 
         def connect(topic, kind):
             definition = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-            return writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", definition))
+            return writer.register_channel(
+                topic, "cdr", writer.register_schema(kind, "ros2msg", definition)
+            )
 
         writer.start("ros2", "test")
-        send(messages, types, connect, lambda channel, at, data: writer.add_message(channel, at, data, at))
+        send(
+            messages,
+            types,
+            connect,
+            lambda channel, at, data: writer.add_message(channel, at, data, at),
+        )
         writer.finish()
     return path
 
@@ -115,7 +158,9 @@ def split(path, messages, storage):
     """A bag of three files, as a recorder leaves it that begins a new file now and then."""
     third = len(messages) // 3
     for k in range(3):
-        part = write_bag(path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage)
+        part = write_bag(
+            path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage
+        )
         path.mkdir(exist_ok=True)
         file = next(file for file in part.iterdir() if file.suffix in (".mcap", ".db3"))
         shutil.move(file, path / f"bag_{k + 8}{file.suffix}")
@@ -146,17 +191,23 @@ MAKES = {
     "ros 1, lz4": partial(write_ros1, compression=Ros1Writer.CompressionFormat.LZ4),
     "rosbag2 mcap": write_bag,
     "rosbag2 sqlite3": SQLITE3,
-    "rosbag2 sqlite3, messages compressed": partial(SQLITE3, mode=CompressionMode.MESSAGE),
+    "rosbag2 sqlite3, messages compressed": partial(
+        SQLITE3, mode=CompressionMode.MESSAGE
+    ),
     "rosbag2 sqlite3, file compressed": partial(SQLITE3, mode=CompressionMode.FILE),
     "rosbag2 mcap, file compressed": partial(write_bag, mode=CompressionMode.FILE),
-    "rosbag2 mcap, storage compressed": partial(write_bag, mode=CompressionMode.STORAGE),
+    "rosbag2 mcap, storage compressed": partial(
+        write_bag, mode=CompressionMode.STORAGE
+    ),
     "three mcap files": partial(split, storage=StoragePlugin.MCAP),
     "three sqlite3 files": partial(split, storage=StoragePlugin.SQLITE3),
     "zstd chunks": write_mcap,
     "lz4 chunks": partial(write_mcap, compression=CompressionType.LZ4),
     "plain chunks": partial(write_mcap, compression=CompressionType.NONE),
     "no chunks": partial(write_mcap, use_chunking=False),
-    "no checksums": partial(write_mcap, compression=CompressionType.NONE, enable_crcs=False),
+    "no checksums": partial(
+        write_mcap, compression=CompressionType.NONE, enable_crcs=False
+    ),
     "no summary": partial(
         write_mcap,
         use_statistics=False,
@@ -172,7 +223,10 @@ MAKES = {
 @contextlib.contextmanager
 def bounded(seconds=20.0, growth=600_000):
     """Time of the processor in s, growth of the memory at its largest in kB."""
-    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun, before = (
+        time.process_time(),
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+    )
     yield
     assert time.process_time() - begun < seconds
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < growth

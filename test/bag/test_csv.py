@@ -20,7 +20,10 @@ RATES = np.hstack([unit.rate for unit in UNITS]).astype(float)
 
 def write(folder, names, time=TIME, rates=RATES, delimiter=",", head="", tail=""):
     path = folder / "flight.csv"
-    rows = [delimiter.join([repr(t), *map(repr, row)]) for t, row in zip(time.tolist(), rates.tolist(), strict=True)]
+    rows = [
+        delimiter.join([repr(t), *map(repr, row)])
+        for t, row in zip(time.tolist(), rates.tolist(), strict=True)
+    ]
     path.write_text(head + "\n".join([delimiter.join(names), *rows]) + "\n" + tail)
     return path
 
@@ -47,7 +50,8 @@ def test_columns_are_those_that_their_names_say(tmp_path, names):
         assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
     assert damage == (
         f"flight.csv: columns by their names: time is {names[0]}; /imu_0 is {', '.join(names[1:4])}; /imu_1 is"
-        f" {', '.join(names[4:])}" + ("" if "rad" in names[1] else "; no unit is named: taken as rad/s"),
+        f" {', '.join(names[4:])}"
+        + ("" if "rad" in names[1] else "; no unit is named: taken as rad/s"),
     )
 
 
@@ -58,7 +62,9 @@ def test_columns_are_those_that_their_names_say(tmp_path, names):
         *(("stamp", 1e9, UTC), ("time", 1e3, UTC), ("t", 1.0, UTC)),
     ],
 )
-def test_times_have_the_unit_of_their_name_or_that_of_a_date(tmp_path, name, scale, start):
+def test_times_have_the_unit_of_their_name_or_that_of_a_date(
+    tmp_path, name, scale, start
+):
     names = [name, *(f"gyro_{axis}{k} (deg/s)" for k in (1, 2) for axis in AXES)]
     time = (start * 1e-9 + TIME) * scale
     found, (said,) = messages(write(tmp_path, names, time, np.degrees(RATES)))
@@ -69,12 +75,22 @@ def test_times_have_the_unit_of_their_name_or_that_of_a_date(tmp_path, name, sca
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])
-def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(tmp_path, delimiter):
+def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(
+    tmp_path, delimiter
+):
     names = [*named("imu_{k}.{axis}"), "note"]
-    path = write(tmp_path, named("imu_{k}.{axis}"), delimiter=delimiter, head="\ufeff# a flight\n\n")
+    path = write(
+        tmp_path,
+        named("imu_{k}.{axis}"),
+        delimiter=delimiter,
+        head="\ufeff# a flight\n\n",
+    )
     lines = path.read_text().splitlines()
     comma = delimiter == ";"
-    lines[3:] = [(line.replace(".", ",") if comma else line) + f'{delimiter}"said {delimiter}"' for line in lines[3:]]
+    lines[3:] = [
+        (line.replace(".", ",") if comma else line) + f'{delimiter}"said {delimiter}"'
+        for line in lines[3:]
+    ]
     lines[2] = delimiter.join(names)
     path.write_text("\r\n".join(lines) + "\r\n")
     found, _ = messages(path)
@@ -86,8 +102,16 @@ IMUS = "imus: [[p1, q1, r1], [p2, q2, r2]]\n"
 
 def test_columns_yaml_says_what_names_do_not(tmp_path):
     names = ["k", "t", "p1", "q1", "r1", "p2", "q2", "r2"]
-    path = write(tmp_path, names, np.arange(len(TIME)), np.column_stack([TIME * 1e3, np.degrees(RATES)]))
-    assert "has no columns of gyros among k, t, p1, q1, r1, p2, q2, r2; columns.yaml says which: docs" in refusal(path)
+    path = write(
+        tmp_path,
+        names,
+        np.arange(len(TIME)),
+        np.column_stack([TIME * 1e3, np.degrees(RATES)]),
+    )
+    assert (
+        "has no columns of gyros among k, t, p1, q1, r1, p2, q2, r2; columns.yaml says which: docs"
+        in refusal(path)
+    )
     about = tmp_path / "columns.yaml"
     about.write_text(f"time: t\ntime_unit: ms\nrate_unit: deg/s\n{IMUS}")
     found, _ = messages(path)
@@ -96,12 +120,18 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
     for text, words in (
         ("imus: [[p1, q1]]", "imus is a list of three columns for each IMU"),
         ("imus: [[p1, q1, z9], [p2, q2, r2]]", "has no column 'z9', it has k, t, p1"),
-        (f"{IMUS}rate_unit: rpm", "column 'p1' has the unit 'rpm', expected one of rad/s"),
+        (
+            f"{IMUS}rate_unit: rpm",
+            "column 'p1' has the unit 'rpm', expected one of rad/s",
+        ),
         (f"{IMUS}units: 3", "expected time, time_unit, rate_unit and imus"),
         (f"{IMUS}time: [1]", "has no column [1]"),
         ("- 1", "expected time, time_unit"),
         ("x: [", "is not YAML"),
-        ("{time: t, time_unit: ms, imus: [[p1, q1, r1]]}", "this table has one IMU (columns of 1 IMU at 100 Hz): no"),
+        (
+            "{time: t, time_unit: ms, imus: [[p1, q1, r1]]}",
+            "this table has one IMU (columns of 1 IMU at 100 Hz): no",
+        ),
     ):
         about.write_text(text)
         assert words in refusal(path)
@@ -111,7 +141,9 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
 
 
 @pytest.mark.parametrize("portion", [3000, 1 << 20])
-def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypatch, portion):
+def test_an_imu_without_values_in_a_line_has_no_message_there(
+    tmp_path, monkeypatch, portion
+):
     """Two IMUs of their own rates in one table; a damaged number is one, not a lost message; a second table is left."""
     monkeypatch.setattr("fdi_ros.bag.csv_file._PORTION", portion)
     path = write(tmp_path, named("imu_{k}.{axis}"))
@@ -119,7 +151,9 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypa
     again = lines[1:]
     lines[1::2] = [",".join([*line.split(",")[:4], "", "", ""]) for line in lines[1::2]]
     lines[100] = lines[100].replace(lines[100].split(",")[1], "0.1x2", 1)
-    path.write_text("\n".join([*lines[:50], "", "# pause", "no numbers", *lines[50:]]) + "\n1.0,2.")
+    path.write_text(
+        "\n".join([*lines[:50], "", "# pause", "no numbers", *lines[50:]]) + "\n1.0,2."
+    )
     found, damage = messages(path)
     assert [len(one[0]) for one in found.values()] == [len(TIME), len(TIME) // 2]
     assert np.isnan(found["/imu_0"][1][99]).tolist() == [True, False, False]
@@ -138,17 +172,35 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path, monkeypa
     ("content", "words"),
     [
         ("", "is empty"),
-        ("1.0,2.0,3.0,4.0\n" * 50, "has no names of columns: its first line holds numbers"),
-        ("t,gyro_x [LSB],gyro_y,gyro_z\n", "column 'gyro_x [LSB]' has the unit 'lsb', expected one of"),
-        ("t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50, "has columns of 2 IMUs at times that do not advance"),
+        (
+            "1.0,2.0,3.0,4.0\n" * 50,
+            "has no names of columns: its first line holds numbers",
+        ),
+        (
+            "t,gyro_x [LSB],gyro_y,gyro_z\n",
+            "column 'gyro_x [LSB]' has the unit 'lsb', expected one of",
+        ),
+        (
+            "t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50,
+            "has columns of 2 IMUs at times that do not advance",
+        ),
         ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),
         ("t," * CSV_LINE_BYTES, "has no line with the names"),
         (
-            "t,gx,gy,gz,gx1,gy1,gz1\n" + "".join(f"{10 * k},0,0,0,0,0,0\n" for k in range(50)),
+            "t,gx,gy,gz,gx1,gy1,gz1\n"
+            + "".join(f"{10 * k},0,0,0,0,0,0\n" for k in range(50)),
             "does the name of the time have its unit (time_ms), or columns.yaml a time_unit?",
         ),
     ],
-    ids=["empty", "no names", "unit", "time", "line", "names", "time in the wrong unit"],
+    ids=[
+        "empty",
+        "no names",
+        "unit",
+        "time",
+        "line",
+        "names",
+        "time in the wrong unit",
+    ],
 )
 def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, words):
     path = tmp_path / "a.csv"
@@ -161,7 +213,12 @@ def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, wor
 def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):
     made = units(2, seconds=20.0)
     time = (made[0].stamp - made[0].stamp[0]) * 1e-6
-    path = write(tmp_path, named("imu_{k}.{axis}"), time, np.hstack([unit.rate for unit in made]).astype(float))
+    path = write(
+        tmp_path,
+        named("imu_{k}.{axis}"),
+        time,
+        np.hstack([unit.rate for unit in made]).astype(float),
+    )
     (tmp_path / "other.csv").write_text("name,size\na,3\n")
     config = tmp_path / "made.yaml"
     assert "/imu_1" in fdi("inspect", path, "--output", config).out

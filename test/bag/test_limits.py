@@ -13,7 +13,17 @@ import pytest
 import zstandard
 from bag import fuzz
 from bag.fuzz import SOUND as SOUND_DRAW
-from bag.recordings import ARRAY, IMU, MAKES, PARAMETERS, START, bounded, write_bag, write_config, write_mcap
+from bag.recordings import (
+    ARRAY,
+    IMU,
+    MAKES,
+    PARAMETERS,
+    START,
+    bounded,
+    write_bag,
+    write_config,
+    write_mcap,
+)
 from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
@@ -40,7 +50,10 @@ def message(channel=0, at=START, data=b""):
 
 
 def channel(number, name):
-    return record(4, struct.pack("<HH", number, 1) + text(name) + text("cdr") + struct.pack("<I", 0))
+    return record(
+        4,
+        struct.pack("<HH", number, 1) + text(name) + text("cdr") + struct.pack("<I", 0),
+    )
 
 
 def chunk(inside):
@@ -69,15 +82,35 @@ def made(folder, records):
 @pytest.mark.parametrize(
     ("records", "received", "words"),
     [
-        (lambda: chunk(SCHEMA + channel(0, "/a") + message() * (1 << 19)) * 24, None, "unpacks to more than"),
-        (lambda: channel(0, "/a") + (message() + record(200, b"")) * 100_000, 100_000, ""),
-        (lambda: b"".join(channel(k, f"/t{k}") for k in range(65_535)) + message(), 1, "more than 4096 topics"),
-        (lambda: channel(0, "/a") + message() + message(data=bytes(5 << 20)) + message(), 3, ""),
+        (
+            lambda: chunk(SCHEMA + channel(0, "/a") + message() * (1 << 19)) * 24,
+            None,
+            "unpacks to more than",
+        ),
+        (
+            lambda: channel(0, "/a") + (message() + record(200, b"")) * 100_000,
+            100_000,
+            "",
+        ),
+        (
+            lambda: b"".join(channel(k, f"/t{k}") for k in range(65_535)) + message(),
+            1,
+            "more than 4096 topics",
+        ),
+        (
+            lambda: (
+                channel(0, "/a") + message() + message(data=bytes(5 << 20)) + message()
+            ),
+            3,
+            "",
+        ),
         (lambda: record(200, b"") * 320_000, 0, "more records than its size explains"),
     ],
     ids=["packed", "unknown records", "topics", "a long message", "empty records"],
 )
-def test_bombs_are_read_as_far_as_their_size_explains(tmp_path, records, received, words):
+def test_bombs_are_read_as_far_as_their_size_explains(
+    tmp_path, records, received, words
+):
     path = made(tmp_path, records())
     with bounded():
         reports, damage = inspect(path)
@@ -88,7 +121,10 @@ def test_bombs_are_read_as_far_as_their_size_explains(tmp_path, records, receive
 
 
 def test_a_packed_file_is_unpacked_as_far_as_its_size_explains(tmp_path):
-    packed, packer = tmp_path / "bomb.mcap.zstd", zstandard.ZstdCompressor().compressobj()
+    packed, packer = (
+        tmp_path / "bomb.mcap.zstd",
+        zstandard.ZstdCompressor().compressobj(),
+    )
     parts = [MAGIC + SCHEMA + channel(0, "/a") + message(), *[bytes(1 << 20)] * 512]
     packed.write_bytes(b"".join(map(packer.compress, parts)) + packer.flush())
     with bounded(), Recording(packed) as recording:
@@ -101,15 +137,31 @@ def test_a_packed_file_is_unpacked_as_far_as_its_size_explains(tmp_path):
 
 
 def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
-    names = channel(0, "/a") + channel(1, "/" + "b" * 300) + record(3, struct.pack("<H", 2) + bytes(1 << 21))
+    names = (
+        channel(0, "/a")
+        + channel(1, "/" + "b" * 300)
+        + record(3, struct.pack("<H", 2) + bytes(1 << 21))
+    )
     made(tmp_path, names + message() + message(1) + message(0, 2**63 + 5))
     reports, damage = inspect(tmp_path / "bag.mcap")
     assert [(r.topic.name, r.received) for r in reports] == [("/a", 1)]
-    for line, words in zip(damage, ("than 255", "than 1048576 bytes", "before 1970 or after 2038"), strict=True):
+    for line, words in zip(
+        damage,
+        ("than 255", "than 1048576 bytes", "before 1970 or after 2038"),
+        strict=True,
+    ):
         assert words in line
 
 
-SOUND = ("zstd chunks", "lz4 chunks", "plain chunks", "no checksums", "no chunks", "rosbag2 sqlite3", "ros 1, bz2")
+SOUND = (
+    "zstd chunks",
+    "lz4 chunks",
+    "plain chunks",
+    "no checksums",
+    "no chunks",
+    "rosbag2 sqlite3",
+    "ros 1, bz2",
+)
 
 
 @pytest.mark.parametrize("make", SOUND)
@@ -136,13 +188,19 @@ def outcome(path):
         summary = replay(path, CONFIG)
     except BagError as error:
         return str(error)
-    counts = [item for counts in summary.stream.alignment.values() for item in counts.items()]
-    said = [*summary.stream.damage] + [name for name, count in counts if count and name != "received"]
+    counts = [
+        item for counts in summary.stream.alignment.values() for item in counts.items()
+    ]
+    said = [*summary.stream.damage] + [
+        name for name, count in counts if count and name != "received"
+    ]
     said += [topic for topic, count in summary.stream.malformed.items() if count]
     return " ".join(said) or ("complete" if summary.scores.samples == SAMPLES else "")
 
 
-def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unpacked(tmp_path):
+def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unpacked(
+    tmp_path,
+):
     path = write_mcap(tmp_path / "bag.mcap", fly(SAMPLES)[0])
     data = path.read_bytes()
     at = data.index(b"\x04\x00\x00\x00zstd")
@@ -158,7 +216,9 @@ def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unp
         assert replay(path, CONFIG).stream.damage
 
 
-def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(tmp_path):
+def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(
+    tmp_path,
+):
     path = write_bag(tmp_path / "bag", fly(20)[0])
 
     def said():
@@ -169,14 +229,24 @@ def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(t
 
     (path / "bag.mcap").rename(path / "other.mcap")
     assert said() == ("bag.mcap is named in metadata.yaml and not there",)
-    for text in (*YAML, "", "x: [", "rosbag2_bagfile_information: 3", "- 1", "\x00\x01", "a: !!python/none x"):
+    for text in (
+        *YAML,
+        "",
+        "x: [",
+        "rosbag2_bagfile_information: 3",
+        "- 1",
+        "\x00\x01",
+        "a: !!python/none x",
+    ):
         (path / "metadata.yaml").write_text(text)
         assert "metadata.yaml is damaged" in said()[0]
 
 
 def database(path, messages):
     base = sqlite3.connect(path)
-    base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+    base.execute(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+    )
     base.execute("INSERT INTO topics VALUES(1, '/imu_1/data_raw', ?, 'cdr')", (IMU,))
     base.execute(messages)
     base.commit()
@@ -186,7 +256,10 @@ def database(path, messages):
 @pytest.mark.parametrize("messages", fuzz.COMPUTED.values(), ids=fuzz.COMPUTED)
 def test_a_database_that_computes_is_refused(messages, tmp_path):
     database(tmp_path / "bag.db3", messages).close()
-    with bounded(5), pytest.raises(BagError, match=r"is no plain table|has computed columns"):
+    with (
+        bounded(5),
+        pytest.raises(BagError, match=r"is no plain table|has computed columns"),
+    ):
         Recording(tmp_path / "bag.db3")
 
 
@@ -195,13 +268,18 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     write_bag(path, fly(20)[0], StoragePlugin.SQLITE3)
     base = sqlite3.connect(path / "bag.db3")
     packed = zstandard.compress(bytes(1 << 26))
-    base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", [(START, packed)] * 7)
+    base.executemany(
+        "INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)",
+        [(START, packed)] * 7,
+    )
     base.execute("UPDATE topics SET type = CAST(x'fffe' AS TEXT) WHERE id = 2")
     base.commit()
     with bounded():
         _, damage = inspect(path)
     assert "more bytes than it should" in damage[0]
-    base.execute("UPDATE messages SET data = zeroblob(70000000) WHERE id = (SELECT MAX(id) FROM messages)")
+    base.execute(
+        "UPDATE messages SET data = zeroblob(70000000) WHERE id = (SELECT MAX(id) FROM messages)"
+    )
     base.execute("DELETE FROM messages WHERE data = ?", (packed,))
     base.commit()
     base.close()
@@ -219,13 +297,19 @@ def test_messages_of_a_database_are_sorted_without_being_loaded(tmp_path):
     base.close()
     with bounded(growth=330_000), Recording(tmp_path / "bag.db3") as recording:
         topics = [topic.name for topic in recording.topics]
-        times = [at for batch in recording.batches(topics) for at in batch.log_time.tolist()]
+        times = [
+            at for batch in recording.batches(topics) for at in batch.log_time.tolist()
+        ]
     assert times == [START + 1000 * k for k in range(8)]
 
 
 def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, fdi):
     lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
-    path = write_bag(tmp_path / "bag", [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
+    path = write_bag(
+        tmp_path / "bag",
+        [("/gyros", START + k, lies) for k in range(5)],
+        types={"/gyros": ARRAY},
+    )
     with bounded():
         code, out, _ = fdi("inspect", path)
     assert code == 3
@@ -243,7 +327,8 @@ def test_a_query_ends_by_itself(tmp_path):
 
 
 ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
-    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
+    for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
 YAML = {
     "x: !!int zz": "'zz' is no int",
@@ -264,7 +349,12 @@ YAML = {
 
 
 @pytest.mark.parametrize(
-    ("read", "error"), [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError)]
+    ("read", "error"),
+    [
+        (read_parameter_file, ConfigError),
+        (load_scenario, FdiError),
+        (load_study, StudyError),
+    ],
 )
 def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
     path = tmp_path / "hostile.yaml"
@@ -279,18 +369,33 @@ def test_what_a_file_says_is_shown_and_not_obeyed(fdi, refused, tmp_path):
     assert shown("a\n\x1b[2Jb\u202ec\u2028\x00") == r"a\n\x1b[2Jb\u202ec\u2028\x00"
     assert shown("x" * 500, 10) == "xxxxxxx..."
     names = ("/a\n/**:\n  ros__parameters: {input: x}", "/\x1b]0;owned\x07", "/\u202eb")
-    messages = [(names[k % 3], START + 10**7 * k, data) for k, (_, _, data) in enumerate(fly(60)[0])]
-    path = write_mcap(tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE)
-    made, config = tmp_path / "made.yaml", write_config(tmp_path / "c.yaml", {**TWO_IMUS, "imus.topics": ["/a", "/b"]})
+    messages = [
+        (names[k % 3], START + 10**7 * k, data)
+        for k, (_, _, data) in enumerate(fly(60)[0])
+    ]
+    path = write_mcap(
+        tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE
+    )
+    made, config = (
+        tmp_path / "made.yaml",
+        write_config(tmp_path / "c.yaml", {**TWO_IMUS, "imus.topics": ["/a", "/b"]}),
+    )
     inspected = fdi("inspect", path, "--write", made)
     assert (inspected.code, inspected.err.count("\n")) == (2, 1)
-    replayed, set_up = refused("replay", path, "--config", config), refused("setup", path, "--output", made)
+    replayed, set_up = (
+        refused("replay", path, "--config", config),
+        refused("setup", path, "--output", made),
+    )
     for told in (inspected.out, inspected.err, set_up):
         assert r"/a\n/**:\n  ros__parameters: {input: x}" in told
-    assert all(line.isprintable() for line in "".join((*inspected[1:], replayed, set_up)).split("\n"))
+    assert all(
+        line.isprintable()
+        for line in "".join((*inspected[1:], replayed, set_up)).split("\n")
+    )
     assert not made.exists()
     path = write_mcap(
-        tmp_path / "x\n  bad: [.mcap", [(f"/imu_{k % 2}", t, m) for k, (_, t, m) in enumerate(fly(60)[0])]
+        tmp_path / "x\n  bad: [.mcap",
+        [(f"/imu_{k % 2}", t, m) for k, (_, t, m) in enumerate(fly(60)[0])],
     )
     assert fdi("inspect", path, "--write", made).code == 0
     assert Config.from_file(made).imus.topics == ("/imu_0", "/imu_1")

@@ -26,18 +26,29 @@ from fdi_ros.errors import BagError, FdiError
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {
-    **dict.fromkeys(("IMU", "IMU2", "IMT", "TimeMS", "GYR1"), ("log.bin", write_dataflash)),
+    **dict.fromkeys(
+        ("IMU", "IMU2", "IMT", "TimeMS", "GYR1"), ("log.bin", write_dataflash)
+    ),
     "GYR": ("log.BIN", write_dataflash),
-    **dict.fromkeys(("sensor_gyro", "sensor_gyro_fifo", "vehicle_imu_status"), ("log.ulg", write_ulog)),
+    **dict.fromkeys(
+        ("sensor_gyro", "sensor_gyro_fifo", "vehicle_imu_status"),
+        ("log.ulg", write_ulog),
+    ),
     "vehicle_imu": ("log.ulog", write_ulog),
 }
-EVERY = pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "vehicle_imu_status"])
+EVERY = pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind != "vehicle_imu_status"]
+)
 EITHER = pytest.mark.parametrize("kind", ["IMU", "sensor_gyro"])
 
 
 def real(name):
     path = Path(__file__).parents[3] / "shared" / "data" / "logs" / name
-    return path if path.exists() else pytest.skip(f"the recorded data is not there: ../shared/data/logs/{name}")
+    return (
+        path
+        if path.exists()
+        else pytest.skip(f"the recorded data is not there: ../shared/data/logs/{name}")
+    )
 
 
 def log(folder, kind, made=None, **options):
@@ -56,19 +67,31 @@ def messages(path):
             assert decoded.good.all()
             assert (decoded.stamp == batch.log_time).all()
             for k, topic in enumerate(batch.topic.tolist()):
-                found[names[topic]].append((decoded.stamp[k], decoded.values[k], batch.message(k)))
-        assert [topic.count for topic in recording.topics] == [len(found[name]) for name in names]
+                found[names[topic]].append(
+                    (decoded.stamp[k], decoded.values[k], batch.message(k))
+                )
+        assert [topic.count for topic in recording.topics] == [
+            len(found[name]) for name in names
+        ]
         columns = {name: list(zip(*rows, strict=True)) for name, rows in found.items()}
         return {
-            name: (np.array(a), np.array(b), list(c)) for name, (a, b, c) in columns.items()
+            name: (np.array(a), np.array(b), list(c))
+            for name, (a, b, c) in columns.items()
         }, recording.damage.report()
 
 
 @pytest.mark.parametrize(
     ("kind", "start", "gps", "begin", "room"),
     [
-        *((kind, 10.0, True, UTC - FIX * 1000, 32) for kind in KINDS if kind != "vehicle_imu_status"),
-        *(("sensor_gyro_fifo", 10.0, True, UTC - FIX * 1000, room) for room in (8, 20, 33)),
+        *(
+            (kind, 10.0, True, UTC - FIX * 1000, 32)
+            for kind in KINDS
+            if kind != "vehicle_imu_status"
+        ),
+        *(
+            ("sensor_gyro_fifo", 10.0, True, UTC - FIX * 1000, room)
+            for room in (8, 20, 33)
+        ),
         # The 32 bits of GYR before 3.3 begin anew after 72 minutes.
         ("GYR1", 2**32 * 1e-6 - 3.0, False, 0, 32),
         # A simulation stamps by the clock of its computer; its GPS may say any other time.
@@ -91,20 +114,35 @@ def test_rates_and_times_are_those_of_the_samples_in_front_left_up(
     for unit, (stamp, rate, _) in zip(made, found.values(), strict=True):
         step = 1000 if kind == "TimeMS" else 1
         assert (stamp == begin + unit.stamp // step * step * 1000).all()
-        error = {"vehicle_imu": 1e-7, "IMT": 1e-7, "sensor_gyro_fifo": 0.51 * SCALE}.get(kind, 0.0)
+        error = {
+            "vehicle_imu": 1e-7,
+            "IMT": 1e-7,
+            "sensor_gyro_fifo": 0.51 * SCALE,
+        }.get(kind, 0.0)
         np.testing.assert_allclose(rate, unit.rate * FLU, rtol=0.0, atol=error)
     # ROS reads the same, and of an autopilot no orientation.
     message = STORE.deserialize_cdr(found["/imu_1"][2][7], IMU)
-    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == found["/imu_1"][0][7]
+    assert (
+        message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        == found["/imu_1"][0][7]
+    )
     assert message.header.frame_id == "imu_1"
     assert message.orientation_covariance[0] == -1.0
     has_acceleration = kind in ("IMU", "IMU2", "TimeMS", "IMT", "vehicle_imu")
     expected = made[1].acceleration[7] * FLU * has_acceleration
-    np.testing.assert_allclose([getattr(message.linear_acceleration, axis) for axis in "xyz"], expected, rtol=1e-6)
-    assert message.linear_acceleration_covariance[0] == (0.0 if has_acceleration else -1.0)
+    np.testing.assert_allclose(
+        [getattr(message.linear_acceleration, axis) for axis in "xyz"],
+        expected,
+        rtol=1e-6,
+    )
+    assert message.linear_acceleration_covariance[0] == (
+        0.0 if has_acceleration else -1.0
+    )
 
 
-@pytest.mark.parametrize("hole", [bytes(30 << 20), b"\xa3" * 1_000_001, b"\x95\xa3\x00" * 99_999])
+@pytest.mark.parametrize(
+    "hole", [bytes(30 << 20), b"\xa3" * 1_000_001, b"\x95\xa3\x00" * 99_999]
+)
 def test_a_hole_in_a_log_is_passed_and_its_bytes_are_counted(tmp_path, hole):
     """A card that ran full, or a file system that was repaired; the record before it has none behind it to prove it."""
     path = log(tmp_path, "IMU")
@@ -134,7 +172,9 @@ def as_pymavlink_reads(path):
     with contextlib.closing(DFReader_binary(str(path))) as opened:
         while (one := opened.recv_match(type=["IMU", "IMU2", "IMU3"])) is not None:
             instance = getattr(one, "I", ("IMU", "IMU2", "IMU3").index(one.get_type()))
-            rows.setdefault(f"/imu_{instance}", []).append((one._timestamp, one.GyrX, -one.GyrY, -one.GyrZ))
+            rows.setdefault(f"/imu_{instance}", []).append(
+                (one._timestamp, one.GyrX, -one.GyrY, -one.GyrZ)
+            )
     return {name: np.array(values) for name, values in rows.items()}
 
 
@@ -152,26 +192,51 @@ def test_pymavlink_reads_the_same(tmp_path, kind):
 
 @pytest.mark.parametrize(
     ("units_of", "multipliers", "factor"),
-    [(b"s#EEEooo", b"F-000000", 1.0), (b"s#kkkooo", b"F-000000", np.pi / 180), (b"s#EEEooo", b"F-CCC000", 1e-3)],
+    [
+        (b"s#EEEooo", b"F-000000", 1.0),
+        (b"s#kkkooo", b"F-000000", np.pi / 180),
+        (b"s#EEEooo", b"F-CCC000", 1e-3),
+    ],
 )
-def test_units_and_multipliers_are_those_that_the_log_says(tmp_path, units_of, multipliers, factor):
+def test_units_and_multipliers_are_those_that_the_log_says(
+    tmp_path, units_of, multipliers, factor
+):
     unit, multiplier = (67, "QbZ", "TimeUS,Id,Label"), (68, "Qbd", "TimeUS,Id,Mult")
     of_message = (69, "QBNN", "TimeUS,FmtType,UnitIds,MultIds")
     tables = {"UNIT": unit, "MULT": multiplier, "FMTU": of_message}
-    extra = b"".join(format_record(number, name, *form) for name, (number, *form) in tables.items())
-    extra += logs.records(unit, 4, Id=[*b"Ekos"], Label=["rad/s", "deg/s", "m/s/s", "s"]).tobytes()
-    extra += logs.records(multiplier, 4, Id=[*b"-0FC"], Mult=[0.0, 1.0, 1e-6, 1e-3]).tobytes()
-    extra += logs.records(of_message, FmtType=logs.MESSAGES["IMU"][0], UnitIds=units_of, MultIds=multipliers).tobytes()
+    extra = b"".join(
+        format_record(number, name, *form) for name, (number, *form) in tables.items()
+    )
+    extra += logs.records(
+        unit, 4, Id=[*b"Ekos"], Label=["rad/s", "deg/s", "m/s/s", "s"]
+    ).tobytes()
+    extra += logs.records(
+        multiplier, 4, Id=[*b"-0FC"], Mult=[0.0, 1.0, 1e-6, 1e-3]
+    ).tobytes()
+    extra += logs.records(
+        of_message,
+        FmtType=logs.MESSAGES["IMU"][0],
+        UnitIds=units_of,
+        MultIds=multipliers,
+    ).tobytes()
     made = units(seconds=8.0)
     found, _ = messages(log(tmp_path, "IMU", made, extra=extra))
-    np.testing.assert_allclose(found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12)
+    np.testing.assert_allclose(
+        found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_number_of_a_unit_or_an_error_that_is_none_is_no_defect(tmp_path, number):
     unit, error = (67, "fZ", "Id,Label"), (90, "Qff", "TimeUS,Subsys,ECode")
-    extra = format_record(67, "UNIT", *unit[1:]) + logs.records(unit, Id=number, Label="deg/s").tobytes()
-    extra += format_record(90, "ERR", *error[1:]) + logs.records(error, Subsys=number, ECode=1.0).tobytes()
+    extra = (
+        format_record(67, "UNIT", *unit[1:])
+        + logs.records(unit, Id=number, Label="deg/s").tobytes()
+    )
+    extra += (
+        format_record(90, "ERR", *error[1:])
+        + logs.records(error, Subsys=number, ECode=1.0).tobytes()
+    )
     found, damage = messages(log(tmp_path, "IMU", units(seconds=8.0), extra=extra))
     assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
 
@@ -184,9 +249,18 @@ def test_what_was_appended_is_read_from_its_offset(tmp_path):
     cut = len(data) - 300 * size - 20
     flags = struct.pack("<8s8s3Q", bytes(8), b"\1" + bytes(7), cut, 0, 0)
     # There the numbers of topics are given anew.
-    again = b"".join(logs.ulog_message(b"A", struct.pack("<BH", k, k) + b"sensor_gyro") for k in (2, 1, 0))
+    again = b"".join(
+        logs.ulog_message(b"A", struct.pack("<BH", k, k) + b"sensor_gyro")
+        for k in (2, 1, 0)
+    )
     later = again + data[len(data) - 300 * size :]
-    path.write_bytes(data[:16] + struct.pack("<HB", 40, ord("B")) + flags + data[16 + 43 : cut] + later)
+    path.write_bytes(
+        data[:16]
+        + struct.pack("<HB", 40, ord("B"))
+        + flags
+        + data[16 + 43 : cut]
+        + later
+    )
     found, damage = messages(path)
     assert damage == ()
     assert sum(len(one[2]) for one in found.values()) == 2400 - 1
@@ -194,11 +268,15 @@ def test_what_was_appended_is_read_from_its_offset(tmp_path):
 
 
 def test_dropouts_of_the_logger_are_told(tmp_path):
-    dropouts = b"".join(logs.ulog_message(b"O", struct.pack("<H", ms)) for ms in (120, 3000))
+    dropouts = b"".join(
+        logs.ulog_message(b"O", struct.pack("<H", ms)) for ms in (120, 3000)
+    )
     path = log(tmp_path, "sensor_gyro")
     path.write_bytes(path.read_bytes() + dropouts)
     _, damage = messages(path)
-    assert damage == ("log.ulg: the logger dropped out 2 times, for 3.12 s in all and 3 s at most",)
+    assert damage == (
+        "log.ulg: the logger dropped out 2 times, for 3.12 s in all and 3 s at most",
+    )
 
 
 @EITHER
@@ -214,19 +292,27 @@ def test_what_is_read_does_not_depend_on_the_portions(tmp_path, kind, monkeypatc
 
 
 @EITHER
-def test_of_a_log_damaged_or_cut_off_all_else_is_read_and_nothing_invented(tmp_path, kind):
+def test_of_a_log_damaged_or_cut_off_all_else_is_read_and_nothing_invented(
+    tmp_path, kind
+):
     path = log(tmp_path, kind)
     data, (whole, _) = path.read_bytes(), messages(path)
     draw = random.Random(1)
     for k in range(14):
         at = draw.randrange(len(data) // 6, len(data) - 3000)
         size = draw.choice((1, 10, 1000))
-        gone, new = draw.choice(((size, 0), (size, size), (0, size))) if k < 8 else (len(data), 0)
+        gone, new = (
+            draw.choice(((size, 0), (size, size), (0, size)))
+            if k < 8
+            else (len(data), 0)
+        )
         path.write_bytes(data[:at] + draw.randbytes(new) + data[at + gone :])
         found, damage = messages(path)
         for name, (_, _, sent) in found.items():
             # Of a message whose values alone are hit there is nothing to tell.
-            assert len({*sent} - {*whole[name][2]}) <= (1 + 2 * (new == gone) * size // 50) * (k < 8)
+            assert len({*sent} - {*whole[name][2]}) <= (
+                1 + 2 * (new == gone) * size // 50
+            ) * (k < 8)
         counts = [len(one[2]) for one in found.values()]
         assert len(damage) <= 2
         assert damage or (new == gone and sum(counts) == 2400) or k >= 8
@@ -249,27 +335,53 @@ def test_damaged_times_are_left_out_and_a_gap_is_not(tmp_path, kind):
     damaged = {0: 3 * day, 100: -9 * 10**6, 300: day, 301: day, 399: 20 * day}
     for k, by in damaged.items():
         assert data.count(struct.pack("<Q", stamp[k])) == 1
-        data = data.replace(struct.pack("<Q", stamp[k]), struct.pack("<Q", stamp[k] + by))
+        data = data.replace(
+            struct.pack("<Q", stamp[k]), struct.pack("<Q", stamp[k] + by)
+        )
     path.write_bytes(data)
     found, damage = messages(path)
     # What is 9 s too early is not told from what is late.
-    expected = np.delete(stamp + 10**6 * np.array([-9 * (k == 100) for k in range(len(stamp))]), [0, 300, 301, 399])
+    expected = np.delete(
+        stamp + 10**6 * np.array([-9 * (k == 100) for k in range(len(stamp))]),
+        [0, 300, 301, 399],
+    )
     assert sorted(found["/imu_1"][0]) == sorted(UTC + (expected - FIX) * 1000)
-    assert [line.partition(": ")[2] for line in damage] == ["samples with impossible times were left out"]
+    assert [line.partition(": ")[2] for line in damage] == [
+        "samples with impossible times were left out"
+    ]
 
 
 @EITHER
 def test_a_log_gives_the_verdicts_of_the_bag_made_of_it(tmp_path, kind, fdi):
-    path, config = log(tmp_path, kind, units(seconds=20.0, apart=700)), tmp_path / "made.yaml"
+    path, config = (
+        log(tmp_path, kind, units(seconds=20.0, apart=700)),
+        tmp_path / "made.yaml",
+    )
     assert fdi("inspect", path, "--write", config, "--quiet").code == 0
     assert Config.from_file(config).topics == ("/imu_0", "/imu_1", "/imu_2")
     assert fdi("convert", path, "--output", tmp_path / "converted", "--quiet").code == 0
-    found, words = [], ["--config", config, "--fault", "channel=imu_2.y kind=bias size=0.3 start=12", "--json", "-"]
+    found, words = (
+        [],
+        [
+            "--config",
+            config,
+            "--fault",
+            "channel=imu_2.y kind=bias size=0.3 start=12",
+            "--json",
+            "-",
+        ],
+    )
     for one in (path, tmp_path / "converted"):
         figures = json.loads(fdi("replay", one, *words, "--quiet").out)
         assert figures["faults"][0]["isolated"]
         assert figures["declared"] == []
-        found.append({key: value for key, value in figures.items() if key not in ("bag", "seconds", "us_per_sample")})
+        found.append(
+            {
+                key: value
+                for key, value in figures.items()
+                if key not in ("bag", "seconds", "us_per_sample")
+            }
+        )
     assert found[0] == found[1]
 
 
@@ -285,7 +397,9 @@ def thinned(unit, kept):
         (slice(1), "has too few samples to judge its rate (1)"),
     ],
 )
-def test_a_unit_that_is_logged_slowly_or_hardly_is_left_out(tmp_path, kind, kept, words):
+def test_a_unit_that_is_logged_slowly_or_hardly_is_left_out(
+    tmp_path, kind, kept, words
+):
     made = units(seconds=8.0)
     made[1] = thinned(made[1], kept)
     path = log(tmp_path, kind, made)
@@ -300,18 +414,27 @@ def test_a_sensor_logged_twice_is_read_once(tmp_path):
     path = tmp_path / "both.bin"
     path.write_bytes(raw + log(tmp_path, "IMU", units(3, seconds=8.0)).read_bytes())
     found, _ = messages(path)
-    assert {name: len(one[0]) for name, one in found.items()} == {"/imu_0": 1600, "/imu_1": 1600, "/imu_2": 1600}
+    assert {name: len(one[0]) for name, one in found.items()} == {
+        "/imu_0": 1600,
+        "/imu_1": 1600,
+        "/imu_2": 1600,
+    }
 
 
 def filtered(unit):
     """What is logged of the same samples behind a filter."""
-    rate = np.stack([np.convolve(axis, np.full(5, 0.2))[: len(axis)] for axis in unit.rate.T], axis=1)
+    rate = np.stack(
+        [np.convolve(axis, np.full(5, 0.2))[: len(axis)] for axis in unit.rate.T],
+        axis=1,
+    )
     return type(unit)(unit.stamp, rate.astype("f4"), unit.acceleration)
 
 
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("apart", [0, 137])
-def test_a_sensor_logged_before_and_after_its_filters_is_read_once(tmp_path, count, apart):
+def test_a_sensor_logged_before_and_after_its_filters_is_read_once(
+    tmp_path, count, apart
+):
     """Without IMU, which has the number of sensors; also if all are sampled at once, as in a simulation."""
     made = units(count, seconds=8.0, apart=apart)
     path = log(tmp_path, "GYR", [*made, *map(filtered, made)])
@@ -323,7 +446,10 @@ def test_a_sensor_logged_before_and_after_its_filters_is_read_once(tmp_path, cou
     found, damage = messages(path)
     assert list(found) == [f"/imu_{k}" for k in range(count)]
     assert (found[f"/imu_{count - 1}"][1][-500:] == made[-1].rate[-500:] * FLU).all()
-    words = [f"log.BIN: GYR {count + k} has the times of GYR {k}: taken for the same sensor" for k in range(count)]
+    words = [
+        f"log.BIN: GYR {count + k} has the times of GYR {k}: taken for the same sensor"
+        for k in range(count)
+    ]
     assert [line[: len(words[0])] for line in damage] == words
 
 
@@ -338,15 +464,25 @@ def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
     second = log(tmp_path, kind, units(seconds=20.0, start=7.0, seed=1)).read_bytes()
     path.write_bytes(data + second)
     found, damage = messages(path)
-    assert {name: sent for name, (_, _, sent) in found.items()} == {name: sent for name, (_, _, sent) in whole.items()}
+    assert {name: sent for name, (_, _, sent) in found.items()} == {
+        name: sent for name, (_, _, sent) in whole.items()
+    }
     (line,) = damage
-    assert ("the time steps back" if KINDS[kind][1] is write_dataflash else "a second log begins") in line
+    assert (
+        "the time steps back"
+        if KINDS[kind][1] is write_dataflash
+        else "a second log begins"
+    ) in line
     assert f" at byte {len(data)}" in line
     assert f"the {len(second)} bytes" in line
 
 
 @pytest.mark.parametrize(
-    ("kind", "setting"), [("IMU", "ArduPilot: LOG_BITMASK bit 18, Fast IMU"), ("sensor_gyro", "logger_topics.txt")]
+    ("kind", "setting"),
+    [
+        ("IMU", "ArduPilot: LOG_BITMASK bit 18, Fast IMU"),
+        ("sensor_gyro", "logger_topics.txt"),
+    ],
 )
 @pytest.mark.parametrize(
     ("rate", "kept", "words"),
@@ -354,12 +490,24 @@ def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
         (100.0, slice(2), "at 100 Hz, 2 samples; needed: two IMUs"),
         (100.0, slice(9), "at 100 Hz, 9 samples; needed: two IMUs"),
         (100.0, slice(1), "once; needed: two IMUs"),
-        (18.0, slice(None), "at 18 Hz; needed: two IMUs or more, each by itself, at 20 Hz or more"),
+        (
+            18.0,
+            slice(None),
+            "at 18 Hz; needed: two IMUs or more, each by itself, at 20 Hz or more",
+        ),
         (100.0, np.arange(800) % 20 < 2, "at 10.1 Hz; needed: two IMUs"),
     ],
 )
-def test_why_a_log_is_refused_and_the_setting_that_helps(tmp_path, kind, setting, rate, kept, words):
-    said = refusal(log(tmp_path, kind, [thinned(unit, kept) for unit in units(seconds=8.0, rate=rate)]))
+def test_why_a_log_is_refused_and_the_setting_that_helps(
+    tmp_path, kind, setting, rate, kept, words
+):
+    said = refusal(
+        log(
+            tmp_path,
+            kind,
+            [thinned(unit, kept) for unit in units(seconds=8.0, rate=rate)],
+        )
+    )
     assert f"has {kind} of 3 IMUs {words}" in said
     assert setting in said
     assert 'docs/flight_logs.md, "Settings of the logger"' in said
@@ -385,7 +533,12 @@ LACKS = "which is not read (its format lacks a field"
         ("vehicle_imu", b"float[3] delta_angle;", b"float[9] delta_angle;", LACKS),
         ("vehicle_imu", b"float[3] delta_angle;", b"float[99999] delta__;", LACKS),
         ("sensor_gyro", b"uint8_t[3] clip", b"nested_[3] clip", LACKS),
-        ("sensor_gyro", b"(\0B" + bytes(9), b"(\0B" + bytes(8) + b"\2", "is a ULog of a later version"),
+        (
+            "sensor_gyro",
+            b"(\0B" + bytes(9),
+            b"(\0B" + bytes(8) + b"\2",
+            "is a ULog of a later version",
+        ),
     ],
 )
 def test_a_topic_of_another_form_is_not_read(tmp_path, kind, before, after, words):
@@ -401,25 +554,36 @@ def test_a_topic_of_another_form_is_not_read(tmp_path, kind, before, after, word
     [
         {"part": "uint16_t[3] a;inner b;float c;", "inner": "uint8_t[2] a;part b;"},
         {"part": "inner[999] a;", "inner": "inne_[999] a;", "inne_": "uint8_t[999] a;"},
-        {"part": "l0 a;"} | {f"l{k}": f"l{k + 1} a;" for k in range(1500)} | {"l1500": "uint8_t[16] a;"},
+        {"part": "l0 a;"}
+        | {f"l{k}": f"l{k + 1} a;" for k in range(1500)}
+        | {"l1500": "uint8_t[16] a;"},
     ],
     ids=["within itself", "too large", "too deep"],
 )
 def test_formats_that_nest_without_end_are_refused(tmp_path, nested, monkeypatch):
-    form = logs.ULOG_FORMATS["sensor_gyro"].replace("float x;", "part[2] parts;float x;")
+    form = logs.ULOG_FORMATS["sensor_gyro"].replace(
+        "float x;", "part[2] parts;float x;"
+    )
     for name, text in {"sensor_gyro": form, **nested}.items():
         monkeypatch.setitem(logs.ULOG_FORMATS, name, text)
     monkeypatch.setitem(logs.ULOG_TYPES, "part", "V16")
-    assert "defines a message of more than 1000 fields" in refusal(log(tmp_path, "sensor_gyro"))
+    assert "defines a message of more than 1000 fields" in refusal(
+        log(tmp_path, "sensor_gyro")
+    )
 
 
 def test_instances_without_end_are_no_instances(tmp_path):
     """Each would be a topic."""
     size, path = 30_000, tmp_path / "log.bin"
     message = (70, "QQfff", "TimeUS,I,GyrX,GyrY,GyrZ")
-    records = logs.records(message, size, TimeUS=1000 * np.arange(size), I=np.arange(size))
+    records = logs.records(
+        message, size, TimeUS=1000 * np.arange(size), I=np.arange(size)
+    )
     path.write_bytes(format_record(70, "IMU", *message[1:]) + records.tobytes())
-    assert "this autopilot logged one IMU (IMU of 1 IMU at 1e+03 Hz): nothing to compare it with" in refusal(path)
+    assert (
+        "this autopilot logged one IMU (IMU of 1 IMU at 1e+03 Hz): nothing to compare it with"
+        in refusal(path)
+    )
 
 
 @pytest.mark.parametrize(
@@ -429,9 +593,21 @@ def test_instances_without_end_are_no_instances(tmp_path):
         ("a.bin", b"ULog\x01\x12\x35", "is no log of ArduPilot: it starts with b'UL'"),
         ("a.ulg", b"\xa3\x95\x80" * 9, "is no log of PX4"),
         ("a.ulg", logs.ULOG_HEAD + bytes(4), "Header too short"),
-        ("a.bin", b"\xa3\x95\x80" * 900, "has no IMU or GYR or IMT, it has 1 unknown: "),
-        ("a.ulg", b"ULog\x01\x12\x35" + b"Z" * 900, "has no vehicle_imu or sensor_gyro or sensor_gyro_fifo, it has"),
-        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"),
+        (
+            "a.bin",
+            b"\xa3\x95\x80" * 900,
+            "has no IMU or GYR or IMT, it has 1 unknown: ",
+        ),
+        (
+            "a.ulg",
+            b"ULog\x01\x12\x35" + b"Z" * 900,
+            "has no vehicle_imu or sensor_gyro or sensor_gyro_fifo, it has",
+        ),
+        (
+            "a.log",
+            b"FMT, 128",
+            "expected a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file",
+        ),
     ],
 )
 def test_what_is_no_log_is_refused(tmp_path, name, content, words):
@@ -453,7 +629,9 @@ def test_a_log_that_a_library_reads_needs_it_and_has_a_bound(
     path = write(tmp_path / name)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, library, None)
-        with pytest.raises(FdiError, match=rf"needs {library}: pip install .*{library}$"):
+        with pytest.raises(
+            FdiError, match=rf"needs {library}: pip install .*{library}$"
+        ):
             Recording(path)
     os.truncate(path, 300 << 20)
     words = f"{name} has 300 MB, expected at most {bound}: such a log is read whole"
@@ -499,7 +677,9 @@ def test_a_default_log_shows_a_bias_and_no_more_than_that_is_said(tmp_path, fdi)
     for faulty in (False, True):
         made[1].rate[300:, 1] += 0.1 * faulty
         path = log(tmp_path, "vehicle_imu_status", made)
-        assert "A COARSE CHECK" in fdi("inspect", path, "--output", config, "--force").out
+        assert (
+            "A COARSE CHECK" in fdi("inspect", path, "--output", config, "--force").out
+        )
         check = "imu_1.y faulty" if faulty else "declared=0"
         replayed = fdi("replay", path, "--config", config, "--check", check)
         assert replayed.code == 0, replayed

@@ -56,7 +56,9 @@ def test_every_make_of_recording_gives_the_same_samples(make, tmp_path):
     np.testing.assert_array_equal(values, z)
     assert samples.progress == pytest.approx(1, abs=0.1)
     assert samples.recording.damage.report() == (
-        ("there is no metadata.yaml: the recording was cut off, the files were read without it",)
+        (
+            "there is no metadata.yaml: the recording was cut off, the files were read without it",
+        )
         if "three" in make
         else ()
     )
@@ -68,7 +70,9 @@ def test_messages_out_of_order_and_of_other_topics_do_not_matter(make, tmp_path)
     noise = [("/other", log_time, messages[0][2]) for _, log_time, _ in messages[::7]]
     mixed = sorted(messages + noise, key=lambda message: message[1])
     late = np.random.default_rng(1).uniform(0, 200, len(mixed))
-    path = MAKES[make](tmp_path / "bag", [mixed[i] for i in np.argsort(np.arange(len(mixed)) + late)])
+    path = MAKES[make](
+        tmp_path / "bag", [mixed[i] for i in np.argsort(np.arange(len(mixed)) + late)]
+    )
     stamp, values, _ = read(path)
     np.testing.assert_array_equal(stamp, STAMP)
     np.testing.assert_array_equal(values, z)
@@ -79,7 +83,9 @@ def test_messages_out_of_order_and_of_other_topics_do_not_matter(make, tmp_path)
 
 def test_a_part_is_read_by_seconds_from_the_first_message(tmp_path):
     messages, z = flight(SAMPLES)
-    stamp, values, samples = read(write_mcap(tmp_path / "bag.mcap", messages), start=1.0, end=2.0)
+    stamp, values, samples = read(
+        write_mcap(tmp_path / "bag.mcap", messages), start=1.0, end=2.0
+    )
     assert samples.origin == START
     np.testing.assert_array_equal(stamp, STAMP[100:200])
     np.testing.assert_array_equal(values, z[100:200])
@@ -88,12 +94,17 @@ def test_a_part_is_read_by_seconds_from_the_first_message(tmp_path):
 def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     z = np.random.default_rng(0).normal(size=(50, 6))
     times = START + np.array([0, 0, 0, *range(3, 50)]) * STEP
-    messages = [("/gyro_channels", int(t), array(list(row), ["a"])) for t, row in zip(times, z, strict=True)]
+    messages = [
+        ("/gyro_channels", int(t), array(list(row), ["a"]))
+        for t, row in zip(times, z, strict=True)
+    ]
     messages.insert(20, ("/gyro_channels", messages[20][1], array([1.0] * 5)))
     path = write_mcap(tmp_path / "bag.mcap", messages, types={"/gyro_channels": ARRAY})
     stamp, values, samples = read(path, Config())
     np.testing.assert_array_equal(values, z)
-    np.testing.assert_array_equal(stamp[:4], [START, START + 1, START + 2, START + 3 * STEP])
+    np.testing.assert_array_equal(
+        stamp[:4], [START, START + 1, START + 2, START + 3 * STEP]
+    )
     assert samples.malformed == {"gyro_channels": 1}
 
 
@@ -114,14 +125,25 @@ def with_an_empty_file(path, z):
 @pytest.mark.parametrize(
     ("make", "damage", "least", "most", "words"),
     [
-        *((make, cut_off, 90, 209, "breaks off in the record at byte") for make in ("zstd chunks", "lz4 chunks")),
+        *(
+            (make, cut_off, 90, 209, "breaks off in the record at byte")
+            for make in ("zstd chunks", "lz4 chunks")
+        ),
         ("plain chunks", cut_off, 90, 209, "breaks off in the record at byte"),
-        ("plain chunks", with_a_flipped_bit, 240, 299, "fails its checksum and was left out"),
+        (
+            "plain chunks",
+            with_a_flipped_bit,
+            240,
+            299,
+            "fails its checksum and was left out",
+        ),
         # After the gap the aligner wants to see a second message before it believes the first.
         ("three mcap files", with_an_empty_file, 198, 200, "bag_9.mcap is empty"),
     ],
 )
-def test_what_is_damaged_is_left_out_and_said(make, damage, least, most, words, tmp_path):
+def test_what_is_damaged_is_left_out_and_said(
+    make, damage, least, most, words, tmp_path
+):
     messages, z = flight(SAMPLES)
     path = MAKES[make](tmp_path / "bag", messages)
     damage(path, z)
@@ -142,7 +164,10 @@ def contents(folder):
 def crashed(tmp_path):
     """A database being written, what it holds, and what copies it as a recorder that loses its power leaves it."""
     messages, z = flight(SAMPLES)
-    folder, written = tmp_path / "crashed", write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3) / "bag.db3"
+    folder, written = (
+        tmp_path / "crashed",
+        write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3) / "bag.db3",
+    )
     folder.mkdir()
 
     def crash(end):
@@ -154,10 +179,14 @@ def crashed(tmp_path):
         yield base, z, crash
 
 
-def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(crashed, tmp_path, monkeypatch):
+def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(
+    crashed, tmp_path, monkeypatch
+):
     base, z, crash = crashed
     base.execute("PRAGMA journal_mode = WAL")
-    rows = list(base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (SAMPLES,)))
+    rows = list(
+        base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (SAMPLES,))
+    )
     base.execute("DELETE FROM messages WHERE id > ?", (SAMPLES,))
     base.commit()
     base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -177,7 +206,9 @@ def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(
     assert samples.recording.damage.report() == ()
 
 
-def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_left_there(crashed):
+def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_left_there(
+    crashed,
+):
     base, _, crash = crashed
     base.execute("PRAGMA cache_size = 1")
     base.execute("PRAGMA journal_mode = DELETE")
@@ -187,12 +218,16 @@ def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_le
     _, values, samples = read(folder / "bag.db3")
     assert len(values) > SAMPLES // 2
     assert contents(folder) == before
-    assert "its last transaction was not finished" in samples.recording.damage.report()[0]
+    assert (
+        "its last transaction was not finished" in samples.recording.damage.report()[0]
+    )
 
 
 def pointer(path):
     """What git has in the place of a large file."""
-    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 99\n")
+    path.write_text(
+        f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 99\n"
+    )
     return path
 
 
@@ -204,21 +239,55 @@ def unindexed(path):
     return path
 
 
-LOST = ("log.bin", "log.BIN", "log.ulg", "log.tlog", "log.csv", "bag.bag", "bag.mcap", "bag.db3")
+LOST = (
+    "log.bin",
+    "log.BIN",
+    "log.ulg",
+    "log.tlog",
+    "log.csv",
+    "bag.bag",
+    "bag.mcap",
+    "bag.db3",
+)
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda p: p / "none", "no recording at"),
-        (lambda p: (p / "bag.txt").write_text("x") and p / "bag.txt", "is not a recording"),
+        (
+            lambda p: (p / "bag.txt").write_text("x") and p / "bag.txt",
+            "is not a recording",
+        ),
         (lambda p: (p / "bag.mcap").touch() or p / "bag.mcap", "is empty"),
-        (lambda p: (p / "bag.mcap").write_bytes(b"#ROSBAG V2.0\n") and p / "bag.mcap", "is not an MCAP file"),
-        (lambda p: (p / "bag.db3").write_bytes(b"x" * 999) and p / "bag.db3", "is not a readable rosbag2 database"),
+        (
+            lambda p: (
+                (p / "bag.mcap").write_bytes(b"#ROSBAG V2.0\n") and p / "bag.mcap"
+            ),
+            "is not an MCAP file",
+        ),
+        (
+            lambda p: (p / "bag.db3").write_bytes(b"x" * 999) and p / "bag.db3",
+            "is not a readable rosbag2 database",
+        ),
         (lambda p: p, "is a folder without .mcap or .db3 files"),
-        (lambda p: (p / "bag.bag").write_bytes(b"#ROSBAG V1.2\n" * 9) and p / "bag.bag", "is not a bag of ROS 1"),
-        (lambda p: unindexed(p / "bag.bag"), "has no index, its recording was cut off: run rosbag reindex"),
-        *((lambda p, s=s: pointer(p / s), "is a git-lfs pointer, not the recording: run git lfs pull") for s in LOST),
+        (
+            lambda p: (
+                (p / "bag.bag").write_bytes(b"#ROSBAG V1.2\n" * 9) and p / "bag.bag"
+            ),
+            "is not a bag of ROS 1",
+        ),
+        (
+            lambda p: unindexed(p / "bag.bag"),
+            "has no index, its recording was cut off: run rosbag reindex",
+        ),
+        *(
+            (
+                lambda p, s=s: pointer(p / s),
+                "is a git-lfs pointer, not the recording: run git lfs pull",
+            )
+            for s in LOST
+        ),
     ],
 )
 def test_what_is_no_recording_is_refused_in_one_line(make, words, tmp_path):
@@ -230,7 +299,10 @@ def test_what_is_no_recording_is_refused_in_one_line(make, words, tmp_path):
 def test_a_topic_of_another_type_is_refused(tmp_path):
     messages, _ = flight(10)
     path = write_mcap(tmp_path / "bag.mcap", messages, types={TOPICS[0]: ARRAY})
-    with pytest.raises(BagError, match=r"is std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/Imu"):
+    with pytest.raises(
+        BagError,
+        match=r"is std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/Imu",
+    ):
         read(path)
 
 
@@ -239,12 +311,17 @@ def test_the_rate_of_samples_is_told_in_spite_of_losses_bursts_and_gaps():
     random = np.random.default_rng(0)
     lossy = regular[random.random(2000) > 0.15]
     # Two by two, and a pause of an hour.
-    bursts, pause = regular - STEP // 2 * (np.arange(2000) % 2), regular + 3600 * 10**9 * (np.arange(2000) > 1000)
+    bursts, pause = (
+        regular - STEP // 2 * (np.arange(2000) % 2),
+        regular + 3600 * 10**9 * (np.arange(2000) > 1000),
+    )
     for stamp in (regular, lossy, bursts, pause):
         for configured in (100.0, 90.0, 110.0):
             check_sample_rate("bag", stamp, configured)
         for configured in (25.0, 400.0):
-            with pytest.raises(BagError, match=rf"bag: sample_rate is {configured:g} Hz in the config"):
+            with pytest.raises(
+                BagError, match=rf"bag: sample_rate is {configured:g} Hz in the config"
+            ):
                 check_sample_rate("bag", stamp, configured)
     check_sample_rate("bag", regular[:50], 1.0)
 
@@ -257,7 +334,9 @@ def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi, refused):
     messages, z = flight(SAMPLES)
     others = [("/text", log_time, b"\1\0\0\0x") for _, log_time, _ in messages[::9]]
     mixed = sorted(messages + others, key=lambda m: m[1])
-    path = write_ros1(tmp_path / "bag.bag", mixed, types={"/text": "std_msgs/msg/String"})
+    path = write_ros1(
+        tmp_path / "bag.bag", mixed, types={"/text": "std_msgs/msg/String"}
+    )
     words, out = ["convert", path, "--output", tmp_path / "out"], tmp_path / "out"
     assert fdi(*words).out.startswith(f"{TOPICS[0]}: 300 messages\n")
     for recording in (path, out):
@@ -266,17 +345,27 @@ def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi, refused):
         np.testing.assert_array_equal(stamp, STAMP)
         assert samples.recording.damage.report() == ()
         with Recording(recording) as opened:
-            assert ("/text" in [topic.name for topic in opened.topics]) == (recording == path)
-            sent = [batch.message(k) for batch in opened.batches([TOPICS[0]]) for k in range(len(batch))]
+            assert ("/text" in [topic.name for topic in opened.topics]) == (
+                recording == path
+            )
+            sent = [
+                batch.message(k)
+                for batch in opened.batches([TOPICS[0]])
+                for k in range(len(batch))
+            ]
         assert sent == [data for topic, _, data in messages if topic == TOPICS[0]]
     assert "--force" in refused(*words)
     assert fdi(*words, "--force", "--quiet").code == 0
     bag = write_bag(tmp_path / "bag", messages)
-    assert "holds more than a recording made by fdi" in refused("convert", out, "--output", bag, "--force")
+    assert "holds more than a recording made by fdi" in refused(
+        "convert", out, "--output", bag, "--force"
+    )
 
 
 def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
-    path = write_ros1(tmp_path / "bag.bag", flight(20)[0], Ros1Writer.CompressionFormat.BZ2)
+    path = write_ros1(
+        tmp_path / "bag.bag", flight(20)[0], Ros1Writer.CompressionFormat.BZ2
+    )
     data = path.read_bytes()
     at = data.index(b"BZh")
     size = struct.unpack_from("<I", data, at - 4)[0]
@@ -284,7 +373,10 @@ def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
     bomb = b"".join([*map(packer.compress, [bytes(1 << 20)] * 256), packer.flush()])
     assert len(bomb) <= size
     path.write_bytes(data[:at] + bomb + bytes(size - len(bomb)) + data[at + size :])
-    with bounded(growth=250_000), pytest.raises(BagError, match="has no usable message on"):
+    with (
+        bounded(growth=250_000),
+        pytest.raises(BagError, match="has no usable message on"),
+    ):
         read(path)
 
 
@@ -295,6 +387,11 @@ def test_an_index_without_end_is_refused(tmp_path):
     at = data.index(b"chunk_count=") + 12
     last = data[-124:]
     assert last[8:12] == b"op=\6"
-    path.write_bytes(data[:at] + struct.pack("<I", 10_000) + data[at + 4 :] + last * 10_000)
-    with pytest.raises(BagError, match="its index, or a part of it, is larger than that of any recorder"):
+    path.write_bytes(
+        data[:at] + struct.pack("<I", 10_000) + data[at + 4 :] + last * 10_000
+    )
+    with pytest.raises(
+        BagError,
+        match="its index, or a part of it, is larger than that of any recorder",
+    ):
         Recording(path)

@@ -34,9 +34,14 @@ def written(path, data):
 @pytest.mark.parametrize("stack", ["px4", "ardupilot"])
 def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, version):
     rates = {**SCALED, 27: 10.0, 105: 10.0}
-    path = written(tmp_path / "FLIGHT.TLOG", telemetry(Autopilot(stack, rates=rates), version=version))
+    path = written(
+        tmp_path / "FLIGHT.TLOG",
+        telemetry(Autopilot(stack, rates=rates), version=version),
+    )
     with Recording(path) as recording:
-        assert [(topic.name, topic.count) for topic in recording.topics] == [(f"/imu_{k}", 300) for k in range(3)]
+        assert [(topic.name, topic.count) for topic in recording.topics] == [
+            (f"/imu_{k}", 300) for k in range(3)
+        ]
         assert not recording.damage
     theirs, late = {"SCALED_IMU": [], "SCALED_IMU2": [], "SCALED_IMU3": []}, []
     with contextlib.closing(mavutil.mavlink_connection(str(path))) as log:
@@ -44,34 +49,50 @@ def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, versio
             theirs[message.get_type()].append(message)
     for number, sent in enumerate(theirs.values()):
         found = messages(path, f"/imu_{number}")
-        assert (np.diff(list(found)) == np.diff([one.time_boot_ms for one in sent]) * 1_000_000).all()
-        expected = [(1e-3 * one.xgyro, -1e-3 * one.ygyro, -1e-3 * one.zgyro) for one in sent]
+        assert (
+            np.diff(list(found))
+            == np.diff([one.time_boot_ms for one in sent]) * 1_000_000
+        ).all()
+        expected = [
+            (1e-3 * one.xgyro, -1e-3 * one.ygyro, -1e-3 * one.zgyro) for one in sent
+        ]
         np.testing.assert_allclose(list(found.values()), expected, atol=1e-12)
-        late += [one._timestamp - stamp / 1e9 for one, stamp in zip(sent, found, strict=True)]
+        late += [
+            one._timestamp - stamp / 1e9 for one, stamp in zip(sent, found, strict=True)
+        ]
     # UTC is that of the least delayed message of all.
     assert -1e-6 <= min(late) < 1e-6
     assert max(late) < 0.012
 
 
 def test_of_two_vehicles_the_first_is_read(tmp_path):
-    one, other = Autopilot("px4", rates=SCALED, system=5), Autopilot("ardupilot", rates=SCALED, system=9, seed=4)
+    one, other = (
+        Autopilot("px4", rates=SCALED, system=5),
+        Autopilot("ardupilot", rates=SCALED, system=9, seed=4),
+    )
     alone = Autopilot("px4", rates=SCALED, system=5)
     mixed, alone = (
-        messages(written(tmp_path / "a.tlog", telemetry(*some)), "/imu_1") for some in ((one, other), (alone,))
+        messages(written(tmp_path / "a.tlog", telemetry(*some)), "/imu_1")
+        for some in ((one, other), (alone,))
     )
     assert list(mixed.values()) == list(alone.values())
 
 
 def test_what_has_no_two_imus_is_refused(tmp_path):
     """Ten a second are enough, two are not; nor raw counts, which of autopilots other than ArduPilot are no rates."""
-    path = written(tmp_path / "a.tlog", telemetry(Autopilot(rates=dict.fromkeys(SCALED, 10.0))))
+    path = written(
+        tmp_path / "a.tlog", telemetry(Autopilot(rates=dict.fromkeys(SCALED, 10.0)))
+    )
     assert len(messages(path, "/imu_2")) == 60
     slow = telemetry(Autopilot(rates=dict.fromkeys(SCALED, 2.0)), seconds=20.0)
     one = Autopilot("ardupilot", rates={27: 50.0}, units=1)
     raw = telemetry(one)
     beat = bytes(one.mav.heartbeat_encode(2, 4, 0, 0, 4).pack(one.mav))
     for data, words in (
-        (slow, r"at 2 Hz; needed: two IMUs .* at 5 Hz or more, .* ArduPilot: SRn_RAW_SENS"),
+        (
+            slow,
+            r"at 2 Hz; needed: two IMUs .* at 5 Hz or more, .* ArduPilot: SRn_RAW_SENS",
+        ),
         (raw, "this autopilot sent one IMU"),
         (struct.pack(">Q", UTC // 1000) + beat + raw, "has no SCALED_IMU"),
         (telemetry(Autopilot()), "has no SCALED_IMU"),
@@ -83,7 +104,10 @@ def test_what_has_no_two_imus_is_refused(tmp_path):
 
 def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path):
     """What its ground stations ask for (RAW_SENS) is RAW_IMU, SCALED_IMU2 and SCALED_IMU3."""
-    path = written(tmp_path / "a.tlog", telemetry(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)))
+    path = written(
+        tmp_path / "a.tlog",
+        telemetry(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)),
+    )
     first, second = messages(path, "/imu_0"), messages(path, "/imu_1")
     assert len(first) == len(second) == 300
     assert np.abs(np.array(list(first.values())) - list(second.values())).max() < 0.02
@@ -94,7 +118,11 @@ LOG = telemetry(Autopilot("px4", rates=SCALED), seconds=3.0)
 
 @settings(max_examples=60)
 @given(
-    places=st.lists(st.tuples(st.integers(0, len(LOG) - 1), st.binary(max_size=40)), min_size=1, max_size=6),
+    places=st.lists(
+        st.tuples(st.integers(0, len(LOG) - 1), st.binary(max_size=40)),
+        min_size=1,
+        max_size=6,
+    ),
     cut=st.integers(0, len(LOG) // 4),
 )
 def test_damage_is_read_around(tmp_path_factory, places, cut):

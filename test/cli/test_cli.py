@@ -45,17 +45,31 @@ UNTOLD = 4
 FAULT = "channel=g2 kind=bias size=0.2 start=20"
 
 
-def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sample(tmp_path, replay):
-    code, out, err = replay("--fault", FAULT, "--json", tmp_path / "s.json", "--csv", tmp_path / "s.csv")
+def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sample(
+    tmp_path, replay
+):
+    code, out, err = replay(
+        "--fault", FAULT, "--json", tmp_path / "s.json", "--csv", tmp_path / "s.csv"
+    )
     assert (code, err) == (0, "")
     assert "\r" not in out
-    assert out.startswith("1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated")
-    assert re.search(r"^  1\. g2 FAULTY from 20\.[01]\d\d s \([+]0\.20", out, re.MULTILINE)
+    assert out.startswith(
+        "1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated"
+    )
+    assert re.search(
+        r"^  1\. g2 FAULTY from 20\.[01]\d\d s \([+]0\.20", out, re.MULTILINE
+    )
     assert "\n       injected there: bias on g2\n" in out
-    assert json.loads((tmp_path / "s.json").read_text())["faults"][0]["declared_channels"] == ["g2"]
+    assert json.loads((tmp_path / "s.json").read_text())["faults"][0][
+        "declared_channels"
+    ] == ["g2"]
     rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
     assert len(rows) == 6001
-    assert (rows[0]["rate_x"], rows[0]["g1.state"], rows[999]["g1.state"]) == ("", "UNCHECKED", "OK")
+    assert (rows[0]["rate_x"], rows[0]["g1.state"], rows[999]["g1.state"]) == (
+        "",
+        "UNCHECKED",
+        "OK",
+    )
     assert abs(float(rows[999]["g1"])) < 4
     assert sorted(os.listdir(tmp_path)) == ["s.csv", "s.json"]
 
@@ -63,30 +77,58 @@ def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sampl
 def test_a_check_that_is_not_met_is_exit_code_1_with_the_reasons(tmp_path, replay):
     sound = tmp_path / "s.json"
     words = ("--end", 24, "--fault", FAULT, "--json", sound)
-    code, out, err = replay(*words, "--check", "delay<1 isolated, false = 0 judged>=0.8")
+    code, out, err = replay(
+        *words, "--check", "delay<1 isolated, false = 0 judged>=0.8"
+    )
     assert (code, err) == (0, "")
     assert out.endswith("check met: delay<1 isolated, false = 0 judged>=0.8\n")
     delay = json.loads(sound.read_text())["faults"][0]["delay_s"]
-    code, out, err = replay(*words, "--force", "--quiet", "--check", "delay<0.001 detected isolated<=0.01 judged>0.99")
+    code, out, err = replay(
+        *words,
+        "--force",
+        "--quiet",
+        "--check",
+        "delay<0.001 detected isolated<=0.01 judged>0.99",
+    )
     assert (code, out) == (1, "")
-    assert f"fdi: check not met: delay<0.001: bias on g2: detected after {delay:.3f} s\n" in err
+    assert (
+        f"fdi: check not met: delay<0.001: bias on g2: detected after {delay:.3f} s\n"
+        in err
+    )
     assert "judged>0.99: 2100 of 2400 samples were judged, 0.8750" in err
     told = json.loads(sound.read_text())["check"]
-    assert told["required"] == ["delay<0.001", "detected", "isolated<=0.01", "judged>0.99"]
+    assert told["required"] == [
+        "delay<0.001",
+        "detected",
+        "isolated<=0.01",
+        "judged>0.99",
+    ]
     assert [f"fdi: check not met: {line}" for line in told["unmet"]] == err.splitlines()
 
 
-def test_a_missed_fault_and_a_false_declaration_fail_the_check(fdi, flight, config, tmp_path, replay):
+def test_a_missed_fault_and_a_false_declaration_fail_the_check(
+    fdi, flight, config, tmp_path, replay
+):
     words = ("--end", 30, "--check", "detected isolated<9 false=0")
     code, _, err = replay(*words, "--fault", "channel=g2 kind=bias size=1e-5 start=20")
     assert code == 1
-    unmet = [f"fdi: check not met: {one}: bias on g2: not detected" for one in ("detected", "isolated<9")]
+    unmet = [
+        f"fdi: check not met: {one}: bias on g2: not detected"
+        for one in ("detected", "isolated<9")
+    ]
     assert err.splitlines() == unmet
     wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(config.read_text().replace("preset: two_triad_cone", "preset: dodecahedron"))
-    code, _, err = fdi("replay", flight, "--config", wrong, "--end", 30, "--check", "false<1")
+    wrong.write_text(
+        config.read_text().replace("preset: two_triad_cone", "preset: dodecahedron")
+    )
+    code, _, err = fdi(
+        "replay", flight, "--config", wrong, "--end", 30, "--check", "false<1"
+    )
     assert code == 1
-    assert re.match(r"fdi: check not met: false<1: \d+ declarations, of channels: g\d [A-Z]+ at ", err)
+    assert re.match(
+        r"fdi: check not met: false<1: \d+ declarations, of channels: g\d [A-Z]+ at ",
+        err,
+    )
 
 
 def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config, root):
@@ -97,14 +139,22 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
 
     # Faults of a scenario and of the command line add up.
     scenario = root / "config" / "scenarios" / "two_at_once.yaml"
-    both = ("--scenario", scenario, "--fault", "channel=g1 kind=noise size=0.2 start=50 seed=4")
+    both = (
+        "--scenario",
+        scenario,
+        "--fault",
+        "channel=g1 kind=noise size=0.2 start=50 seed=4",
+    )
     found = figures("replay", flight, "--config", config, *both)
     assert [fault["kind"] for fault in found["faults"]] == ["noise", "bias", "drift"]
     # In 5 s the biases are still being learned: what the gyros are cannot be told.
     figures("replay", flight, "--config", config, "--end", 5, code=UNTOLD)
     found = figures("inspect", flight)
     assert found["duration_s"] == pytest.approx(60, abs=0.02)
-    assert (found["start_ns"], found["start"]) == (1750000000000000000, "2025-06-15T15:06:40+00:00")
+    assert (found["start_ns"], found["start"]) == (
+        1750000000000000000,
+        "2025-06-15T15:06:40+00:00",
+    )
     assert found["size_bytes"] == sum(path.stat().st_size for path in flight.iterdir())
     assert [topic["messages"] for topic in found["topics"]] == [6001] * 3
     assert figures("shipped", config.name)["files"] == [str(config)]
@@ -114,10 +164,16 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
 
 
 @pytest.mark.parametrize("verb", ["replay", "sweep", "calibrate", "geometry", "fleet"])
-def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(verb, fdi, root, tmp_path, monkeypatch):
+def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(
+    verb, fdi, root, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "bad.yaml").write_text("/**: {ros__parameters: {noise: {noise_std: [-1.0]}}}")
-    (tmp_path / "good.yaml").write_text("/**: {ros__parameters: {noise: {noise_std: [0.002]}}}")
+    (tmp_path / "bad.yaml").write_text(
+        "/**: {ros__parameters: {noise: {noise_std: [-1.0]}}}"
+    )
+    (tmp_path / "good.yaml").write_text(
+        "/**: {ros__parameters: {noise: {noise_std: [0.002]}}}"
+    )
     bag = root / "bags" / "cone_flight"
     words = {
         "replay": ("--end", 5),
@@ -128,12 +184,19 @@ def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(verb, fdi
     }[verb]
 
     def called(*files):
-        given = files if verb == "geometry" else (bag, *(word for file in files for word in ("--config", file)))
+        given = (
+            files
+            if verb == "geometry"
+            else (bag, *(word for file in files for word in ("--config", file)))
+        )
         return fdi(verb, *given, *words, "--quiet")
 
     taken = f"fdi: no two_imus.yaml here, taking {root / 'config' / 'two_imus.yaml'}\n"
     code, _, said = called("two_imus.yaml", "good.yaml", "bad.yaml")
-    assert (code, said) == (2, f"{taken}fdi: noise.noise_std is -1 rad/s, expected 1e-09 to 10 rad/s\n")
+    assert (code, said) == (
+        2,
+        f"{taken}fdi: noise.noise_std is -1 rad/s, expected 1e-09 to 10 rad/s\n",
+    )
     code, _, said = called("two_imus.yaml", "bad.yaml", "good.yaml")
     assert (code, said) == (4 if verb == "replay" else 0, taken)
 
@@ -154,7 +217,9 @@ def test_a_sample_rate_that_is_far_from_the_recordings_is_refused_and_a_near_one
     fdi, refused, flight, config, tmp_path, configured
 ):
     wrong = tmp_path / "c.yaml"
-    wrong.write_text(config.read_text().replace("sample_rate: 100.0", f"sample_rate: {configured}"))
+    wrong.write_text(
+        config.read_text().replace("sample_rate: 100.0", f"sample_rate: {configured}")
+    )
     said = f"sample_rate is {configured:g} Hz in the config, the recording has 100 Hz"
     if configured == 115.0:
         words = ("replay", flight, "--config", wrong, "--end", 1)
@@ -163,8 +228,14 @@ def test_a_sample_rate_that_is_far_from_the_recordings_is_refused_and_a_near_one
         assert (code, out, err.count("\n")) == (0, "", 1)
         assert err.startswith(f"fdi: warning: {said}")
         return
-    for words in (["replay"], ["sweep"], ["calibrate", "--output", tmp_path / "out.yaml"]):
-        assert f"{said}: set sample_rate to 100" in refused(words[0], flight, "--config", wrong, *words[1:])
+    for words in (
+        ["replay"],
+        ["sweep"],
+        ["calibrate", "--output", tmp_path / "out.yaml"],
+    ):
+        assert f"{said}: set sample_rate to 100" in refused(
+            words[0], flight, "--config", wrong, *words[1:]
+        )
 
 
 COMPLETED = {
@@ -184,11 +255,21 @@ AT_EACH_KEY = "COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _shtab_fdi; echo ${COMPREP
 def test_bash_completes_verbs_options_files_and_detectors(capsys, tmp_path):
     with pytest.raises(SystemExit, match="0"):
         command_line.main(["--print-completion", "bash"])
-    for name, text in (("_fdi", capsys.readouterr().out), ("flight.mcap", ""), ("my.yaml", "")):
+    for name, text in (
+        ("_fdi", capsys.readouterr().out),
+        ("flight.mcap", ""),
+        ("my.yaml", ""),
+    ):
         (tmp_path / name).write_text(text)
-    command = ["bash", "-c", f"source ./_fdi; while read -ra COMP_WORDS; do {AT_EACH_KEY}; done"]
+    command = [
+        "bash",
+        "-c",
+        f"source ./_fdi; while read -ra COMP_WORDS; do {AT_EACH_KEY}; done",
+    ]
     typed = "".join(f"{words}\n" for words in COMPLETED)
-    done = subprocess.run(command, input=typed, capture_output=True, text=True, cwd=tmp_path, check=True)
+    done = subprocess.run(
+        command, input=typed, capture_output=True, text=True, cwd=tmp_path, check=True
+    )
     assert done.stdout.splitlines() == list(COMPLETED.values())
 
 
@@ -198,7 +279,10 @@ def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
     first, _, rest = out.partition("then:")
     for name in command_line.FIRST:
         assert command_line.VERBS[name].examples[0] in first
-    assert all((f"  {name} " in rest) != (name in command_line.FIRST) for name in command_line.VERBS)
+    assert all(
+        (f"  {name} " in rest) != (name in command_line.FIRST)
+        for name in command_line.VERBS
+    )
     for words, code, begin in (
         (["--help"], 0, "usage: fdi VERB"),
         (["--version"], 0, "fdi_ros "),
@@ -206,14 +290,19 @@ def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
     ):
         with pytest.raises(SystemExit) as ended:
             command_line.main(words)
-        assert (ended.value.code, capsys.readouterr().out[: len(begin)]) == (code, begin)
+        assert (ended.value.code, capsys.readouterr().out[: len(begin)]) == (
+            code,
+            begin,
+        )
 
 
 CHOICES = {
     "replay": [*DETECTORS, *FAULT_KINDS, "two_at_once.yaml"],
     "sweep": [*DETECTORS, *FAULT_KINDS],
     "compile": DETECTORS,
-    "montecarlo": [path.name for path in shipped_files() if path.parent.name == "studies"],
+    "montecarlo": [
+        path.name for path in shipped_files() if path.parent.name == "studies"
+    ],
     "fleet": ["none", "each"],
 }
 
@@ -234,7 +323,9 @@ def test_every_help_has_examples_that_can_be_typed_and_all_choices(capsys, verb)
 
 
 def test_compile_leaves_nothing_to_compile(fdi, refused):
-    code, out, err = fdi("compile", "--detector", "max_residual", "guaranteed", "--json", "-")
+    code, out, err = fdi(
+        "compile", "--detector", "max_residual", "guaranteed", "--json", "-"
+    )
     said, _, folder = err.rstrip("\n").rpartition(" in ")
     assert (code, said) == (0, "nothing to do: all is there,")
     figures = json.loads(out)
@@ -270,19 +361,36 @@ def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_pat
     here = [name for name in DETECTORS if name != "determinant"]
     used = [
         ["replay", flight, "--config", config, "--end", 21, "--fault", FAULT],
-        *(["replay", flight, "--config", config, "--end", 4, "--detector", name] for name in here),
+        *(
+            ["replay", flight, "--config", config, "--end", 4, "--detector", name]
+            for name in here
+        ),
         ["replay", flight, "--config", units, "--output", tmp_path / "bag"],
         ["setup", flight, "--output", out],
         ["inspect", flight],
         ["geometry", out],
-        ["sweep", flight, "--config", units, "--fault", "kind=bias size=0.1", "--end", 25],
+        [
+            "sweep",
+            flight,
+            "--config",
+            units,
+            "--fault",
+            "kind=bias size=0.1",
+            "--end",
+            25,
+        ],
         ["convert", flight, "--output", tmp_path / "converted"],
         ["inspect", logs.write_dataflash(tmp_path / "log.bin", logs.units())],
         ["inspect", logs.write_ulog(tmp_path / "log.ulg", logs.units())],
         ["inspect", logs.write_tlog(tmp_path / "log.tlog")],
     ]
     commands = repr([[str(word) for word in [*words, "--quiet"]] for words in used])
-    done = subprocess.run([sys.executable, "-c", NEW_FORMS, commands], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", NEW_FORMS, commands],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert (done.stdout, done.stderr) == ("set()\n", "")
 
 
@@ -290,7 +398,18 @@ def test_results_are_replaced_if_asked_for(tmp_path, refused, flight, config):
     there, bag, link = tmp_path / "s.json", tmp_path / "out", tmp_path / "link.json"
     there.write_text('{"generator": "fdi_ros"}')
     link.symlink_to(there)
-    words = ("replay", flight, "--config", config, "--end", 1, "--json", link, "--output", bag)
+    words = (
+        "replay",
+        flight,
+        "--config",
+        config,
+        "--end",
+        1,
+        "--json",
+        link,
+        "--output",
+        bag,
+    )
     assert refused(*words) == f"fdi: {link} exists already; --force overwrites it\n"
     assert there.read_text() == '{"generator": "fdi_ros"}'
     for _ in range(2):
@@ -311,10 +430,22 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
     [
         ("replay none --config CONFIG", "no recording at none"),
         ("replay empty.mcap --config CONFIG", "empty.mcap is empty"),
-        ("replay FLIGHT --config none.yaml", "cannot read config none.yaml: No such file or directory"),
-        ("replay FLIGHT --config THREE", "no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64"),
-        ("replay FLIGHT --config FIVE", "no usable message on: gyro_channels (6001 malformed, expected 5 values in"),
-        ("replay FLIGHT --config TYPO", "unknown parameter 'nosie.noise_std', did you mean 'noise.noise_std'"),
+        (
+            "replay FLIGHT --config none.yaml",
+            "cannot read config none.yaml: No such file or directory",
+        ),
+        (
+            "replay FLIGHT --config THREE",
+            "no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64",
+        ),
+        (
+            "replay FLIGHT --config FIVE",
+            "no usable message on: gyro_channels (6001 malformed, expected 5 values in",
+        ),
+        (
+            "replay FLIGHT --config TYPO",
+            "unknown parameter 'nosie.noise_std', did you mean 'noise.noise_std'",
+        ),
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
         (f"{REPLAY} --detector magic", "unknown detector 'magic', expected one of"),
@@ -322,23 +453,53 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         (f"{REPLAY} --start 9 --end 3", "expected 0 <= start < end"),
         (f"{REPLAY} --start 900", "has no usable message"),
         (f"{REPLAY} --json none/s.json", "there is no folder"),
-        (f"{SIGN} start=2'", "sign on g1 starts at 2 s, expected at least 3 s: until then the biases are learned"),
-        (f"{SIGN} start=32.5' --start 30", "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then"),
-        (f"{SIGN} start=9' --end 9", "sign on g1 starts at 9 s, expected at most 8.99 s: that is the last sample"),
-        (f"{REPLAY} --check 'false=0 dlay<1'", "'dlay<1' begins with 'dlay', expected one of"),
-        (f"{REPLAY} --check 'delay>1'", "'delay>1' is compared by '>', expected delay<NUMBER"),
+        (
+            f"{SIGN} start=2'",
+            "sign on g1 starts at 2 s, expected at least 3 s: until then the biases are learned",
+        ),
+        (
+            f"{SIGN} start=32.5' --start 30",
+            "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then",
+        ),
+        (
+            f"{SIGN} start=9' --end 9",
+            "sign on g1 starts at 9 s, expected at most 8.99 s: that is the last sample",
+        ),
+        (
+            f"{REPLAY} --check 'false=0 dlay<1'",
+            "'dlay<1' begins with 'dlay', expected one of",
+        ),
+        (
+            f"{REPLAY} --check 'delay>1'",
+            "'delay>1' is compared by '>', expected delay<NUMBER",
+        ),
         (f"{REPLAY} --check false", "'false' has no bound, expected false<NUMBER or"),
-        (f"{REPLAY} --check 'judged > x'", "'judged>x' has the bound 'x', expected a number"),
+        (
+            f"{REPLAY} --check 'judged > x'",
+            "'judged>x' has the bound 'x', expected a number",
+        ),
         (f"{REPLAY} --check detected", "'detected' is about injected faults"),
-        (f"{REPLAY} --check 'g9 faulty'", "'g9 faulty' names no channel, expected one of: g1, g2"),
+        (
+            f"{REPLAY} --check 'g9 faulty'",
+            "'g9 faulty' names no channel, expected one of: g1, g2",
+        ),
         (f"{REPLAY} --check ' '", "--check is empty, expected conditions on: detected"),
-        *((f"{REPLAY} --check '{one}'", f"'{one}' can never hold") for one in ("judged>1", "false<0", "unchecked=0.5")),
+        *(
+            (f"{REPLAY} --check '{one}'", f"'{one}' can never hold")
+            for one in ("judged>1", "false<0", "unchecked=0.5")
+        ),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(words, said, refused, flight, config, root, tmp_path, monkeypatch):
+def test_bad_input_is_one_line_and_exit_code_2(
+    words, said, refused, flight, config, root, tmp_path, monkeypatch
+):
     (tmp_path / "empty.mcap").touch()
     axes = "{preset: axes, axes: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, %s]}"
-    places = {"FLIGHT": flight, "CONFIG": config, "THREE": root / "config" / "three_imus.yaml"}
+    places = {
+        "FLIGHT": flight,
+        "CONFIG": config,
+        "THREE": root / "config" / "three_imus.yaml",
+    }
     for name, settings in (
         ("five", "geometry: {preset: cone, cone_channels: 5}"),
         ("typo", "nosie: {noise_std: [1.0]}"),
@@ -354,21 +515,44 @@ def test_bad_input_is_one_line_and_exit_code_2(words, said, refused, flight, con
 @pytest.mark.parametrize("words", [["shipped"], ["--help"], ["replay", "--help"]])
 def test_a_pipe_may_close(words):
     words = [sys.executable, "-m", "fdi_ros.cli", *words]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         process.stdout.close()
         assert (process.stderr.read(), process.wait(240)) == (b"", 0)
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
 def test_outputs_may_be_closed_from_the_start(closed):
-    shell = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-m", "fdi_ros.cli", "shipped"]
-    done = subprocess.run(shell, capture_output=True, text=True, timeout=240, check=False)
+    shell = [
+        "sh",
+        "-c",
+        f'exec "$@" {closed}',
+        "sh",
+        sys.executable,
+        "-m",
+        "fdi_ros.cli",
+        "shipped",
+    ]
+    done = subprocess.run(
+        shell, capture_output=True, text=True, timeout=240, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, tmp_path):
-    words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config)]
+def test_a_replay_that_is_stopped_leaves_nothing_behind(
+    number, flight, config, tmp_path
+):
+    words = [
+        sys.executable,
+        "-m",
+        "fdi_ros.cli",
+        "replay",
+        str(flight),
+        "--config",
+        str(config),
+    ]
     words += ["--output", str(tmp_path / "out"), "--csv", str(tmp_path / "s.csv")]
 
     def hear_it():
@@ -378,7 +562,11 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
     # As plain Python it takes so long that it cannot be done before the signal comes.
     slow = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=hear_it, env=slow
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=hear_it,
+        env=slow,
     ) as process:
         # Both outputs have been begun.
         while len(os.listdir(tmp_path)) < 2:
@@ -409,16 +597,27 @@ print(*sys.modules)
 
 
 def test_help_and_usage_errors_wait_for_no_compiler():
-    done = subprocess.run([sys.executable, "-c", NO_COMPILER], capture_output=True, text=True, timeout=240, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", NO_COMPILER],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=True,
+    )
     assert done.stdout.count("\nended ") == 7
     loaded = done.stdout.splitlines()[-1].split()
     assert "fdi_ros.cli.command_line" in loaded
     assert set(loaded).isdisjoint({"numba", "yaml"})
 
 
-def test_devices_pipes_and_open_files_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
+def test_devices_pipes_and_open_files_are_written_through_and_results_confirmed(
+    capsysbinary, flight, config, tmp_path
+):
     words = ["replay", str(flight), "--config", str(config), "--end", "1"]
-    assert command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == UNTOLD
+    assert (
+        command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"])
+        == UNTOLD
+    )
     assert Path("/dev/null").is_char_device()
     said = capsysbinary.readouterr()
     assert said.out.endswith(b"\nwrote /dev/null\nwrote /dev/null\n")
@@ -431,11 +630,17 @@ def test_devices_pipes_and_open_files_are_written_through_and_results_confirmed(
         assert json.loads(read.result(60))["samples"] == 100
     assert pipe.is_fifo()
     with (tmp_path / "figures.json").open("wb") as file:
-        assert command_line.main([*words, "--json", f"/proc/self/fd/{file.fileno()}"]) == UNTOLD
+        assert (
+            command_line.main([*words, "--json", f"/proc/self/fd/{file.fileno()}"])
+            == UNTOLD
+        )
     assert json.loads((tmp_path / "figures.json").read_text())["samples"] == 100
     capsysbinary.readouterr()
 
-    assert command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == UNTOLD
+    assert (
+        command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")])
+        == UNTOLD
+    )
     said = capsysbinary.readouterr()
     assert json.loads(said.out)["samples"] == 100
     assert said.err.decode().endswith(f"wrote {tmp_path / 's.csv'}\n")
@@ -444,7 +649,10 @@ def test_devices_pipes_and_open_files_are_written_through_and_results_confirmed(
     assert command_line.main([*words, "--output", "-"]) == 2
     assert command_line.main([*words, "--json", "/dev/full"]) == 2
     errors = capsysbinary.readouterr().err.decode().splitlines()
-    assert ["two outputs" in errors[0], "a recording is a folder" in errors[1]] == [True, True]
+    assert ["two outputs" in errors[0], "a recording is a folder" in errors[1]] == [
+        True,
+        True,
+    ]
     assert errors[2:] == ["fdi: cannot write /dev/full: No space left on device"]
 
 
@@ -463,11 +671,17 @@ REPLACED = [
         (f"REPLAY --json {name}", "which is read")
         for name in ("CONFIG", "/proc/self/cwd/config", "/dev/fd/../cwd/config")
     ),
-    *((f"REPLAY --output {name}", "which is read") for name in ("FLIGHT", "FLIGHT/metadata.yaml", "FLIGHT/..")),
+    *(
+        (f"REPLAY --output {name}", "which is read")
+        for name in ("FLIGHT", "FLIGHT/metadata.yaml", "FLIGHT/..")
+    ),
     ("geometry CONFIG --report CONFIG --force", "which is read"),
     ("montecarlo STUDY --json STUDY --force", "which is read"),
     ("montecarlo STUDY --json CONFIG", "exists already"),
-    ("replay broken.mcap --config CONFIG --output bag --csv s.csv --json s.json", "broken.mcap"),
+    (
+        "replay broken.mcap --config CONFIG --output bag --csv s.csv --json s.json",
+        "broken.mcap",
+    ),
     ("geometry CONFIG --json CONFIG --force", ""),
     # A recording that lies outside its folder: named so, or linked.
     ("replay NAMED --config CONFIG --force --json OUTSIDE", ""),
@@ -479,7 +693,10 @@ REPLACED = [
 def places(flight, root, tmp_path, monkeypatch):
     """Files and folders that no output may replace, by the words that stand for them."""
     monkeypatch.chdir(tmp_path)
-    found = {"FLIGHT": Path("of", "flight"), **{name.upper(): Path(name) for name in ("recorded", "named", "linked")}}
+    found = {
+        "FLIGHT": Path("of", "flight"),
+        **{name.upper(): Path(name) for name in ("recorded", "named", "linked")},
+    }
     for path in found.values():
         shutil.copytree(flight, path)
     for name, content in (
@@ -490,7 +707,12 @@ def places(flight, root, tmp_path, monkeypatch):
         ("page", b"<!DOCTYPE html>\n<html>mine</html>"),
         ("config", (root / "config" / "two_imus.yaml").read_bytes()),
         ("study", (root / "config" / "studies" / "roc.yaml").read_bytes()),
-        ("named/metadata.yaml", (flight / "metadata.yaml").read_bytes().replace(b"cone_flight.mcap", b"../outside")),
+        (
+            "named/metadata.yaml",
+            (flight / "metadata.yaml")
+            .read_bytes()
+            .replace(b"cone_flight.mcap", b"../outside"),
+        ),
     ):
         path = Path(name)
         path.parent.mkdir(exist_ok=True)
@@ -508,9 +730,14 @@ def under(folder):
 
 
 @pytest.mark.parametrize(("words", "said"), REPLACED)
-def test_only_a_former_result_is_replaced_and_nothing_else_is_touched(words, said, refused, places, tmp_path):
+def test_only_a_former_result_is_replaced_and_nothing_else_is_touched(
+    words, said, refused, places, tmp_path
+):
     words = words.replace("REPLAY", "replay FLIGHT --config CONFIG --end 1 --force")
-    given = [re.sub(r"^[A-Z]+", lambda found: str(places[found[0]]), word) for word in words.split()]
+    given = [
+        re.sub(r"^[A-Z]+", lambda found: str(places[found[0]]), word)
+        for word in words.split()
+    ]
     before = under(tmp_path)
     assert said in refused(*given)
     assert under(tmp_path) == before
@@ -531,7 +758,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_then(monkeypatch):
+def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_then(
+    monkeypatch,
+):
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
     for stream, said in (
         (Terminal(), r" 50 %\|.* \r$"),

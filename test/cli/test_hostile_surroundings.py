@@ -68,8 +68,15 @@ def no_file(request, tmp_path, monkeypatch):
         ["geometry", "FILE"],
     ],
 )
-def test_what_is_no_regular_file_is_never_read(words, no_file, flight, config, tmp_path, refused):
-    meant = {"FLIGHT": flight, "CONFIG": config, "FILE": no_file, "OUT": tmp_path / "out"}
+def test_what_is_no_regular_file_is_never_read(
+    words, no_file, flight, config, tmp_path, refused
+):
+    meant = {
+        "FLIGHT": flight,
+        "CONFIG": config,
+        "FILE": no_file,
+        "OUT": tmp_path / "out",
+    }
     said = refused(*(meant.get(word, word) for word in words))
     assert "other.yaml: it is no regular file" in said
     assert not (tmp_path / "out").exists()
@@ -84,12 +91,22 @@ def test_metadata_keys_and_recordings_that_are_no_files(no_file, flight, tmp_pat
     assert "metadata.yaml is damaged" in done.out
     with pytest.raises(FdiError, match="it is no regular file"):
         read_key(str(bag / "metadata.yaml"))
-    for name in ("metadata.yaml", "a.mcap", "a.db3", "a.bin", "a.ulg", "a.tlog", "a.mcap.zstd"):
+    for name in (
+        "metadata.yaml",
+        "a.mcap",
+        "a.db3",
+        "a.bin",
+        "a.ulg",
+        "a.tlog",
+        "a.mcap.zstd",
+    ):
         next(path for path in bag.iterdir() if not path.is_file()).rename(bag / name)
         assert fdi("inspect", bag / name).code == 2
 
 
-def test_a_fleet_waits_for_no_pipe_and_one_given_up_leaves_nothing(flight, tmp_path, refused):
+def test_a_fleet_waits_for_no_pipe_and_one_given_up_leaves_nothing(
+    flight, tmp_path, refused
+):
     os.mkfifo(tmp_path / ".lock")
     os.mkfifo(tmp_path / "flights.parquet")
     assert "it is no regular file" in refused("fleet", flight, "--output", tmp_path)
@@ -99,7 +116,12 @@ def test_a_fleet_waits_for_no_pipe_and_one_given_up_leaves_nothing(flight, tmp_p
 
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     """But not what is young, of another result, or held by a run that goes on."""
-    names = (".a.json.01234567", ".a.json.89abcdef", ".b.json.01234567", ".a.json.fedcba98")
+    names = (
+        ".a.json.01234567",
+        ".a.json.89abcdef",
+        ".b.json.01234567",
+        ".a.json.fedcba98",
+    )
     left, young, other, held = (tmp_path / name for name in names)
     for folder in (left, young, other, held):
         folder.mkdir()
@@ -110,7 +132,12 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     fcntl.flock(writer, fcntl.LOCK_EX)
     write_json(tmp_path / "a.json", {"x": 1})
     os.close(writer)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.json", young.name, other.name, held.name}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "a.json",
+        young.name,
+        other.name,
+        held.name,
+    }
 
 
 INTERRUPTED = """
@@ -127,8 +154,22 @@ sys.exit(fdi())
 """
 
 
-@pytest.mark.parametrize("moment", ["fdi_ros.cli.command_line", "argparse", "numpy", "numba", "fdi_ros.replay.run"])
+@pytest.mark.parametrize(
+    "moment",
+    ["fdi_ros.cli.command_line", "argparse", "numpy", "numba", "fdi_ros.replay.run"],
+)
 def test_a_signal_while_it_is_loaded_is_no_traceback(moment, flight, config):
-    words = [sys.executable, "-c", INTERRUPTED, "replay", flight, "--config", config, moment]
-    done = subprocess.run([*map(str, words)], capture_output=True, text=True, timeout=LIMIT, check=False)
+    words = [
+        sys.executable,
+        "-c",
+        INTERRUPTED,
+        "replay",
+        flight,
+        "--config",
+        config,
+        moment,
+    ]
+    done = subprocess.run(
+        [*map(str, words)], capture_output=True, text=True, timeout=LIMIT, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

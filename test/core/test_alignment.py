@@ -42,7 +42,9 @@ def values(samples, units=2):
 
 def received(samples, units=2):
     """(N, units) whether each unit gave a value."""
-    return np.array([s["received"][: 3 * units : 3] for s in samples], dtype=bool).reshape(-1, units)
+    return np.array(
+        [s["received"][: 3 * units : 3] for s in samples], dtype=bool
+    ).reshape(-1, units)
 
 
 def waiting(aligner, j):
@@ -75,8 +77,13 @@ def streams(draw):
         count = int(draw(st.sampled_from([60, 150])) / period)
         ticks = phase + period * np.arange(count) + rng.uniform(-jitter, jitter, count)
         kept = rng.random(count) >= loss
-        arrival = np.maximum.accumulate(ticks + delay + rng.uniform(0, jitter + 1e-3, count))
-        messages += [(a, j, START + round(t * MS)) for a, t in zip(arrival[kept], ticks[kept], strict=True)]
+        arrival = np.maximum.accumulate(
+            ticks + delay + rng.uniform(0, jitter + 1e-3, count)
+        )
+        messages += [
+            (a, j, START + round(t * MS))
+            for a, t in zip(arrival[kept], ticks[kept], strict=True)
+        ]
     messages.sort()
     return units, [(j, stamp) for _, j, stamp in messages]
 
@@ -84,17 +91,30 @@ def streams(draw):
 def arrays(messages):
     """Units, stamps and rates of messages."""
     unit, stamps = np.array(messages, dtype=np.int64).reshape(-1, 2).T
-    return unit, stamps, np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 3)
+    return (
+        unit,
+        stamps,
+        np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 3),
+    )
 
 
 def blocks_of(messages, units, cuts):
-    aligner, edges, columns = Alignment(units, SKEW, TIMEOUT), [0, *sorted(cuts), len(messages)], arrays(messages)
-    return aligner, [aligner.push_block(*(one[a:b] for one in columns)) for a, b in itertools.pairwise(edges)]
+    aligner, edges, columns = (
+        Alignment(units, SKEW, TIMEOUT),
+        [0, *sorted(cuts), len(messages)],
+        arrays(messages),
+    )
+    return aligner, [
+        aligner.push_block(*(one[a:b] for one in columns))
+        for a, b in itertools.pairwise(edges)
+    ]
 
 
 def same(samples, blocks, units):
     assert np.concatenate([b.stamp for b in blocks]).tolist() == stamps_of(samples)
-    assert np.vstack([b.z for b in blocks]).tobytes() == values(samples, units).tobytes()
+    assert (
+        np.vstack([b.z for b in blocks]).tobytes() == values(samples, units).tobytes()
+    )
     told = np.vstack([b.delivered for b in blocks])
     np.testing.assert_array_equal(told, np.repeat(received(samples, units), 3, axis=1))
 
@@ -109,7 +129,12 @@ def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(cas
     assert np.isnan(z[~here]).all()
     # The rate tells its instant: within the skew of the stamp, or exactly it when interpolated.
     true = np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 1, 3)
-    np.testing.assert_allclose(z[here], np.broadcast_to(true, z.shape)[here], atol=2 * SKEW / 1e9 + 1e-12, rtol=0)
+    np.testing.assert_allclose(
+        z[here],
+        np.broadcast_to(true, z.shape)[here],
+        atol=2 * SKEW / 1e9 + 1e-12,
+        rtol=0,
+    )
     fastest = 1 << 60
     for j in range(units):
         own = np.array([stamp for k, stamp in messages if k == j], dtype=np.int64)
@@ -121,7 +146,9 @@ def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(cas
         assert len(moved) == len(set(moved))
         # All that can be formed is formed.
         if not aligner.counters[j]["late"]:
-            inside = np.searchsorted(stamps, own[1:], "right") - np.searchsorted(stamps, own[:-1], "left")
+            inside = np.searchsorted(stamps, own[1:], "right") - np.searchsorted(
+                stamps, own[:-1], "left"
+            )
             assert (inside >= 1).all()
     assert np.diff(stamps).min(initial=1 << 60) >= fastest > 0
 
@@ -132,10 +159,16 @@ def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lat
     units, messages = case
     unit, stamps, rates = arrays(messages)
     delays = [1e-6 * d for d in lateness[:units]]
-    right, corrected = Alignment(units, SKEW, TIMEOUT), Alignment(units, SKEW, TIMEOUT, delays)
+    right, corrected = (
+        Alignment(units, SKEW, TIMEOUT),
+        Alignment(units, SKEW, TIMEOUT, delays),
+    )
     late = stamps + 1000 * np.array(lateness)[unit]
     for expected, block in (
-        (right.push_block(unit, stamps, rates), corrected.push_block(unit, late, rates)),
+        (
+            right.push_block(unit, stamps, rates),
+            corrected.push_block(unit, late, rates),
+        ),
         (as_block(right.flush(), units), as_block(corrected.flush(), units)),
     ):
         assert block.stamp.tobytes() == expected.stamp.tobytes()
@@ -166,7 +199,9 @@ def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case):
 
 @settings(max_examples=100)
 @given(streams(), st.lists(st.integers(0, 200), max_size=4))
-def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(case, cuts):
+def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(
+    case, cuts
+):
     units, messages = case
     live, samples = run(messages, units)
     recorded, blocks = blocks_of(messages, units, [min(c, len(messages)) for c in cuts])
@@ -185,12 +220,19 @@ anything = st.one_of(
 
 
 @settings(max_examples=300)
-@given(st.lists(st.tuples(st.integers(0, 3), anything), max_size=120), st.sampled_from([(SKEW, TIMEOUT), (0, 1)]))
-def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(messages, spans):
+@given(
+    st.lists(st.tuples(st.integers(0, 3), anything), max_size=120),
+    st.sampled_from([(SKEW, TIMEOUT), (0, 1)]),
+)
+def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(
+    messages, spans
+):
     aligner, samples = run(messages, 4, *spans, flush=True)
     assert all(a < b for a, b in itertools.pairwise(stamps_of(samples)))
     # Without its shift a sample stands at the stamp of a message, and shift or not, at most one at each message.
-    assert {int(s["stamp"] - s["shift"]) for s in samples} <= {stamp for _, stamp in messages}
+    assert {int(s["stamp"] - s["shift"]) for s in samples} <= {
+        stamp for _, stamp in messages
+    }
     assert len(samples) <= len(messages)
     assert sum(count["received"] for count in aligner.counters) == len(messages)
     # Where two clocks have gone apart what there is of a sample is not given, and yet not missing.
@@ -199,7 +241,13 @@ def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(
         own = [s for s in samples if s["received"][3 * j]]
         counts = aligner.counters[j]
         refused = sum(counts[kind] for kind in ("duplicate", "backward", "jumped"))
-        assert len(own) <= counts["received"] - refused + counts["interpolated"] + aligner.rows["restarts"][0]
+        assert (
+            len(own)
+            <= counts["received"]
+            - refused
+            + counts["interpolated"]
+            + aligner.rows["restarts"][0]
+        )
         assert 0 <= len(samples) - len(own) - counts["missing"] <= empty
 
 
@@ -220,7 +268,9 @@ ALONE = [(0, t) for t in TENS[:30]]
 
 def without(*lost, count=30, period=10.0):
     """Rounds of two units without some messages of the second."""
-    return [m for m in rounds(count, period) if m not in [(1, period * k) for k in lost]]
+    return [
+        m for m in rounds(count, period) if m not in [(1, period * k) for k in lost]
+    ]
 
 
 SLOWEST = MAX_BRIDGE * TIMEOUT / MS
@@ -235,24 +285,61 @@ SLOWEST = MAX_BRIDGE * TIMEOUT / MS
         # A silent unit comes back by itself: with the message for which it was not waited any more.
         (without(*range(11, 40), count=60), TENS, 0, {1: {"missing": 30}}),
         # At 1 kHz the next message is within the skew of 2 ms, and is not taken for the one lost.
-        (without(10, period=1.0), [float(k) for k in range(30)], 0, {1: {"interpolated": 1}}),
+        (
+            without(10, period=1.0),
+            [float(k) for k in range(30)],
+            0,
+            {1: {"interpolated": 1}},
+        ),
         # No span is bridged beyond its share of the timeout.
-        (without(*range(1, 20, 2), period=SLOWEST / 2), None, 0, {1: {"interpolated": 10}}),
-        (without(*range(1, 20, 2), period=SLOWEST / 2 + 0.5), None, 0, {1: {"interpolated": 0}}),
+        (
+            without(*range(1, 20, 2), period=SLOWEST / 2),
+            None,
+            0,
+            {1: {"interpolated": 10}},
+        ),
+        (
+            without(*range(1, 20, 2), period=SLOWEST / 2 + 0.5),
+            None,
+            0,
+            {1: {"interpolated": 0}},
+        ),
         # A clock too far behind: the rest goes on, as it does, after a wait, with one that is a little behind.
-        ([m for t in TENS for m in ((0, t), (1, t - 5000.0))], TENS, 0, {1: {"late": 60}}),
+        (
+            [m for t in TENS for m in ((0, t), (1, t - 5000.0))],
+            TENS,
+            0,
+            {1: {"late": 60}},
+        ),
         ([m for t in TENS for m in ((0, t), (1, t - 45.0))], None, 0, {1: {"late": 0}}),
         # Stamps go back and are repeated, and never enter.
         (
-            [*rounds(20)[:21], (0, 40.0), (0, 100.0), (1, 90.0), (1, 80.0), *rounds(20)[21:]],
+            [
+                *rounds(20)[:21],
+                (0, 40.0),
+                (0, 100.0),
+                (1, 90.0),
+                (1, 80.0),
+                *rounds(20)[21:],
+            ],
             TENS[:20],
             0,
             {j: {"backward": 1, "duplicate": 1} for j in range(2)},
         ),
         # A pause of all is gone over at once.
-        (rounds(20) + [(j, t + 6e4) for j, t in rounds(20)], TENS[:20] + [t + 6e4 for t in TENS[:20]], 1, {}),
+        (
+            rounds(20) + [(j, t + 6e4) for j, t in rounds(20)],
+            TENS[:20] + [t + 6e4 for t in TENS[:20]],
+            1,
+            {},
+        ),
         # All clocks set back shift the time base.
-        (rounds(20) + [(j, t - 36e5) for j, t in rounds(20)], TENS[:20] + [t - 36e5 for t in TENS[:20]], 1, {}),
+        (
+            rounds(20) + [(j, t - 36e5) for j, t in rounds(20)],
+            TENS[:20] + [t - 36e5 for t in TENS[:20]],
+            1,
+            {},
+        ),
         # The only unit left is believed after the timeout.
         (
             ALONE + [(0, t - 9000) for _, t in ALONE],
@@ -266,10 +353,15 @@ SLOWEST = MAX_BRIDGE * TIMEOUT / MS
         ([*ALONE[:20], (0, 1e9), (0, -1e9), *ALONE[20:]], TENS[:30], 0, {}),
     ],
 )
-def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, formed, restarts, counted):
+def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(
+    messages, formed, restarts, counted
+):
     aligner, samples = run(at(*messages))
     # Without the shift that keeps time from stepping back.
-    assert formed in (None, [(int(s["stamp"] - s["shift"]) - START) / MS for s in samples])
+    assert formed in (
+        None,
+        [(int(s["stamp"] - s["shift"]) - START) / MS for s in samples],
+    )
     assert np.diff(stamps_of(samples)).min() > 0
     assert aligner.rows["restarts"][0] == restarts
     assert samples[-1]["shift"] == aligner.shift
@@ -289,14 +381,22 @@ def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait():
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"imus.delays": [0.004]}, r"imus.delays has 1 values, expected 0 or 2 \(one per triad\)"),
+        (
+            {"imus.delays": [0.004]},
+            r"imus.delays has 1 values, expected 0 or 2 \(one per triad\)",
+        ),
         ({"imus.delays": [0.0, 0.2]}, r"imus.delays.* 0.2.* -0.1 to 0.1"),
-        ({"imus.delays": [0.004], "input": "channels"}, r"imus.delays is given, but input is 'channels'"),
+        (
+            {"imus.delays": [0.004], "input": "channels"},
+            r"imus.delays is given, but input is 'channels'",
+        ),
     ],
 )
 def test_delays_that_do_not_fit_are_refused(parameters, words):
     with pytest.raises(ConfigError, match=words):
-        Config.from_parameters({"input": "imus", "imus.topics": ["/a", "/b"], **parameters})
+        Config.from_parameters(
+            {"input": "imus", "imus.topics": ["/a", "/b"], **parameters}
+        )
 
 
 CLOCKS = {
@@ -305,8 +405,14 @@ CLOCKS = {
     "much too fast": ("jumped", lambda seconds: 1.05 * seconds),
     "much too slow": ("late", lambda seconds: 0.95 * seconds),
     # From 2 s on every message just less than the timeout ahead of the one before.
-    "leaping": ("jumped", lambda s: s + 0.99e-9 * TIMEOUT * np.maximum(np.arange(len(s)) - 200, 0)),
-    "random": ("backward", lambda s: s + np.random.default_rng(1).uniform(-1.0, 1.0, len(s))),
+    "leaping": (
+        "jumped",
+        lambda s: s + 0.99e-9 * TIMEOUT * np.maximum(np.arange(len(s)) - 200, 0),
+    ),
+    "random": (
+        "backward",
+        lambda s: s + np.random.default_rng(1).uniform(-1.0, 1.0, len(s)),
+    ),
     "of another time": ("jumped", lambda seconds: seconds + 5e6),
 }
 """As what messages with the stamps of a clock are counted, and the clock."""
@@ -327,21 +433,33 @@ def through(aligner, clocks, order=None):
     count, units = clocks.shape
     order = slice(None) if order is None else order
     stamp = START + np.round(1e9 * clocks.ravel()[order]).astype(np.int64)
-    return aligner.push_block(np.tile(np.arange(units), count)[order], stamp, np.zeros((count * units, 3)))
+    return aligner.push_block(
+        np.tile(np.arange(units), count)[order], stamp, np.zeros((count * units, 3))
+    )
 
 
 @pytest.mark.parametrize("odd", [0, 2])
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, odd):
     clocks, right = clocks_of(clock, odd, 3)
-    arrival = (right + np.random.default_rng(odd).uniform(0, 0.005, right.shape)).ravel()
+    arrival = (
+        right + np.random.default_rng(odd).uniform(0, 0.005, right.shape)
+    ).ravel()
     aligner = Alignment(3, SKEW, TIMEOUT)
-    given = through(aligner, clocks, np.argsort(arrival)).delivered[-3000:, ::3].mean(axis=0)
+    given = (
+        through(aligner, clocks, np.argsort(arrival))
+        .delivered[-3000:, ::3]
+        .mean(axis=0)
+    )
     others = [j for j in range(3) if j != odd]
     assert given[odd] < 0.05
     assert (given[others] > 0.99).all()
     assert aligner.counters[odd][CLOCKS[clock][0]] > 500
-    assert all(aligner.counters[j][other] <= 2 for j in others for other in ("late", "jumped", "backward"))
+    assert all(
+        aligner.counters[j][other] <= 2
+        for j in others
+        for other in ("late", "jumped", "backward")
+    )
 
 
 @pytest.mark.parametrize("odd", [0, 1])
@@ -359,15 +477,22 @@ def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd):
 
 def test_two_clocks_that_come_together_again_are_believed_again():
     seconds = np.arange(3000) * 0.01
-    apart = np.interp(seconds, [5.0, 10.0, 15.0, 20.0], [0.0, 2.0, 2.0, 0.0]) * TIMEOUT / 1e9
-    block = through(Alignment(2, SKEW, TIMEOUT), np.column_stack([seconds, seconds + 0.001 - apart]))
+    apart = (
+        np.interp(seconds, [5.0, 10.0, 15.0, 20.0], [0.0, 2.0, 2.0, 0.0])
+        * TIMEOUT
+        / 1e9
+    )
+    block = through(
+        Alignment(2, SKEW, TIMEOUT), np.column_stack([seconds, seconds + 0.001 - apart])
+    )
     given, at = block.delivered[:, ::3], (block.stamp - START) / 1e9
     assert given[(at < 5.0) | (at > 20.0)].all()
     assert not given[(at > 9.0) & (at < 16.0)].any()
 
 
 JUMPS = [
-    [m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + jump))] for jump in (5e3, 5e2, -150, -5e2, -5e3)
+    [m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + jump))]
+    for jump in (5e3, 5e2, -150, -5e2, -5e3)
 ]
 HELD_UP = [(0, float(t)) for t in range(1000, 2000, 10)]
 HELD_UP += [m for t in range(2000, 3000, 10) for m in ((0, float(t)), (1, t - 1000.0))]

@@ -90,7 +90,9 @@ def test_the_rotation_of_the_earth_and_biases_that_are_usual_or_given_are_rest()
         bias = 0.005 * np.random.default_rng(100 + seed).standard_normal(6)
         found, words, _ = learned(turned(noise(seed) + bias, 7.3e-5 + tremble))
         assert words == "learned"
-        assert found == pytest.approx(bias, abs=5 * NOISE / np.sqrt(EFFICIENCY * LENGTH))
+        assert found == pytest.approx(
+            bias, abs=5 * NOISE / np.sqrt(EFFICIENCY * LENGTH)
+        )
     given = [0.05 * x for x in Pipeline(config()).geometry.axes[:, 0]]
     assert learned(noise(7) + given)[1].startswith("refused")
     assert learned(noise(7) + given, bias__fixed=given)[1] == "learned"
@@ -103,10 +105,18 @@ def first_average(folder, settings, start, end):
 
 
 def test_real_units_at_rest_are_taken_as_such_and_turned_by_hand_not(recording, root):
-    settings = Config.from_file(root / "config" / "three_imus.yaml", {"detector.name": "likelihood_ratio"})
+    settings = Config.from_file(
+        root / "config" / "three_imus.yaml", {"detector.name": "likelihood_ratio"}
+    )
     # Biases of up to 0.024 rad/s, not calibrated; all three units and every two of them.
     for kept in ([0, 1, 2], [0, 1], [1, 2], [0, 2]):
         mounts = np.reshape(settings.imus.mounts, (3, 9))[kept].ravel().tolist()
-        some = {"imus.topics": [settings.imus.topics[k] for k in kept], "imus.names": [], "imus.mounts": mounts}
+        some = {
+            "imus.topics": [settings.imus.topics[k] for k in kept],
+            "imus.names": [],
+            "imus.mounts": mounts,
+        }
         assert first_average(recording, settings.replaced(some), 0.0, 4.0) == "learned"
-    assert first_average(recording, settings, 18.0, 21.5).startswith("refused, not at rest")
+    assert first_average(recording, settings, 18.0, 21.5).startswith(
+        "refused, not at rest"
+    )

@@ -75,10 +75,23 @@ def warm(started):
 
 
 def start(copy, **environment):
-    place = {"PYTHONPATH": str(copy), "HOME": str(copy.parent / "home"), "TMPDIR": str(copy.parent / "temporary")}
-    inherited = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
-    env, out = {**inherited, **place, **environment}, {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    return subprocess.Popen([sys.executable, "-B", "-c", SCRIPT], env=env, cwd=copy, text=True, **out)
+    place = {
+        "PYTHONPATH": str(copy),
+        "HOME": str(copy.parent / "home"),
+        "TMPDIR": str(copy.parent / "temporary"),
+    }
+    inherited = {
+        k: v
+        for k, v in os.environ.items()
+        if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
+    }
+    env, out = (
+        {**inherited, **place, **environment},
+        {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT},
+    )
+    return subprocess.Popen(
+        [sys.executable, "-B", "-c", SCRIPT], env=env, cwd=copy, text=True, **out
+    )
 
 
 def outcome(process):
@@ -86,7 +99,11 @@ def outcome(process):
     output = process.communicate(timeout=300)[0]
     assert process.returncode == 0, output
     assert "Traceback" not in output
-    lines = dict(line.split(" ", 1) for line in output.splitlines() if line.startswith(("kept", "says")))
+    lines = dict(
+        line.split(" ", 1)
+        for line in output.splitlines()
+        if line.startswith(("kept", "says"))
+    )
     return Path(lines["kept"].removeprefix("in ")), lines["says"], output
 
 
@@ -152,7 +169,9 @@ class Planted:
         return Path.touch, (self.mark,)
 
 
-@pytest.mark.parametrize("what", ["mine", "open to all", "a link", "a stranger's", "a stranger's folder"])
+@pytest.mark.parametrize(
+    "what", ["mine", "open to all", "a link", "a stranger's", "a stranger's folder"]
+)
 def test_code_that_somebody_else_may_have_put_there_is_not_run(warm, what):
     if "stranger" in what and os.geteuid() != 0:
         pytest.skip("only root can give a file to another user")
@@ -192,7 +211,9 @@ def test_a_change_of_a_called_function_is_compiled(warm):
     assert "compiled it" not in outcome(start(copy))[2]
     source = copy / "fdi_ros" / "core" / "decision.py"
     text = source.read_text()
-    line = "decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0"
+    line = (
+        "decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0"
+    )
     assert line in text
     source.write_text(text.replace(line, "decision.faulty = decision.suspicion = 0"))
     assert outcome(start(copy))[1] == "0 5"
@@ -215,7 +236,9 @@ def said(caplog):
 
 def test_results_that_cannot_be_kept_are_said_and_stop_nothing(tmp_path, said):
     _Kept(str(tmp_path / "gone"), "function", "stamp").save("key", "data")
-    assert said.messages == [f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"]
+    assert said.messages == [
+        f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"
+    ]
 
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"stamp", bytes(range(256))])
@@ -271,11 +294,25 @@ def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
     """The first on a machine; those after it say nothing."""
     command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(flight)]
     # Another kind of compiled code than that of the package, which would be taken over.
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_BOUNDSCHECK": "1"}
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "NUMBA_BOUNDSCHECK": "1",
+    }
     for said in (WORDS, ""):
-        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root, env=environment)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=root,
+            env=environment,
+        )
         first, _, rest = done.stderr.partition("\n")
         assert first == said
-        assert all(re.fullmatch(r"compiling +\d+ % \|[# ]{20}\| \d+ s", line) for line in rest.splitlines())
+        assert all(
+            re.fullmatch(r"compiling +\d+ % \|[# ]{20}\| \d+ s", line)
+            for line in rest.splitlines()
+        )
         assert done.stdout.startswith("READY: ")
         assert [*tmp_path.rglob("*.nbi")], "kept in the folder that the user wishes"

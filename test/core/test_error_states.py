@@ -28,7 +28,13 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 
-PRIORS = {"bias": 0.01, "scale": 0.02, "delay": 0.01, "bias rate": 1e-4, "clock rate": 1e-4}
+PRIORS = {
+    "bias": 0.01,
+    "scale": 0.02,
+    "delay": 0.01,
+    "bias rate": 1e-4,
+    "clock rate": 1e-4,
+}
 WALKS = {"bias": 1e-3, "scale": 1e-4, "delay": 1e-4}
 
 
@@ -58,9 +64,16 @@ class Measured:
         predict(self.layout, self.states, 3.0)
         self.n, self.count = n, int(self.layout["count"])
         self.x, self.p = self.x_and_p()
-        self.at, self.parity, sensors = (allocate(one)[0] for one in (Projection, Parity, Sensors))
+        self.at, self.parity, sensors = (
+            allocate(one)[0] for one in (Projection, Parity, Sensors)
+        )
         self.rate = self.rng.normal(0, 1, 3)
-        fill_signals(self.layout, self.rate, self.rng.normal(0, 5, MAX_CHANNELS), self.at["signals"])
+        fill_signals(
+            self.layout,
+            self.rate,
+            self.rng.normal(0, 5, MAX_CHANNELS),
+            self.at["signals"],
+        )
         project(self.layout, self.states, self.at)
         known = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
         known[:n, :n] = self.noise + self.at["covariance"][:n, :n]
@@ -70,11 +83,21 @@ class Measured:
         self.information = self.parity["information"][:n, :n].copy()
 
     def x_and_p(self):
-        return self.states["x"][: self.count].copy(), self.states["p"][: self.count, : self.count].copy()
+        return self.states["x"][: self.count].copy(), self.states["p"][
+            : self.count, : self.count
+        ].copy()
 
     def after(self, innovation, least):
         innovation = np.pad(innovation, (0, MAX_CHANNELS - len(innovation)))
-        update(self.layout, self.states, self.at, self.parity["information"], innovation, 1.0, least)
+        update(
+            self.layout,
+            self.states,
+            self.at,
+            self.parity["information"],
+            innovation,
+            1.0,
+            least,
+        )
         return self.x_and_p()
 
 
@@ -86,15 +109,32 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     matrix = np.zeros((n, one.count))
     for i, k in np.argwhere(one.layout["place"][:n] >= 0):
         matrix[i, one.layout["place"][i, k]] = one.at["signals"][i, k]
-    np.testing.assert_allclose(one.at["covariance"][:n, :n], matrix @ one.p @ matrix.T, rtol=1e-9, atol=1e-15)
-    y, innovation = one.axes @ one.rate + one.rng.normal(0, 0.01, n), np.zeros(MAX_CHANNELS)
-    subtract_errors(one.layout, one.states, one.at["signals"], np.pad(y, (0, MAX_CHANNELS - n)), innovation)
-    joint = np.block([[one.p, np.zeros((one.count, 3))], [np.zeros((3, one.count)), 1e6 * np.eye(3)]])
+    np.testing.assert_allclose(
+        one.at["covariance"][:n, :n], matrix @ one.p @ matrix.T, rtol=1e-9, atol=1e-15
+    )
+    y, innovation = (
+        one.axes @ one.rate + one.rng.normal(0, 0.01, n),
+        np.zeros(MAX_CHANNELS),
+    )
+    subtract_errors(
+        one.layout,
+        one.states,
+        one.at["signals"],
+        np.pad(y, (0, MAX_CHANNELS - n)),
+        innovation,
+    )
+    joint = np.block(
+        [[one.p, np.zeros((one.count, 3))], [np.zeros((3, one.count)), 1e6 * np.eye(3)]]
+    )
     both = np.hstack([matrix, one.axes])
     gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + one.noise)
     x, p = one.after(innovation[:n], np.zeros(MAX_STATES))
-    np.testing.assert_allclose(x, (np.pad(one.x, (0, 3)) + gain @ (y - matrix @ one.x))[: one.count], atol=1e-7)
-    np.testing.assert_allclose(p, (joint - gain @ both @ joint)[: one.count, : one.count], atol=1e-9)
+    np.testing.assert_allclose(
+        x, (np.pad(one.x, (0, 3)) + gain @ (y - matrix @ one.x))[: one.count], atol=1e-7
+    )
+    np.testing.assert_allclose(
+        p, (joint - gain @ both @ joint)[: one.count, : one.count], atol=1e-9
+    )
 
 
 @settings(max_examples=25)
@@ -103,13 +143,24 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
     """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
     one = Measured(seed, 6)
     whole = one.columns.T @ one.information @ one.columns
-    least, innovation, motion = np.zeros(MAX_STATES), one.rng.normal(0, 0.01, 6), slice(6, 6 + 18)
+    least, innovation, motion = (
+        np.zeros(MAX_STATES),
+        one.rng.normal(0, 0.01, 6),
+        slice(6, 6 + 18),
+    )
     least[motion] = (np.diag(one.p) - share * np.diag(whole))[motion]
     x, p = one.after(innovation, least)
-    assert (np.diag(p)[motion] >= (np.diag(one.p - min(share, 1.0) * whole))[motion] * (1 - 1e-9)).all()
+    assert (
+        np.diag(p)[motion]
+        >= (np.diag(one.p - min(share, 1.0) * whole))[motion] * (1 - 1e-9)
+    ).all()
     taught = np.diag(least[: one.count])
-    np.testing.assert_allclose(p, one.p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12)
-    np.testing.assert_allclose(x, one.x + taught @ one.columns.T @ one.information @ innovation, atol=1e-12)
+    np.testing.assert_allclose(
+        p, one.p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        x, one.x + taught @ one.columns.T @ one.information @ innovation, atol=1e-12
+    )
     assert np.linalg.eigvalsh(p).min() > -1e-12
 
 
@@ -136,11 +187,17 @@ ALL = 0b111111
 
 def restamped(late, samples):
     """Channels and values (6,) that two units of three channels are given, of stamps, values and what is plain."""
-    line, sample, out = allocate(DelayBuffer)[0], allocate(Sample)[0], np.zeros(MAX_CHANNELS)
+    line, sample, out = (
+        allocate(DelayBuffer)[0],
+        allocate(Sample)[0],
+        np.zeros(MAX_CHANNELS),
+    )
     config = allocate(PathSettings)[0]
     config["n"], config["units"], config["members"] = 6, 2, [0b111, 0b111000, 0, 0]
     for sample["stamp"], sample["z"][:6], plain in samples:
-        found = restamp(line, config, np.array([*late, 0.0, 0.0]), sample, ALL, plain, out)
+        found = restamp(
+            line, config, np.array([*late, 0.0, 0.0]), sample, ALL, plain, out
+        )
         yield found, out[:6].copy()
 
 
@@ -148,18 +205,30 @@ def restamped(late, samples):
 @given(late=st.floats(-0.05, 0.05), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
 def test_late_units_are_brought_to_one_instant(late, rate):
     """Straight lines in time come out as they went in: all of one instant, that of the latest unit."""
-    slope, late = np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0]), late if abs(late) >= 1e-6 else 0.0
+    slope, late = (
+        np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0]),
+        late if abs(late) >= 1e-6 else 0.0,
+    )
     stamps = np.arange(200) * round(1e9 / rate)
     of_unit = np.repeat([0.0, late], 3)
-    told = list(restamped((0.0, late), ((k, slope * (1e-9 * k - of_unit), ALL) for k in stamps.tolist())))
+    told = list(
+        restamped(
+            (0.0, late),
+            ((k, slope * (1e-9 * k - of_unit), ALL) for k in stamps.tolist()),
+        )
+    )
     found, out = told[-1]
     assert found == ALL
-    np.testing.assert_allclose(out, slope * (1e-9 * stamps[-1] - max(late, 0.0)), atol=1e-8)
+    np.testing.assert_allclose(
+        out, slope * (1e-9 * stamps[-1] - max(late, 0.0)), atol=1e-8
+    )
 
 
 def test_a_hole_is_not_bridged():
     stamps = [*range(0, 300_000_000, 10_000_000), 390_000_000]
-    *_, (found, out) = restamped((0.0, 0.025), ((stamp, np.arange(6.0), ALL) for stamp in stamps))
+    *_, (found, out) = restamped(
+        (0.0, 0.025), ((stamp, np.arange(6.0), ALL) for stamp in stamps)
+    )
     # The first unit stands back by 25 ms: into the hole.
     assert found == 0b111000
     assert np.isnan(out[:3]).all()
@@ -168,8 +237,13 @@ def test_a_hole_is_not_bridged():
 @pytest.mark.parametrize("bad", [1e9, np.inf, np.nan])
 def test_a_value_out_of_range_reaches_no_other_instant(bad):
     wild = np.array([1.0, bad, 1.0, 1.0, 1.0, 1.0])
-    samples = [(k * 10_000_000, wild if k == 30 else np.ones(6), 0b111101 if k == 30 else ALL) for k in range(60)]
+    samples = [
+        (k * 10_000_000, wild if k == 30 else np.ones(6), 0b111101 if k == 30 else ALL)
+        for k in range(60)
+    ]
     told = list(restamped((0.0, 0.025), samples))
     for found, out in told:
-        np.testing.assert_allclose(out[[i for i in range(6) if found >> i & 1]], 1.0, atol=1e-9)
+        np.testing.assert_allclose(
+            out[[i for i in range(6) if found >> i & 1]], 1.0, atol=1e-9
+        )
     assert 1 <= sum(not found >> 1 & 1 for found, _ in told[11:]) <= 2

@@ -29,15 +29,24 @@ FAULTS = (
 
 
 def digest(parts):
-    return hashlib.sha256(b"".join(np.asarray(part).tobytes() for part in parts)).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.asarray(part).tobytes() for part in parts)
+    ).hexdigest()
 
 
 def flight(detector):
     """Of messages in and out, with three faults, a lost and a cut message; and how many events there were."""
     biases = {"bias__startup_bias_duration": 0.3, "bias__max_rest_rate": 10.0}
     decision = {"decision__latch": False, "decision__clean_time": 0.2}
-    pipeline = Pipeline(parallel(2, detector__name=detector, noise__scale_std=0.002, **biases, **decision))
-    block, ear = struck(stream(pipeline.geometry, 140, 0.02), FAULTS, pipeline.channel_names), Ear(pipeline)
+    pipeline = Pipeline(
+        parallel(
+            2, detector__name=detector, noise__scale_std=0.002, **biases, **decision
+        )
+    )
+    block, ear = (
+        struck(stream(pipeline.geometry, 140, 0.02), FAULTS, pipeline.channel_names),
+        Ear(pipeline),
+    )
     for k, (unit, data) in enumerate(messages(block, 2)):
         if k != 41:
             ear.take(unit, data[: 50 if k == 81 else None])
@@ -51,9 +60,14 @@ def verdicts():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(single_fault, "TRIALS", 2)
         for name, options in VARIANTS:
-            for noise in (NoiseModel(1e-3, bound=1e-3), NoiseModel(1e-3, 2e-3, 3e-4, bound=4e-3)):
+            for noise in (
+                NoiseModel(1e-3, bound=1e-3),
+                NoiseModel(1e-3, 2e-3, 3e-4, bound=4e-3),
+            ):
                 detector = create_detector(name, usual_geometry(name), noise, **options)
-                z, acceleration = healthy(np.random.default_rng(21), detector.geometry, noise, 8)
+                z, acceleration = healthy(
+                    np.random.default_rng(21), detector.geometry, noise, 8
+                )
                 z[2:, 0] += 0.5
                 z[6:, 1] = np.nan
                 verdict = detector.detect(z, acceleration)
@@ -63,14 +77,27 @@ def verdicts():
 
 
 def digests():
-    found = {"verdicts": verdicts(), **{name: flight(name) for name in ("likelihood_ratio", "sequential")}}
+    found = {
+        "verdicts": verdicts(),
+        **{name: flight(name) for name in ("likelihood_ratio", "sequential")},
+    }
     return {name: list(one) for name, one in found.items()}
 
 
 def test_plain_python_gives_the_same_bits(root):
-    path = {"PYTHONPATH": os.pathsep.join([str(root / "test"), str(root)]), "NUMBA_DISABLE_JIT": "1"}
+    path = {
+        "PYTHONPATH": os.pathsep.join([str(root / "test"), str(root)]),
+        "NUMBA_DISABLE_JIT": "1",
+    }
     command = [sys.executable, "-m", "core.test_interpreted"]
-    done = subprocess.run(command, env=os.environ | path, cwd=root, text=True, capture_output=True, check=False)
+    done = subprocess.run(
+        command,
+        env=os.environ | path,
+        cwd=root,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     plain = json.loads(done.stdout)
     assert plain["interpreted"]

@@ -48,7 +48,9 @@ def lopsided(rng, n):
             axes[1] = -axes[0]
         if rng.random() < 0.2:
             axes[2] = axes[3] + 0.5 * axes[0]
-        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
+        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(
+            axes, axis=1, keepdims=True
+        )
         if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
             return Geometry(axes)
 
@@ -62,7 +64,11 @@ def sound(rng, geometry, noise, rows):
     z = along + rng.standard_normal((rows, n)) * model.noise_std
     if not noise.constant:
         z += along * rng.standard_normal((rows, n)) * model.scale_std
-        z += (acceleration @ geometry.axes.T) * rng.standard_normal((rows, n)) * model.timing_std
+        z += (
+            (acceleration @ geometry.axes.T)
+            * rng.standard_normal((rows, n))
+            * model.timing_std
+        )
     return z, acceleration
 
 
@@ -70,6 +76,10 @@ def alarms(detector, noise, rows, seed):
     """Number of alarms among samples of healthy channels."""
     rng, total = np.random.default_rng(seed), 0
     for start in range(0, rows, 100_000):
-        z, acceleration = sound(rng, detector.geometry, noise, min(100_000, rows - start))
-        total += int(detector.detect(z, None if noise.constant else acceleration).alarm.sum())
+        z, acceleration = sound(
+            rng, detector.geometry, noise, min(100_000, rows - start)
+        )
+        total += int(
+            detector.detect(z, None if noise.constant else acceleration).alarm.sum()
+        )
     return total

@@ -10,7 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from detectors.detector_trials import FIVE, VARIANTS, alarms, random_axes, usual_geometry
+from detectors.detector_trials import (
+    FIVE,
+    VARIANTS,
+    alarms,
+    random_axes,
+    usual_geometry,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,8 +33,14 @@ NAMES = sorted(DETECTORS)
 ANY_NUMBER = sorted(set(NAMES) - {"determinant"})
 LASTING = {"sequential": 200 * SIGMA}
 """Error of a channel without which a method gives no alarm in noise with single wild values, rad/s."""
-SINGLE_FAULT = sorted(set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum", "sequential"})
-RATE_OPTIONS = [name for name in NAMES if "false_alarm_probability" in accepted_options(detector_class(name))]
+SINGLE_FAULT = sorted(
+    set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum", "sequential"}
+)
+RATE_OPTIONS = [
+    name
+    for name in NAMES
+    if "false_alarm_probability" in accepted_options(detector_class(name))
+]
 RUN_LENGTHS = ("cusum", "sequential")
 
 BY_SETS = [variant for variant in VARIANTS if not detector_class(variant[0]).takes_any]
@@ -58,7 +70,9 @@ def stream(rng, geometry, rows):
     rate = np.cumsum(rng.normal(0, 0.05, (rows, 3)), axis=0)
     z = rate @ geometry.axes.T + rng.normal(0, SIGMA, (rows, geometry.n))
     at_fault = rng.random(rows) < 0.3
-    z[np.arange(rows), rng.integers(geometry.n, size=rows)] += at_fault * rng.normal(0, 20 * SIGMA, rows)
+    z[np.arange(rows), rng.integers(geometry.n, size=rows)] += at_fault * rng.normal(
+        0, 20 * SIGMA, rows
+    )
     return z, rng.normal(0, 5.0, (rows, 3))
 
 
@@ -75,7 +89,10 @@ def faulty(geometry, channel, size=50 * SIGMA, samples=40):
 
 def in_pieces(detector, z, acceleration, cuts):
     edges = [0, *sorted(cuts), len(z)]
-    parts = [detector.detect(z[a:b], None if acceleration is None else acceleration[a:b]) for a, b in pairwise(edges)]
+    parts = [
+        detector.detect(z[a:b], None if acceleration is None else acceleration[a:b])
+        for a, b in pairwise(edges)
+    ]
     return Verdict(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -94,7 +111,9 @@ def test_shapes_and_types(name, rows):
     for field, array in zip(Verdict._fields, verdict, strict=True):
         per_channel = field in ("suspects", "error", "scores")
         assert array.shape == (z.shape if per_channel else (rows,)), field
-        assert array.dtype == (np.bool_ if field in ("alarm", "suspects", "isolated") else np.float64), field
+        assert array.dtype == (
+            np.bool_ if field in ("alarm", "suspects", "isolated") else np.float64
+        ), field
     assert np.array_equal(z, before), "detect must not write to its argument"
     for layout in (np.asfortranarray(z), np.repeat(z, 2, axis=0)[::2]):
         assert_same_bits(verdict, detector_of(name).detect(layout))
@@ -105,7 +124,9 @@ def test_shapes_and_types(name, rows):
 def test_fields_agree_with_each_other(name, options, noise):
     detector = detector_of(name, noise, lopsided=True, **options)
     if name == "sequential" and not noise.constant:
-        pytest.skip("a motion that changes from sample to sample explains more than the fault")
+        pytest.skip(
+            "a motion that changes from sample to sample explains more than the fault"
+        )
     z, acceleration = stream(np.random.default_rng(11), detector.geometry, 2000)
     z[1000:1100, 1] += LASTING.get(name, 20 * SIGMA)
     lose(np.random.default_rng(12), z, 0.02)
@@ -137,7 +158,9 @@ def test_wrong_shape_is_refused(name, shape):
     noise=st.sampled_from([CONSTANT, MOVING]),
     lopsided=st.booleans(),
 )
-def test_how_a_stream_is_cut_changes_nothing(name, options, seed, cuts, lost, noise, lopsided):
+def test_how_a_stream_is_cut_changes_nothing(
+    name, options, seed, cuts, lost, noise, lopsided
+):
     rng = np.random.default_rng(seed)
     detector = detector_of(name, noise, lopsided, **options)
     z, turning = stream(rng, detector.geometry, 60)
@@ -175,8 +198,12 @@ def test_channels_present_judge_as_if_built_alone(name, options, noise):
             assert np.isnan([part.statistic, *part.scores.T]).all()
             assert not part.alarm.any()
             continue
-        expected = alone.detect(np.ascontiguousarray(z[rows][:, kept]), acceleration[rows])
-        of_channels = {f: getattr(part, f)[:, kept] for f in ("suspects", "error", "scores")}
+        expected = alone.detect(
+            np.ascontiguousarray(z[rows][:, kept]), acceleration[rows]
+        )
+        of_channels = {
+            f: getattr(part, f)[:, kept] for f in ("suspects", "error", "scores")
+        }
         assert_same_bits(part._replace(**of_channels), expected)
         judged += len(rows)
     assert judged > 100
@@ -211,7 +238,9 @@ def test_too_few_channels_is_not_healthy_but_unknown(name, left):
 
 
 def test_more_sets_of_channels_than_are_kept():
-    detector = create_detector("max_residual", Geometry.cone(10), CONSTANT, tolerance="paper")
+    detector = create_detector(
+        "max_residual", Geometry.cone(10), CONSTANT, tolerance="paper"
+    )
     rng = np.random.default_rng(15)
     z, _ = stream(rng, detector.geometry, 1 << 10)
     lost = np.arange(1 << 10)[:, None] >> np.arange(10) & 1
@@ -228,7 +257,9 @@ def test_fault_of_50_sigma_is_named_on_every_isolable_channel(name, options, sig
     assert geometry.isolable.all()
     for channel in range(geometry.n):
         # By evidence a name has to stand for a while.
-        verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 120))
+        verdict = detector_of(name, **options).detect(
+            faulty(geometry, channel, sign * 50 * SIGMA, 120)
+        )
         assert verdict.alarm[-1]
         assert verdict.isolated[-1]
         assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]
@@ -247,11 +278,16 @@ def test_value_no_gyro_can_measure(name, options, noise):
         verdict = detector_of(name, noise, **options).detect(wild, acceleration)
         assert verdict.alarm[-1]
         # At rest, or nearly, the condition number is documented to name wrongly.
-        assert verdict.suspects[-1, channel] or options.get("criterion") == "condition_number"
+        assert (
+            verdict.suspects[-1, channel]
+            or options.get("criterion") == "condition_number"
+        )
         assert np.isfinite(verdict.error).all()
         for size in (1e7, 1e160, 1e308):
             wild[5:, channel] = size
-            assert_same_bits(verdict, detector_of(name, noise, **options).detect(wild, acceleration))
+            assert_same_bits(
+                verdict, detector_of(name, noise, **options).detect(wild, acceleration)
+            )
 
 
 @each
@@ -259,7 +295,11 @@ def test_no_alarm_without_noise(name):
     """Not even in the rounding of single precision, after a long time of none."""
     rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
     z = np.vstack([np.zeros((10_000, 3)), rate]) @ usual_geometry(name).axes.T
-    assert not detector_of(name).detect(z.astype(np.float32).astype(np.float64)).alarm.any()
+    assert (
+        not detector_of(name)
+        .detect(z.astype(np.float32).astype(np.float64))
+        .alarm.any()
+    )
 
 
 def unequal(seed, n):
@@ -268,15 +308,34 @@ def unequal(seed, n):
     return random_axes(rng, n), NoiseModel(rng.uniform(0.5e-3, 2e-3, n))
 
 
-SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual")
+SEARCHES = (
+    "mean_abs_residual",
+    "mean_square_residual",
+    "rate_deviation",
+    "max_residual",
+)
 SLOWLY = NoiseModel(SIGMA, scale_std=1e-3, timing_std=1e-4)
-CONE, DODECAHEDRON, PAPER = Geometry.two_triad_cone(), Geometry.dodecahedron(), Geometry(FIVE)
-FOUR, UNLIKE = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3]), NoiseModel(SIGMA * np.array([1.0, 2.0, 0.5, 1.0, 4.0, 1.0]))
+CONE, DODECAHEDRON, PAPER = (
+    Geometry.two_triad_cone(),
+    Geometry.dodecahedron(),
+    Geometry(FIVE),
+)
+FOUR, UNLIKE = (
+    NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3]),
+    NoiseModel(SIGMA * np.array([1.0, 2.0, 0.5, 1.0, 4.0, 1.0])),
+)
 AS_MANY = [
     *((name, usual_geometry(name), CONSTANT, 1e-2) for name in RATE_OPTIONS),
     *((name, Geometry.cone(4), FOUR, 1e-2) for name in SEARCHES),
-    *((name, geometry, CONSTANT, 1e-3) for name in SEARCHES for geometry in (CONE, DODECAHEDRON)),
-    *(("projector", random_axes(np.random.default_rng(n), n), CONSTANT, 1e-3) for n in (5, 6, 7, 9, 12)),
+    *(
+        (name, geometry, CONSTANT, 1e-3)
+        for name in SEARCHES
+        for geometry in (CONE, DODECAHEDRON)
+    ),
+    *(
+        ("projector", random_axes(np.random.default_rng(n), n), CONSTANT, 1e-3)
+        for n in (5, 6, 7, 9, 12)
+    ),
     *(("recursive", *unequal(n, n), 1e-3) for n in (4, 5, 6, 9)),
     ("determinant", *unequal(6, 5), 1e-3),
     ("likelihood_ratio", DODECAHEDRON, UNLIKE, 1e-3),
@@ -284,11 +343,18 @@ AS_MANY = [
     *((name, CONE, SLOWLY, 1e-3) for name in (*SEARCHES, "recursive")),
     ("projector", DODECAHEDRON, SLOWLY, 1e-3),
     ("determinant", PAPER, SLOWLY, 1e-3),
-    *(("likelihood_ratio", geometry, MOVING, 1e-3) for geometry in (CONE, random_axes(np.random.default_rng(3), 7))),
+    *(
+        ("likelihood_ratio", geometry, MOVING, 1e-3)
+        for geometry in (CONE, random_axes(np.random.default_rng(3), 7))
+    ),
 ]
 LOPSIDED = {n: random_axes(np.random.default_rng(3), n) for n in (5, 6)}
 HARDLY_MORE = [
-    *((name, LOPSIDED[usual_geometry(name).n], noise) for name in RATE_OPTIONS for noise in (CONSTANT, MOVING)),
+    *(
+        (name, LOPSIDED[usual_geometry(name).n], noise)
+        for name in RATE_OPTIONS
+        for noise in (CONSTANT, MOVING)
+    ),
     *((name, *unequal(12, 7)) for name in SEARCHES),
 ]
 
@@ -296,7 +362,9 @@ HARDLY_MORE = [
 @pytest.mark.parametrize(("name", "geometry", "noise", "probability"), AS_MANY)
 def test_as_many_false_alarms_as_asked_for(name, geometry, noise, probability):
     """Above three parity dimensions the threshold itself is an estimate, good to about 1 %."""
-    detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
+    detector = create_detector(
+        name, geometry, noise, false_alarm_probability=probability
+    )
     rows = 200_000 if probability > 1e-4 else 3_000_000
     standard_error = math.sqrt(rows * probability * (1 - probability))
     off = alarms(detector, noise, rows, geometry.n) - rows * probability
@@ -306,16 +374,23 @@ def test_as_many_false_alarms_as_asked_for(name, geometry, noise, probability):
 @pytest.mark.parametrize(("name", "geometry", "noise"), HARDLY_MORE)
 def test_false_alarms_are_hardly_more_nor_far_fewer_on_any_axes(name, geometry, noise):
     rows, probability = 100_000, 0.01
-    detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
+    detector = create_detector(
+        name, geometry, noise, false_alarm_probability=probability
+    )
     assert 0.5 < alarms(detector, noise, rows, 1) / (rows * probability) < 1.1
 
 
 @pytest.mark.parametrize("name", [*RATE_OPTIONS, *RUN_LENGTHS])
 def test_a_rate_per_hour_is_a_probability_per_sample_or_a_run_length(name):
-    per_sample = {"run_length": 1e5} if name in RUN_LENGTHS else {"false_alarm_probability": 1e-5}
+    per_sample = (
+        {"run_length": 1e5}
+        if name in RUN_LENGTHS
+        else {"false_alarm_probability": 1e-5}
+    )
     per_hour = {"false_alarms_per_hour": 3.6, "sample_rate": 100.0}
     one, other = (
-        create_detector(name, usual_geometry(name), CONSTANT, **options) for options in (per_hour, per_sample)
+        create_detector(name, usual_geometry(name), CONSTANT, **options)
+        for options in (per_hour, per_sample)
     )
     z = np.zeros((1, one.geometry.n))
     assert one.detect(z).threshold == pytest.approx(other.detect(z).threshold, rel=1e-9)
@@ -331,17 +406,27 @@ def last_verdicts(name, geometry, **options):
         yield channel, Verdict(*(field[-1] for field in verdict))
 
 
-TRIADS, PAIR = Geometry.from_triads([np.eye(3)] * 2), [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]]
+TRIADS, PAIR = (
+    Geometry.from_triads([np.eye(3)] * 2),
+    [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]],
+)
 ALIKE = [
     *((name, {}, TRIADS, [[0, 3], [1, 4], [2, 5]] * 2) for name in ANY_NUMBER),
     *((name, {}, Geometry.cone(4), [[0, 1, 2, 3]] * 4) for name in ANY_NUMBER),
-    *(("determinant", {"criterion": one}, Geometry(PAIR), [[0, 1]] * 2) for one in ("determinant", "condition_number")),
+    *(
+        ("determinant", {"criterion": one}, Geometry(PAIR), [[0, 1]] * 2)
+        for one in ("determinant", "condition_number")
+    ),
 ]
 
 
 @pytest.mark.parametrize(("name", "options", "geometry", "alike"), ALIKE)
-def test_channels_that_look_alike_are_suspects_together_and_none_is_isolated(name, options, geometry, alike):
-    for suspects, (_, last) in zip(alike, last_verdicts(name, geometry, **options), strict=False):
+def test_channels_that_look_alike_are_suspects_together_and_none_is_isolated(
+    name, options, geometry, alike
+):
+    for suspects, (_, last) in zip(
+        alike, last_verdicts(name, geometry, **options), strict=False
+    ):
         assert last.alarm
         assert not last.isolated
         assert np.flatnonzero(last.suspects).tolist() == suspects
@@ -359,7 +444,14 @@ def test_three_parallel_triads(name):
 @each_variant
 def test_channel_no_fault_of_which_is_seen_is_never_suspect(name, options):
     root = np.sqrt(0.5)
-    axes = [[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0.8, 0]]
+    axes = [
+        [1, 0, 0],
+        [0, 1, 0],
+        [root, root, 0],
+        [root, -root, 0],
+        [0, 0, 1],
+        [0.6, 0.8, 0],
+    ]
     geometry = Geometry(axes if name in ANY_NUMBER else axes[:5])
     assert np.flatnonzero(~geometry.detectable).tolist() == [4]
     for channel, last in last_verdicts(name, geometry, **options):
@@ -369,7 +461,9 @@ def test_channel_no_fault_of_which_is_seen_is_never_suspect(name, options):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [one for one in VARIANTS if one[0] in SINGLE_FAULT and one[0] != "recursive"], ids=str
+    ("name", "options"),
+    [one for one in VARIANTS if one[0] in SINGLE_FAULT and one[0] != "recursive"],
+    ids=str,
 )
 def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
     """There some methods name one channel for a fault of another, however large it is.
@@ -379,7 +473,9 @@ def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
     isolated = 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        detector = create_detector(name, random_axes(rng, 5 + seed % 4), CONSTANT, **options)
+        detector = create_detector(
+            name, random_axes(rng, 5 + seed % 4), CONSTANT, **options
+        )
         n = detector.geometry.n
         for channel in range(n):
             z = rng.normal(0, SIGMA, (40, n))
@@ -387,8 +483,13 @@ def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
             z[20:, channel] += 5000 * SIGMA
             verdict = detector.detect(z)
             # At 50 sigma a channel that is hardly seen gives no alarm, at 5000 every one does.
-            assert verdict.suspects[20:, channel].all() or not detector.geometry.detectable[channel]
-            assert (verdict.suspects[verdict.isolated] == (np.arange(n) == channel)).all()
+            assert (
+                verdict.suspects[20:, channel].all()
+                or not detector.geometry.detectable[channel]
+            )
+            assert (
+                verdict.suspects[verdict.isolated] == (np.arange(n) == channel)
+            ).all()
             assert verdict.isolated[20:].all() or not detector.isolable[channel]
             isolated += bool(verdict.isolated[20:].all())
     assert isolated > 60
@@ -429,9 +530,13 @@ REFUSED = [
 
 @each
 def test_unknown_option_or_detector(name):
-    with pytest.raises(DetectorError, match=r"no option 'sensitivity', expected one of: \w+"):
+    with pytest.raises(
+        DetectorError, match=r"no option 'sensitivity', expected one of: \w+"
+    ):
         create_detector(name, usual_geometry(name), CONSTANT, sensitivity=3)
-    with pytest.raises(DetectorError, match=rf"unknown detector '{name}s', expected one of: .*{name}"):
+    with pytest.raises(
+        DetectorError, match=rf"unknown detector '{name}s', expected one of: .*{name}"
+    ):
         create_detector(f"{name}s", usual_geometry(name), CONSTANT)
 
 

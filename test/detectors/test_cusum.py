@@ -34,7 +34,10 @@ def runs_to_alarm(detector, noise, runs, seed, shift=0.0, block=500):
 
 
 def test_scores_are_the_sums():
-    geometry, z = Geometry.dodecahedron(), np.random.default_rng(1).normal(0.3, 1, (200, 6))
+    geometry, z = (
+        Geometry.dodecahedron(),
+        np.random.default_rng(1).normal(0.3, 1, (200, 6)),
+    )
     detector = Cusum(geometry, UNIT, shift=0.5)
     w = (z @ geometry.S) / geometry.sensitivity
     up = down = np.zeros(6)
@@ -95,7 +98,9 @@ def test_what_a_start_up_average_leaves_is_no_drift():
     # A small shift has a small k: this is where the bias adds up.
     slow, usual = Cusum(geometry, noise, shift=0.1), Cusum(geometry, noise)
     for _ in range(12):
-        z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
+        z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(
+            axis=0
+        )
         for detector in (slow, usual):
             detector.reset()
             assert not detector.detect(z).alarm.any()
@@ -106,7 +111,11 @@ def test_what_a_start_up_average_leaves_is_no_drift():
 
 
 def test_onset():
-    detector, rng, off = Cusum(Geometry.dodecahedron(), UNIT, shift=1.0), np.random.default_rng(11), []
+    detector, rng, off = (
+        Cusum(Geometry.dodecahedron(), UNIT, shift=1.0),
+        np.random.default_rng(11),
+        [],
+    )
     for _ in range(150):
         begin = int(rng.integers(300, 700))
         z = rng.standard_normal((begin + 400, 6))

@@ -28,20 +28,44 @@ def sample(rng, geometry, bound, faults):
 
 def test_the_worked_example_of_the_paper():
     c, s, h = 1 / np.sqrt(3), np.sqrt(2 / 3) / 2, np.sqrt(2 / 3) * np.sqrt(3) / 2
-    geometry = Geometry([[-c, -2 * s, 0], [c, s, -h], [-c, s, h], [c, -2 * s, 0], [-c, s, -h], [c, s, h]])
-    z = geometry.axes @ [-172.82, 604.19, -1284.63] + [0.50, 20.10, -50.80, -0.01, -0.02, 0.30]
-    np.testing.assert_allclose(z, [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19], atol=0.0051)
+    geometry = Geometry(
+        [
+            [-c, -2 * s, 0],
+            [c, s, -h],
+            [-c, s, h],
+            [c, -2 * s, 0],
+            [-c, s, -h],
+            [c, s, h],
+        ]
+    )
+    z = geometry.axes @ [-172.82, 604.19, -1284.63] + [
+        0.50,
+        20.10,
+        -50.80,
+        -0.01,
+        -0.02,
+        0.30,
+    ]
+    np.testing.assert_allclose(
+        z, [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19], atol=0.0051
+    )
     detector = guaranteed(geometry, max_faults=2)
     lower, upper = (bounds[0] for bounds in detector.error_bounds(z[None]))
     printed = [0, 20.89, -51.35, 0, 0, 0]
     np.testing.assert_allclose((lower + upper) / 2, printed, atol=0.0051)
-    np.testing.assert_allclose((upper - lower) / 2, [1.00, 2.74, 2.74, 1.00, 1.00, 1.00], atol=0.0051)
-    np.testing.assert_allclose([z[1] - upper[1], z[1] - lower[1]], [1051.72, 1057.20], atol=0.0051)
+    np.testing.assert_allclose(
+        (upper - lower) / 2, [1.00, 2.74, 2.74, 1.00, 1.00, 1.00], atol=0.0051
+    )
+    np.testing.assert_allclose(
+        [z[1] - upper[1], z[1] - lower[1]], [1051.72, 1057.20], atol=0.0051
+    )
     verdict = detector.detect(z[None])
     assert verdict.isolated[0]
     assert np.flatnonzero(verdict.suspects[0]).tolist() == [1, 2]
     np.testing.assert_allclose(verdict.error[0], printed, atol=0.0051)
-    assert [detector.sets[k] for k in np.flatnonzero(detector.culprits(z[None])[0])] == [(1, 2)]
+    assert [
+        detector.sets[k] for k in np.flatnonzero(detector.culprits(z[None])[0])
+    ] == [(1, 2)]
 
 
 @pytest.mark.parametrize(("n", "trials"), [(5, 8), (6, 8), (7, 5), (9, 3)])
@@ -65,8 +89,13 @@ def test_the_mildest_explanation_is_that_of_a_linear_programme():
     while compared < 12:
         geometry, bound = lopsided(rng, 6), rng.uniform(0.5, 2, 6)
         z = sample(rng, geometry, bound, int(rng.integers(3)))
-        statistic = guaranteed(geometry, bound, max_faults=2).detect(z[None]).statistic[0]
-        sizes = [least_largest(geometry.axes, bound, z, pair) for pair in combinations(range(6), 2)]
+        statistic = (
+            guaranteed(geometry, bound, max_faults=2).detect(z[None]).statistic[0]
+        )
+        sizes = [
+            least_largest(geometry.axes, bound, z, pair)
+            for pair in combinations(range(6), 2)
+        ]
         if min(sizes) > 1.001:
             assert statistic == pytest.approx(min(sizes), rel=1e-6)
             compared += 1
@@ -86,7 +115,10 @@ def by_programmes(H, bound, z, faults):
     hull = np.stack([np.full(n, np.inf), np.full(n, -np.inf)])
     for struck in combinations(range(n), faults):
         kept = [i for i in range(n) if i not in struck]
-        A, b = np.vstack([H[kept], -H[kept]]), np.concatenate([z[kept] + bound[kept], bound[kept] - z[kept]])
+        A, b = (
+            np.vstack([H[kept], -H[kept]]),
+            np.concatenate([z[kept] + bound[kept], bound[kept] - z[kept]]),
+        )
         feasible.append(minimum(np.zeros(3), A, b) == 0)
         if feasible[-1]:
             for i in range(n):
@@ -99,7 +131,9 @@ def least_largest(H, bound, z, struck):
     """Least t for which the errors of the channels struck stay within t bounds and all others within one."""
     grows = np.isin(np.arange(len(H)), struck) * bound
     fixed = bound - grows
-    A = np.vstack([np.column_stack([H, -grows]), np.column_stack([-H, -grows]), [0, 0, 0, -1]])
+    A = np.vstack(
+        [np.column_stack([H, -grows]), np.column_stack([-H, -grows]), [0, 0, 0, -1]]
+    )
     return minimum([0, 0, 0, 1], A, np.concatenate([z + fixed, fixed - z, [0]]))
 
 
@@ -117,7 +151,9 @@ def test_what_is_certain_is_true(seed, n, size, threshold):
     rows = 30
     error = rng.uniform(-1, 1, (rows, n)) * bound
     for row in error:
-        row[rng.choice(n, detector.max_faults, replace=False)] += size * rng.normal(size=detector.max_faults)
+        row[rng.choice(n, detector.max_faults, replace=False)] += size * rng.normal(
+            size=detector.max_faults
+        )
     z = rng.normal(0, 5, (rows, 3)) @ geometry.axes.T + error
     lower, upper = detector.error_bounds(z)
     assert (lower <= error + 1e-9).all()
@@ -133,14 +169,25 @@ def test_what_is_certain_is_true(seed, n, size, threshold):
 
 
 def test_more_faults_than_allowed_are_a_contradiction():
-    assert [guaranteed(Geometry.cone(n)).max_faults for n in range(4, 10)] == [0, 1, 2, 2, 2, 2]
+    assert [guaranteed(Geometry.cone(n)).max_faults for n in range(4, 10)] == [
+        0,
+        1,
+        2,
+        2,
+        2,
+        2,
+    ]
     geometry = Geometry.dodecahedron()
     z = (geometry.axes @ [1.0, 2.0, 3.0] + [60, -70, 80, 0, 0, 0])[None]
     detector = guaranteed(geometry, max_faults=1)
     assert np.isnan(detector.error_bounds(z)).all()
     assert not detector.culprits(z).any()
     verdict = detector.detect(z)
-    assert (verdict.statistic[0], verdict.alarm[0], verdict.isolated[0]) == (np.inf, True, False)
+    assert (verdict.statistic[0], verdict.alarm[0], verdict.isolated[0]) == (
+        np.inf,
+        True,
+        False,
+    )
     assert verdict.suspects.all()
     assert not verdict.error.any()
 
@@ -162,5 +209,7 @@ def test_both_channels_of_an_axis_struck_leave_it_without_bounds():
 def test_without_a_bound_and_with_too_many_faults_it_is_refused():
     with pytest.raises(FdiError, match=r"needs noise.bound"):
         Guaranteed(Geometry.two_triad_cone(), NoiseModel(1.0))
-    with pytest.raises(FdiError, match="max_faults is 2 with 5 channels, expected at most 1"):
+    with pytest.raises(
+        FdiError, match="max_faults is 2 with 5 channels, expected at most 1"
+    ):
         guaranteed(Geometry.cone(5), max_faults=2)

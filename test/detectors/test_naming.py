@@ -35,13 +35,21 @@ class Mean:
     """A mean to be explained, its covariance, and the motion it is of."""
 
     def __init__(self, geometry, y, covariance, rate, acceleration):
-        self.geometry, self.n, self.y, self.covariance = geometry, geometry.n, y, covariance
+        self.geometry, self.n, self.y, self.covariance = (
+            geometry,
+            geometry.n,
+            y,
+            covariance,
+        )
         self.params = Sequential(geometry, NoiseModel(1.0)).constants[0]
         self.rows = allocate(Inference)
         own = self.own = self.rows[0]
         own["mask"] = own["judged"] = (1 << self.n) - 1
         own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, covariance
-        own["rate"], own["angular_acceleration"][: self.n] = rate, geometry.axes @ acceleration
+        own["rate"], own["angular_acceleration"][: self.n] = (
+            rate,
+            geometry.axes @ acceleration,
+        )
         explain(self.params, own)
 
     def hypotheses(self):
@@ -50,7 +58,10 @@ class Mean:
         add_channels(self.own, self.n)
         add_units(self.params, self.own)
         count = int(self.own["count"])
-        return zip(*(self.own[name][:count].tolist() for name in ("members", "whole", "odds")), strict=True)
+        return zip(
+            *(self.own[name][:count].tolist() for name in ("members", "whole", "odds")),
+            strict=True,
+        )
 
 
 def by_channels(hypotheses):
@@ -70,9 +81,14 @@ def evidence(mean, errors):
 
 def amplitudes(mean, directions):
     """Generalised least squares with a rate and amplitudes (k,) of directions (n, k): estimates and covariance."""
-    columns, weight = np.hstack([mean.geometry.axes, directions]), np.linalg.inv(mean.covariance)
+    columns, weight = (
+        np.hstack([mean.geometry.axes, directions]),
+        np.linalg.inv(mean.covariance),
+    )
     normal = columns.T @ weight @ columns
-    return np.linalg.solve(normal, columns.T @ weight @ mean.y)[3:], np.linalg.inv(normal)[3:, 3:]
+    return np.linalg.solve(normal, columns.T @ weight @ mean.y)[3:], np.linalg.inv(
+        normal
+    )[3:, 3:]
 
 
 def oracle(mean):
@@ -85,9 +101,23 @@ def oracle(mean):
         if not std:
             error, scatter = amplitudes(mean, directions)
             # What can hardly be told apart has no figure worth comparing.
-            variance = float((error**2 + np.diag(scatter)).mean()) if np.linalg.cond(scatter) < 1e4 else np.nan
-        ratio = evidence(mean, variance * directions @ directions.T) - healthy if variance == variance else np.nan
-        found.append((mask_of(channels), int(std > 0), np.log(prior) + ratio - (0.0 if std else spread)))
+            variance = (
+                float((error**2 + np.diag(scatter)).mean())
+                if np.linalg.cond(scatter) < 1e4
+                else np.nan
+            )
+        ratio = (
+            evidence(mean, variance * directions @ directions.T) - healthy
+            if variance == variance
+            else np.nan
+        )
+        found.append(
+            (
+                mask_of(channels),
+                int(std > 0),
+                np.log(prior) + ratio - (0.0 if std else spread),
+            )
+        )
 
     for i in range(n):
         take((i,), 1.0, unit_vectors[:, [i]])
@@ -102,7 +132,12 @@ def oracle(mean):
             (mean.geometry.axes @ mean.own["rate"], GAIN_STD),
             (mean.own["angular_acceleration"][:n], DELAY_STD),
         ):
-            take(unit, COINCIDENCE / len(units), np.where(inside, about, 0.0)[:, None], std)
+            take(
+                unit,
+                COINCIDENCE / len(units),
+                np.where(inside, about, 0.0)[:, None],
+                std,
+            )
     return found
 
 
@@ -127,10 +162,15 @@ def test_odds_are_those_of_normal_densities(seed, n):
     # Pairs that can hardly be told apart are left out.
     assert all(channels.bit_count() == 2 for channels in theirs.keys() - ours.keys())
     for channels, found in ours.items():
-        (kinds, odds), (expected_kinds, expected) = zip(*found, strict=True), zip(*theirs[channels], strict=True)
+        (kinds, odds), (expected_kinds, expected) = (
+            zip(*found, strict=True),
+            zip(*theirs[channels], strict=True),
+        )
         assert kinds == expected_kinds
         if np.isfinite(expected).all():
-            np.testing.assert_allclose(np.sort(odds), np.sort(expected), rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(
+                np.sort(odds), np.sort(expected), rtol=1e-4, atol=1e-3
+            )
 
 
 @settings(max_examples=25)
@@ -141,7 +181,9 @@ def test_what_no_hypothesis_explains_blames_all(seed, n):
     root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
     best = [i for i in range(n) if int(mean.own["likeliest"]) >> i & 1]
     columns = root @ np.hstack([mean.geometry.axes, np.eye(n)[:, best]])
-    left = root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
+    left = (
+        root @ mean.y - columns @ np.linalg.lstsq(columns, root @ mean.y, rcond=None)[0]
+    )
     limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)
     if left @ left > 1.01 * limit:
         assert (mean.own["common"], mean.own["union"]) == (0, (1 << n) - 1)

@@ -58,12 +58,20 @@ def after(size, rows):
     return built()
 
 
-fresh, measured, rested = partial(after, 1.0, 0), partial(after, 1.0, 4000), partial(after, 0.2, 20_000)
+fresh, measured, rested = (
+    partial(after, 1.0, 0),
+    partial(after, 1.0, 4000),
+    partial(after, 0.2, 20_000),
+)
 
 
 @pytest.mark.parametrize(
     ("geometry", "noise"),
-    [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
+    [
+        (CONE, UNIT),
+        (Geometry.from_triads([np.eye(3)] * 3), UNIT),
+        (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1])),
+    ],
 )
 def test_run_length_is_at_least_the_one_asked_for(geometry, noise):
     detector, samples, alarms = sequential(geometry, noise, run_length=1000), 0, 0
@@ -82,7 +90,11 @@ def test_delays_beside_the_optimal_bound(size, most):
     """After 40 s without a fault, over which the noise was measured."""
     delays = []
     for k in range(60):
-        alarm = measured().detect(white(k, 200) + fault(k % 6, -size if k % 2 else size)).alarm
+        alarm = (
+            measured()
+            .detect(white(k, 200) + fault(k % 6, -size if k % 2 else size))
+            .alarm
+        )
         assert alarm.any()
         delays.append(int(alarm.argmax()) + 1)
     assert np.mean(delays) < most * BOUND[size]
@@ -98,7 +110,12 @@ def test_what_has_passed_is_forgotten():
 
 
 @settings(max_examples=40)
-@given(size=st.floats(-1e7, 1e7), channel=st.integers(0, 5), at=st.integers(0, 699), common=st.booleans())
+@given(
+    size=st.floats(-1e7, 1e7),
+    channel=st.integers(0, 5),
+    at=st.integers(0, 699),
+    common=st.booleans(),
+)
 def test_one_wild_value_never_alarms(size, channel, at, common):
     z = white(9, 700)
     # A spike that all channels have in the same measure is one of the rate at times.
@@ -117,14 +134,23 @@ def test_a_bias_is_learned_and_what_comes_later_is_found():
 
 def test_errors_that_motion_explains_never_alarm():
     """A turn as long as it likes, with scale factors up to three standard deviations off, and late instants."""
-    rng, noise = np.random.default_rng(12), NoiseModel(0.003, scale_std=0.002, timing_std=3e-4)
+    rng, noise = (
+        np.random.default_rng(12),
+        NoiseModel(0.003, scale_std=0.002, timing_std=3e-4),
+    )
     t = np.arange(20_000) / 100
-    rate = np.stack([np.sin(2 * t), 1.5 * np.cos(0.3 * t), np.full_like(t, 3.0)], axis=1)
+    rate = np.stack(
+        [np.sin(2 * t), 1.5 * np.cos(0.3 * t), np.full_like(t, 3.0)], axis=1
+    )
     turning = np.gradient(rate, 0.01, axis=0)
     for _ in range(3):
         scale, delay = 0.002 * rng.uniform(-3, 3, 6), 3e-4 * rng.uniform(-3, 3, 6)
         z = (rate @ CONE.axes.T) * (1 + scale) + (turning @ CONE.axes.T) * delay
-        assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
+        assert (
+            not sequential(noise=noise)
+            .detect(z + rng.normal(0, 0.003, z.shape), turning)
+            .alarm.any()
+        )
 
 
 def coloured(seed, correlation):
@@ -142,10 +168,19 @@ def spiky(rng):
 
 
 NOISES = {
-    "twice as large at once": (measured, [2.0 * white(seed, 600) for seed in range(20)]),
+    "twice as large at once": (
+        measured,
+        [2.0 * white(seed, 600) for seed in range(20)],
+    ),
     "as expected after a long rest": (rested, [white(seed, 400) for seed in range(20)]),
-    "coloured": (fresh, [coloured(seed, one) for seed in range(4) for one in (0.5, 0.9)]),
-    "of heavy tails": (fresh, [np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2)]),
+    "coloured": (
+        fresh,
+        [coloured(seed, one) for seed in range(4) for one in (0.5, 0.9)],
+    ),
+    "of heavy tails": (
+        fresh,
+        [np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2)],
+    ),
     "with spikes now and then": (fresh, [spiky(np.random.default_rng(10))]),
 }
 
@@ -181,14 +216,19 @@ def stamped(seconds, z):
 
 def test_an_undecided_set_leaves_the_culprit_as_evidence_grows():
     """Three parallel triads at rest in the monitor, after ten seconds with a bias of four noise_std on imu_2.y."""
-    settings, sizes = parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0), []
+    settings, sizes = (
+        parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0),
+        [],
+    )
     for seed in range(8):
         pipeline, z = Pipeline(settings), SIGMA * white(seed, 2500, 9)
         z[1000:, 4] += 4.0 * SIGMA
         output = pipeline.process(stamped(np.arange(2500) / RATE, z))
         sizes += [(output.state == ChannelState.AMBIGUOUS).sum(axis=1).max()]
         assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
-        assert output.state[-1].tolist() == [ChannelState.FAULTY * (i == 4) for i in range(9)]
+        assert output.state[-1].tolist() == [
+            ChannelState.FAULTY * (i == 4) for i in range(9)
+        ]
     assert max(sizes) > 1
 
 
@@ -197,7 +237,11 @@ def test_an_undecided_set_leaves_the_culprit_as_evidence_grows():
 def test_single_spikes_teach_nothing_and_name_nobody(kind, value):
     """Sixty values far off: before the first motion no delay is known, and after it none is wrong."""
     one, rng, still = vehicle(2, kind, 3), np.random.default_rng(52), 1400
-    axes = {"geometry.preset": "axes", "geometry.axes": one.axes.ravel().tolist(), "imus.mounts": []}
+    axes = {
+        "geometry.preset": "axes",
+        "geometry.axes": one.axes.ravel().tolist(),
+        "imus.mounts": [],
+    }
     z = one.block.z.copy()
     at = rng.integers(len(z), size=60), rng.integers(9, size=60)
     z[at] = z[at] + 1.0 if value == 1.0 else value
@@ -207,14 +251,19 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind, value):
     events = pipeline.process(Block(one.block.stamp[still:], z[still:])).events
     assert not [event for event in events if event.after is ChannelState.FAULTY]
     status = pipeline.status()
-    assert (np.abs(np.subtract(status.delays, one.late)) < 4 * np.array(status.delay_std) + 1e-4).all()
+    assert (
+        np.abs(np.subtract(status.delays, one.late))
+        < 4 * np.array(status.delay_std) + 1e-4
+    ).all()
 
 
 def two_units(seconds, late, seed):
     """Two parallel units in quick motion, of which the second stamps its values late."""
     z = np.hstack([swing(seconds), swing(seconds - late)])
     z += SIGMA * white(seed, *z.shape)
-    return Pipeline.from_config(parallel(2, detector__name="sequential")), stamped(seconds, z)
+    return Pipeline.from_config(parallel(2, detector__name="sequential")), stamped(
+        seconds, z
+    )
 
 
 @pytest.mark.parametrize("hole", [0.02, 0.05, 0.1])
@@ -224,7 +273,9 @@ def test_holes_in_the_stream_teach_no_wrong_delay(hole, late):
     seconds = np.arange(0.0, 20.0, 1.0 / RATE)
     pipeline, stream = two_units(seconds[seconds % (0.1 + hole) < 0.1], late, 3)
     output = pipeline.process(stream)
-    assert not np.isin(output.state, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)).any()
+    assert not np.isin(
+        output.state, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+    ).any()
     status = pipeline.status()
     assert abs(status.delays[1] - late) < 3.5 * status.delay_std[1] + 1e-4
     assert status.delay_std[1] < 0.002
@@ -232,11 +283,18 @@ def test_holes_in_the_stream_teach_no_wrong_delay(hole, late):
 
 def flown_with_a_hole(units, hole, fault, seed):
     """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
-    rng, seconds = np.random.default_rng([units, seed]), np.arange(0.0, 24.0 + hole, 1.0 / RATE)
+    rng, seconds = (
+        np.random.default_rng([units, seed]),
+        np.arange(0.0, 24.0 + hole, 1.0 / RATE),
+    )
     rate = swing(seconds) * np.clip((seconds[:, None] - 4.0) / 2.0, 0.0, 1.0)
     # Biases, their walk and their warming as the settings allow.
-    bias = rng.normal(0.0, 0.01, 3 * units) + np.outer(seconds, rng.normal(0.0, 5e-6, 3 * units))
-    bias = bias + np.cumsum(5e-5 / math.sqrt(RATE) * rng.standard_normal(bias.shape), axis=0)
+    bias = rng.normal(0.0, 0.01, 3 * units) + np.outer(
+        seconds, rng.normal(0.0, 5e-6, 3 * units)
+    )
+    bias = bias + np.cumsum(
+        5e-5 / math.sqrt(RATE) * rng.standard_normal(bias.shape), axis=0
+    )
     z = np.hstack([rate] * units) + bias + SIGMA * rng.standard_normal(bias.shape)
     z[seconds > 12.0 + hole / 2, 4] += fault
     there = (seconds < 12.0) | (seconds >= 12.0 + hole)
@@ -253,8 +311,13 @@ def test_a_fault_that_begins_in_a_hole_is_found_and_none_without(units, hole):
         assert not np.isin(state, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)).any()
         if hole < 20.0:
             found = flown_with_a_hole(units, hole, 0.01, seed).state[1600]
-            faulty, doubtful = (np.flatnonzero(found == one) for one in (ChannelState.FAULTY, ChannelState.AMBIGUOUS))
-            assert (faulty.tolist(), doubtful.tolist()) == (([4], []) if units == 3 else ([], [1, 4]))
+            faulty, doubtful = (
+                np.flatnonzero(found == one)
+                for one in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+            )
+            assert (faulty.tolist(), doubtful.tolist()) == (
+                ([4], []) if units == 3 else ([], [1, 4])
+            )
 
 
 @pytest.mark.parametrize("offset", [-0.04, -0.02, 0.02, 0.04])
@@ -278,7 +341,11 @@ def test_the_level_covers_a_pair_that_has_the_third_named(size):
     rate = swing(seconds) * (seconds > 5.0)[:, None]
     z = rate @ axes.T + SIGMA * white(1, 3000, 9)
     z[1200:, [0, 3]] += size
-    output = Pipeline(mounted(axes, bias__startup_bias_duration=4.0)).process(stamped(seconds, z))
-    assert [event.channel for event in output.events if event.after is ChannelState.FAULTY] == [6]
+    output = Pipeline(mounted(axes, bias__startup_bias_duration=4.0)).process(
+        stamped(seconds, z)
+    )
+    assert [
+        event.channel for event in output.events if event.after is ChannelState.FAULTY
+    ] == [6]
     assert (np.abs(output.rate - rate) <= output.level)[1301:].all()
     assert size < output.level[1301:, 0].max() < size + 0.1

@@ -26,7 +26,10 @@ FLIGHTS = 3
 
 def flown(units, name):
     pipeline = Pipeline.from_config(config_of(units, CONDITIONS[name][0], Asked()))
-    flights = [judged(pipeline, name, np.random.default_rng([units, k])) for k in range(FLIGHTS)]
+    flights = [
+        judged(pipeline, name, np.random.default_rng([units, k]))
+        for k in range(FLIGHTS)
+    ]
     return {key: np.array([flight[key] for flight in flights]) for key in flights[0]}
 
 

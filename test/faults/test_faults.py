@@ -25,12 +25,18 @@ EXAMPLES = examples("imu_2.y", "imu_2", 1.0, 3.0)
 
 def stream(rows=500, seed=0):
     random = np.random.default_rng(seed)
-    stamp = 1_700_000_000_000_000_000 + np.arange(rows) * 10_000_000 + random.integers(0, 1_000_000, rows)
+    stamp = (
+        1_700_000_000_000_000_000
+        + np.arange(rows) * 10_000_000
+        + random.integers(0, 1_000_000, rows)
+    )
     return Block(stamp, random.normal(0, 1, (rows, 6)))
 
 
 def inject(fault, block):
-    injector = Injector([parse_fault(fault) if isinstance(fault, str) else fault], NAMES)
+    injector = Injector(
+        [parse_fault(fault) if isinstance(fault, str) else fault], NAMES
+    )
     return injector.apply(block), injector
 
 
@@ -53,7 +59,9 @@ def test_ground_truth_covers_all_that_is_changed_and_words_of_a_fault_read_back(
     assert changed[struck].any()
     columns = [3, 4, 5] if FAULT_KINDS[kind].whole_unit else [4]
     _, active = during(block)
-    np.testing.assert_array_equal(struck[:, columns], np.repeat(active[:, None], len(columns), axis=1))
+    np.testing.assert_array_equal(
+        struck[:, columns], np.repeat(active[:, None], len(columns), axis=1)
+    )
 
 
 def test_each_kind_does_what_it_says():
@@ -68,17 +76,26 @@ def test_each_kind_does_what_it_says():
         "scale": true * (1 + kinds["scale"].size),
         "stuck": np.full(len(true), block.z[~active & (time < 1), 4][-1]),
         "dropout": np.full(len(true), np.nan),
-        "intermittent": true + kinds["intermittent"].size * (rest < kinds["intermittent"].duty),
-        "saturation": np.clip(true, -kinds["saturation"].size, kinds["saturation"].size),
+        "intermittent": true
+        + kinds["intermittent"].size * (rest < kinds["intermittent"].duty),
+        "saturation": np.clip(
+            true, -kinds["saturation"].size, kinds["saturation"].size
+        ),
         "sign": -true,
         "delay": block.z[np.flatnonzero(active) - kinds["delay"].size, 4],
-        "oscillation": true + kinds["oscillation"].size * np.sin(2 * np.pi * kinds["oscillation"].frequency * since),
+        "oscillation": true
+        + kinds["oscillation"].size
+        * np.sin(2 * np.pi * kinds["oscillation"].frequency * since),
     }
     for kind, values in expected.items():
         faulty, _ = inject(EXAMPLES[kind], block)
-        np.testing.assert_allclose(faulty.z[active, 4], values, rtol=1e-12, atol=1e-12, err_msg=kind)
+        np.testing.assert_allclose(
+            faulty.z[active, 4], values, rtol=1e-12, atol=1e-12, err_msg=kind
+        )
     for words, value in (("size=0.3", 0.3), ("", block.z[0, 0])):
-        assert set(inject(f"channel=imu_1.x kind=stuck {words}", block)[0].z[:, 0]) == {value}
+        assert set(inject(f"channel=imu_1.x kind=stuck {words}", block)[0].z[:, 0]) == {
+            value
+        }
 
 
 def test_studies_know_a_size_of_every_kind_that_needs_one():
@@ -91,14 +108,26 @@ def test_studies_know_a_size_of_every_kind_that_needs_one():
 def test_random_kinds_have_the_stated_strength():
     rows = 100_000
     block = Block(np.arange(rows) * 10_000_000, np.zeros((rows, 6)))
-    added = inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=3", block)[0].z[:, 0]
-    assert (added != inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=4", block)[0].z[:, 0]).all()
+    added = inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=3", block)[0].z[
+        :, 0
+    ]
+    assert (
+        added
+        != inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=4", block)[0].z[
+            :, 0
+        ]
+    ).all()
     assert added.std() == pytest.approx(0.1, rel=0.01)
     assert abs(added.mean()) < 4 * 0.1 / math.sqrt(rows)
-    added = inject("channel=imu_1.x kind=spike size=0.5 rate=20 start=0", block)[0].z[:, 0]
+    added = inject("channel=imu_1.x kind=spike size=0.5 rate=20 start=0", block)[0].z[
+        :, 0
+    ]
     assert set(np.unique(added)) == {-0.5, 0.0, 0.5}
     expected = rows * -math.expm1(-20 * 0.01)
-    for count, mean in (((added != 0).sum(), expected), ((added > 0).sum(), expected / 2)):
+    for count, mean in (
+        ((added != 0).sum(), expected),
+        ((added > 0).sum(), expected / 2),
+    ):
         assert abs(count - mean) < 5 * math.sqrt(mean)
 
 
@@ -106,16 +135,23 @@ def test_missing_is_not_delivered_and_nan_is():
     block = stream()
     _, active = during(block)
     assert inject(EXAMPLES["dropout"], block)[0].received is None
-    missing = inject(f"{EXAMPLES['dropout']}".replace("missing=0", "missing=1"), block)[0]
+    missing = inject(f"{EXAMPLES['dropout']}".replace("missing=0", "missing=1"), block)[
+        0
+    ]
     np.testing.assert_array_equal(missing.received[:, 4], ~active)
     lost = inject(EXAMPLES["triad_loss"], block)[0]
-    np.testing.assert_array_equal(lost.received[:, 3:], np.repeat(~active[:, None], 3, axis=1))
+    np.testing.assert_array_equal(
+        lost.received[:, 3:], np.repeat(~active[:, None], 3, axis=1)
+    )
     assert lost.received[:, :3].all()
 
 
 def test_several_faults_at_once_act_one_after_the_other():
     block = stream()
-    faults = [parse_fault("channel=imu_1.x,imu_2.z kind=bias size=0.5"), parse_fault("channel=imu_1.x kind=sign")]
+    faults = [
+        parse_fault("channel=imu_1.x,imu_2.z kind=bias size=0.5"),
+        parse_fault("channel=imu_1.x kind=sign"),
+    ]
     injected = Injector(faults, NAMES).apply(block).z
     np.testing.assert_array_equal(injected[:, 0], -(block.z[:, 0] + 0.5))
     np.testing.assert_array_equal(injected[:, 5], block.z[:, 5] + 0.5)
@@ -135,48 +171,92 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
     edges = list(range(401)) if one_by_one else sorted({0, 400, *cuts})
     injector = Injector(faults, NAMES)
     pieces = [injector.apply(block[a:b]) for a, b in itertools.pairwise(edges)]
-    np.testing.assert_array_equal(np.concatenate([piece.z for piece in pieces]), whole.z)
-    received = [np.ones(p.z.shape, bool) if p.received is None else p.received for p in pieces]
-    expected = np.ones(whole.z.shape, bool) if whole.received is None else whole.received
+    np.testing.assert_array_equal(
+        np.concatenate([piece.z for piece in pieces]), whole.z
+    )
+    received = [
+        np.ones(p.z.shape, bool) if p.received is None else p.received for p in pieces
+    ]
+    expected = (
+        np.ones(whole.z.shape, bool) if whole.received is None else whole.received
+    )
     np.testing.assert_array_equal(np.concatenate(received), expected)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("channel=imu_9.y kind=bias size=0.2", "unknown channel 'imu_9.y', expected one of: imu_1.x, imu_1.y"),
-        ("channel=imu_1.x kind=wobble", "unknown fault kind 'wobble', expected one of: bias, drift"),
+        (
+            "channel=imu_9.y kind=bias size=0.2",
+            "unknown channel 'imu_9.y', expected one of: imu_1.x, imu_1.y",
+        ),
+        (
+            "channel=imu_1.x kind=wobble",
+            "unknown fault kind 'wobble', expected one of: bias, drift",
+        ),
         ("channel=imu_1.x kind=bias", "needs size in rad/s"),
         ("channel=imu_1.x kind=bias size=0", "size is 0"),
-        ("channel=imu_1.x kind=bias size=nan", "size is nan rad/s, expected -100 to 100 rad/s"),
+        (
+            "channel=imu_1.x kind=bias size=nan",
+            "size is nan rad/s, expected -100 to 100 rad/s",
+        ),
         ("channel=imu_1.x kind=bias size=big", "size is 'big', expected a number"),
         ("channel=imu_1.x kind=bias size=1 size=2", "size is given twice"),
-        ("channel=imu_1.x kind=bias size=1 duty=0.5", "takes no duty, only: channel, kind, start, stop, seed, size"),
-        ("channel=imu_1.x kind=bias size=1 start=-1", "start is -1 s, expected 0 to 1e+12 s"),
-        ("channel=imu_1.x kind=bias size=1 start=5 stop=5", "stop is 5 s, expected more than start 5 s"),
-        ("channel=imu_1.x kind=bias size=1 seed=0.5", "seed is 0.5, expected a whole number"),
-        ("channel=imu_1 kind=intermittent size=1 duty=2", "duty is 2, expected 0.001 to 0.999"),
+        (
+            "channel=imu_1.x kind=bias size=1 duty=0.5",
+            "takes no duty, only: channel, kind, start, stop, seed, size",
+        ),
+        (
+            "channel=imu_1.x kind=bias size=1 start=-1",
+            "start is -1 s, expected 0 to 1e+12 s",
+        ),
+        (
+            "channel=imu_1.x kind=bias size=1 start=5 stop=5",
+            "stop is 5 s, expected more than start 5 s",
+        ),
+        (
+            "channel=imu_1.x kind=bias size=1 seed=0.5",
+            "seed is 0.5, expected a whole number",
+        ),
+        (
+            "channel=imu_1 kind=intermittent size=1 duty=2",
+            "duty is 2, expected 0.001 to 0.999",
+        ),
         ("channel=imu_1.x kind=triad_loss", "strikes 1 channels, expected 3"),
         ("kind=bias size=1", "needs channel"),
-        ({"channel": "imu_1.x", "kind": "bias", "size": 1, "start": None}, "start is None, expected a number"),
+        (
+            {"channel": "imu_1.x", "kind": "bias", "size": 1, "start": None},
+            "start is None, expected a number",
+        ),
         ({"channel": "imu_1.x", "kind": "bias", "size": 10**400}, "expected a number"),
-        ({"channel": "imu_1.x", "kind": "bias", "size": 1, 5: 3}, "takes no 5, only: channel"),
+        (
+            {"channel": "imu_1.x", "kind": "bias", "size": 1, 5: 3},
+            "takes no 5, only: channel",
+        ),
         ("channel=imu_1.x kind bias", "'kind' is not of the form key=value"),
     ],
 )
 def test_a_wrong_fault_is_refused_in_one_line(text, words):
     with pytest.raises(FaultError) as caught:
-        Injector([parse_fault(text) if isinstance(text, str) else fault_from(text)], NAMES)
+        Injector(
+            [parse_fault(text) if isinstance(text, str) else fault_from(text)], NAMES
+        )
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
     path = tmp_path / "scenario.yaml"
-    path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2, start: 30, stop: 60}\n")
+    path.write_text(
+        "faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2, start: 30, stop: 60}\n"
+    )
     assert load_scenario(path) == (Fault("imu_2.y", Bias(0.2), 30.0, 60.0),)
-    path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2}\n  - {channel: imu_2.y, kind: bias}\n")
-    with pytest.raises(FaultError, match=r"scenario\.yaml, fault 2: fault bias needs size in rad/s"):
+    path.write_text(
+        "faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2}\n  - {channel: imu_2.y, kind: bias}\n"
+    )
+    with pytest.raises(
+        FaultError, match=r"scenario\.yaml, fault 2: fault bias needs size in rad/s"
+    ):
         load_scenario(path)
     for text, words in (
         ("faults: 3", "no list 'faults'"),
@@ -192,8 +272,16 @@ def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
 @settings(max_examples=200, deadline=None)
 @given(
     items=st.dictionaries(
-        st.sampled_from(["channel", "kind", "size", "start", "stop", "seed", "duty", "rate"]),
-        st.one_of(st.sampled_from(["imu_1.x", "bias", "spike"]), st.floats(), st.integers(), st.none(), st.booleans()),
+        st.sampled_from(
+            ["channel", "kind", "size", "start", "stop", "seed", "duty", "rate"]
+        ),
+        st.one_of(
+            st.sampled_from(["imu_1.x", "bias", "spike"]),
+            st.floats(),
+            st.integers(),
+            st.none(),
+            st.booleans(),
+        ),
     )
 )
 def test_whatever_stands_in_a_scenario_gives_a_fault_or_one_line(items):

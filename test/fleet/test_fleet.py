@@ -19,7 +19,16 @@ pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
 from bag import logs
-from bag.recordings import START, STEP, TOPICS, flight, imu_messages, write_bag, write_config, write_mcap
+from bag.recordings import (
+    START,
+    STEP,
+    TOPICS,
+    flight,
+    imu_messages,
+    write_bag,
+    write_config,
+    write_mcap,
+)
 
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
@@ -35,7 +44,10 @@ class Stopped(BaseException):
 
 def run(out, *given, codes=(0, 3, 4)):
     """Judge what is given; return the folder of the tables."""
-    assert main(["fleet", *map(str, given), "--output", str(out), "--workers", "1"]) in codes
+    assert (
+        main(["fleet", *map(str, given), "--output", str(out), "--workers", "1"])
+        in codes
+    )
     return out
 
 
@@ -58,7 +70,10 @@ def fleet(tmp_path_factory):
     write_mcap(root / "heron" / "a.mcap", messages)
     write_bag(root / "heron" / "b", flight(700, seed=1)[0])
     z[500:, 4] += 0.5
-    write_mcap(root / "kite" / "c.mcap", imu_messages(START + STEP * np.arange(900), z, apart=1000))
+    write_mcap(
+        root / "kite" / "c.mcap",
+        imu_messages(START + STEP * np.arange(900), z, apart=1000),
+    )
     write_mcap(root / "kite" / "d.mcap", messages, chunk_size=1 << 12)
     whole = (root / "kite" / "d.mcap").read_bytes()
     (root / "kite" / "d.mcap").write_bytes(whole[: len(whole) * 9 // 10])
@@ -71,7 +86,13 @@ def fleet(tmp_path_factory):
 @pytest.fixture(scope="module")
 def judged(fleet):
     """The folder of a run over all of them that was not stopped."""
-    return run(fleet / "out", fleet / "heron", fleet / "kite", "--config", fleet / "config.yaml")
+    return run(
+        fleet / "out",
+        fleet / "heron",
+        fleet / "kite",
+        "--config",
+        fleet / "config.yaml",
+    )
 
 
 # Which recordings -----------------------------------------------------------------------------------------------------
@@ -80,21 +101,38 @@ def judged(fleet):
 def test_recordings_are_found_each_once_by_whatever_name(fleet, tmp_path):
     """In folders, given twice, as a file of a bag, by a link; and what is no recording at all."""
     found, unread = find_recordings([str(fleet), str(fleet / "heron" / "a.mcap")])
-    assert [path.name for path in found] == ["a.mcap", "b", "c.mcap", "d.mcap", "e.mcap"]
+    assert [path.name for path in found] == [
+        "a.mcap",
+        "b",
+        "c.mcap",
+        "d.mcap",
+        "e.mcap",
+    ]
     assert unread == []
     heron = Path(shutil.copytree(fleet / "heron", tmp_path / "heron"))
     (heron / "again.mcap").symlink_to(heron / "a.mcap")
     (heron / "firmware.bin").write_bytes(b"\x7fELF")
     two = [heron / "a.mcap", heron / "b"]
-    assert find_recordings([str(tmp_path)]) == (two, [f"{heron / 'firmware.bin'} is no flight log"])
-    assert find_recordings([str(next((heron / "b").glob("*.mcap"))), str(two[1])]) == (two[1:], [])
+    assert find_recordings([str(tmp_path)]) == (
+        two,
+        [f"{heron / 'firmware.bin'} is no flight log"],
+    )
+    assert find_recordings([str(next((heron / "b").glob("*.mcap"))), str(two[1])]) == (
+        two[1:],
+        [],
+    )
     (tmp_path / "empty").mkdir()
-    for name, words in (("nowhere", r"there is no .*nowhere"), ("empty", "no recording in")):
+    for name, words in (
+        ("nowhere", r"there is no .*nowhere"),
+        ("empty", "no recording in"),
+    ):
         with pytest.raises(BagError, match=words):
             find_recordings([str(tmp_path / name)])
 
 
-def test_recordings_behind_links_and_beside_other_metadata_are_found(fleet, tmp_path, monkeypatch):
+def test_recordings_behind_links_and_beside_other_metadata_are_found(
+    fleet, tmp_path, monkeypatch
+):
     """Links in circles, a foreign metadata.yaml, a log in the folder of a bag, a folder that may not be read."""
     inside = tmp_path / "of_another_program"
     (inside / "below").mkdir(parents=True)
@@ -129,9 +167,20 @@ def test_recordings_behind_links_and_beside_other_metadata_are_found(fleet, tmp_
 def test_tables_say_what_became_of_each_flight_and_what_their_columns_mean(judged):
     flights = rows(judged)
     assert [bool(row["error"]) for row in flights] == [False, False, False, False, True]
-    assert [bool(row["damage"]) for row in flights] == [False, False, False, True, False]
+    assert [bool(row["damage"]) for row in flights] == [
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
     # A set, and then its name.
-    assert [(row["declared"], row["sets"]) for row in flights[:4]] == [(0, 0), (0, 0), (2, 1), (0, 0)]
+    assert [(row["declared"], row["sets"]) for row in flights[:4]] == [
+        (0, 0),
+        (0, 0),
+        (2, 1),
+        (0, 0),
+    ]
     # The simulated noise is 0.002 rad/s.
     assert np.allclose([np.mean(row["noise"]) for row in flights[:2]], 0.002, rtol=0.2)
     for name in ("flights", "episodes"):
@@ -142,16 +191,32 @@ def test_tables_say_what_became_of_each_flight_and_what_their_columns_mean(judge
 
 def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     """A fault, what could not be read, what was hardly checked; not how recordings end when the power goes."""
-    run(fleet / "again", fleet, "--config", fleet / "config.yaml", "--json", tmp_path / "all.json")
+    run(
+        fleet / "again",
+        fleet,
+        "--config",
+        fleet / "config.yaml",
+        "--json",
+        tmp_path / "all.json",
+    )
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "LOOK AT 2 of 5 flights: 1 faulty, 1 not judged."
-    assert said[1].startswith("2 vehicles; 1 flight could not be judged; 1 fault declared, in 1 flight; 0.01 hours")
+    assert said[1].startswith(
+        "2 vehicles; 1 flight could not be judged; 1 fault declared, in 1 flight; 0.01 hours"
+    )
     assert f"{fleet}/kite/c.mcap: FAULTY: imu_2.y from 5." in said[2]
     assert said[3].startswith(f"{fleet}/kite/e.mcap: could not be judged: ")
     figures = json.loads((tmp_path / "all.json").read_text())
-    assert [one["path"][-6:] for one in figures["need_a_person"]] == ["c.mcap", "e.mcap"]
+    assert [one["path"][-6:] for one in figures["need_a_person"]] == [
+        "c.mcap",
+        "e.mcap",
+    ]
     page = (fleet / "again" / "fleet.html").read_text()
-    assert page.index(">c.mcap<") < page.index(">e.mcap<") < page.index("<h2>All other flights (3)</h2>")
+    assert (
+        page.index(">c.mcap<")
+        < page.index(">e.mcap<")
+        < page.index("<h2>All other flights (3)</h2>")
+    )
     command = f"fdi replay {fleet}/kite/c.mcap --config {rows(fleet / 'again')[2]['config']} --report flight.html"
     assert command in page
 
@@ -160,36 +225,64 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
         rest = [message for message in messages[2 * last :] if message[0] == TOPICS[0]]
         write_mcap(tmp_path / f"{name}.mcap", [*messages[: 2 * last], *rest])
     run(tmp_path / "o", tmp_path, "--config", fleet / "config.yaml")
-    assert capsys.readouterr().out.splitlines()[0] == "LOOK AT 1 of 2 flights: 1 faulty."
+    assert (
+        capsys.readouterr().out.splitlines()[0] == "LOOK AT 1 of 2 flights: 1 faulty."
+    )
     dies, _ = rows(tmp_path / "o")
-    assert re.fullmatch(r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", dies["why"][0])
+    assert re.fullmatch(
+        r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", dies["why"][0]
+    )
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
 
 
 def test_one_sensor_on_two_topics_needs_a_look(tmp_path):
     z = flight(900)[1]
     stamp, topics = START + STEP * np.arange(900), (*TOPICS, "/third")
-    three = write_mcap(tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, z[:, :3]]), topics))
+    three = write_mcap(
+        tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, z[:, :3]]), topics)
+    )
     given = {"input": "imus", "sample_rate": 100.0, "imus.topics": list(topics)}
     for parameters in ("", json.dumps({"/**": {"ros__parameters": given}})):
         row = judge.judge(three, Flight(str(three), "", ""), parameters, False)[0]
-        assert re.search(r"/third\)? gives the values of .*/imu_1/data_raw", " ".join(row.why)), row
-    two = write_mcap(tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], z[:, :3]])))
+        assert re.search(
+            r"/third\)? gives the values of .*/imu_1/data_raw", " ".join(row.why)
+        ), row
+    two = write_mcap(
+        tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], z[:, :3]]))
+    )
     row = judge.judge(two, Flight(str(two), "", ""), "", False)[0]
-    assert f"{TOPICS[1]}: it gives the values of {TOPICS[0]}: one sensor on two topics" in row.why[0]
+    assert (
+        f"{TOPICS[1]}: it gives the values of {TOPICS[0]}: one sensor on two topics"
+        in row.why[0]
+    )
 
 
-def test_without_a_config_that_of_inspect_is_taken_and_said(fleet, root, tmp_path, capsys):
+def test_without_a_config_that_of_inspect_is_taken_and_said(
+    fleet, root, tmp_path, capsys
+):
     """Calibrated on itself, or with the reason why not."""
     (row,) = rows(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
     assert (row["error"], row["measured"]) == ("", False)
     assert Config.from_file(row["config"]).topics == TOPICS
-    assert "Of 1 flight the mounts and axes are what fdi inspect assumes, not measured" in capsys.readouterr().out
-    given = (fleet / "heron" / "a.mcap", root / "bags" / "cone_flight", "--config", root / "config" / "two_imus.yaml")
+    assert (
+        "Of 1 flight the mounts and axes are what fdi inspect assumes, not measured"
+        in capsys.readouterr().out
+    )
+    given = (
+        fleet / "heron" / "a.mcap",
+        root / "bags" / "cone_flight",
+        "--config",
+        root / "config" / "two_imus.yaml",
+    )
     found = rows(run(tmp_path / "each", *given, "--calibrate", "each"))
-    refused, calibrated = sorted(found, key=lambda row: row["calibration"] == "on itself")
+    refused, calibrated = sorted(
+        found, key=lambda row: row["calibration"] == "on itself"
+    )
     assert calibrated["calibration"] == "on itself"
-    assert "made by fdi calibrate from cone_flight" in Path(calibrated["config"]).read_text()
+    assert (
+        "made by fdi calibrate from cone_flight"
+        in Path(calibrated["config"]).read_text()
+    )
     assert refused["calibration"].startswith("refused: ")
 
 
@@ -203,27 +296,41 @@ def test_the_questions_of_the_docs_are_answered(root, tmp_path, monkeypatch):
         if k == 2:
             made[2].rate[600:, 0] += np.float32(0.5)
         if k == 4:
-            made[0].rate[:, 2] += np.random.default_rng(k).normal(0, 0.02, 1000).astype("f4")
+            made[0].rate[:, 2] += (
+                np.random.default_rng(k).normal(0, 0.02, 1000).astype("f4")
+            )
         data = logs.write_dataflash(tmp_path / "logs" / f"{k}.bin", made).read_bytes()
         week = struct.pack("<IH", logs.MS, logs.WEEK + 4 * k)
-        (tmp_path / "logs" / f"{k}.bin").write_bytes(data.replace(struct.pack("<IH", logs.MS, logs.WEEK), week))
+        (tmp_path / "logs" / f"{k}.bin").write_bytes(
+            data.replace(struct.pack("<IH", logs.MS, logs.WEEK), week)
+        )
     run(tmp_path / "fleet", tmp_path / "logs")
     assert rows(tmp_path / "fleet")[1]["date"].startswith("2022-04-06T23:59:")
     monkeypatch.chdir(tmp_path)
-    found = re.findall(r"```sql\n(.*?)```", (root / "docs" / "fleet.md").read_text(), re.DOTALL)
+    found = re.findall(
+        r"```sql\n(.*?)```", (root / "docs" / "fleet.md").read_text(), re.DOTALL
+    )
     failing, drifting, noisy = (duckdb.sql(query).fetchall() for query in found)
-    assert [(channel, flights) for _, channel, flights, _ in failing] == [("imu_2.x", 1)]
+    assert [(channel, flights) for _, channel, flights, _ in failing] == [
+        ("imu_2.x", 1)
+    ]
     assert failing[0][3] == pytest.approx(0.5, rel=0.1)
     assert drifting[0][1] == "imu_1.y"
     # The axes of dataflash are turned into those of the body of ROS.
     assert drifting[0][2:] == pytest.approx((-0.01 * 30 / 28, 1.0), rel=0.05)
-    assert [(Path(path).name, channel) for path, channel, _ in noisy] == [("4.bin", "imu_0.z")]
+    assert [(Path(path).name, channel) for path, channel, _ in noisy] == [
+        ("4.bin", "imu_0.z")
+    ]
 
 
 def test_names_that_are_no_unicode_cost_nothing(fleet, tmp_path):
     (tmp_path / "kite").mkdir()
     for number in (b"\xff", b"\xfe"):
-        (tmp_path / "kite" / (b"broken" + number + b".mcap").decode("utf-8", "surrogateescape")).write_bytes(b"")
+        (
+            tmp_path
+            / "kite"
+            / (b"broken" + number + b".mcap").decode("utf-8", "surrogateescape")
+        ).write_bytes(b"")
     shutil.copy(fleet / "heron" / "a.mcap", tmp_path / "kite")
     out = run(tmp_path / b"o\xff".decode("utf-8", "surrogateescape"), tmp_path / "kite")
     assert [bool(row["error"]) for row in rows(out)] == [False, True, True]
@@ -248,7 +355,10 @@ def test_what_is_there_is_not_judged_again(fleet, tmp_path, monkeypatch):
         assert both(tmp_path / "o") == before
         next((tmp_path / "heron" / "b").glob("*.mcap")).touch()
         run(tmp_path / "o", *given)
-        assert ["judged again" in row["error"] for row in rows(tmp_path / "o")] == [False, True]
+        assert ["judged again" in row["error"] for row in rows(tmp_path / "o")] == [
+            False,
+            True,
+        ]
     # What could not be judged is tried again.
     run(tmp_path / "o", *given)
     assert [row["error"] for row in rows(tmp_path / "o")] == ["", ""]
@@ -260,7 +370,13 @@ def test_what_is_there_is_not_judged_again(fleet, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["episodes", "flights"])
 def test_a_run_that_is_killed_anywhere_goes_on(fleet, judged, tmp_path, name):
     """Before a table is written the second time."""
-    words = (fleet / "heron", fleet / "kite", "--config", fleet / "config.yaml", "--quiet")
+    words = (
+        fleet / "heron",
+        fleet / "kite",
+        "--config",
+        fleet / "config.yaml",
+        "--quiet",
+    )
     times, real = [], tables.whole
 
     def stop(path):
@@ -278,7 +394,10 @@ def test_a_run_that_is_killed_anywhere_goes_on(fleet, judged, tmp_path, name):
     assert len(rows(tmp_path / "o")) == 1
     run(tmp_path / "o", *words)
     for table in ("flights", "episodes"):
-        one, other = ([{**row, "config": ""} for row in rows(out, table)] for out in (tmp_path / "o", judged))
+        one, other = (
+            [{**row, "config": ""} for row in rows(out, table)]
+            for out in (tmp_path / "o", judged)
+        )
         assert one == other
 
 
@@ -286,7 +405,10 @@ def test_a_folder_of_something_else_is_left_alone(fleet, judged, tmp_path, capsy
     """Of other settings, unless that is asked for; of another run at the same time; of another program."""
     out = Path(shutil.copytree(judged, tmp_path / "o"))
     run(out, fleet / "heron", codes=[2])
-    assert "is of other settings or of another version; --force begins anew" in capsys.readouterr().err
+    assert (
+        "is of other settings or of another version; --force begins anew"
+        in capsys.readouterr().err
+    )
     assert both(out) == both(judged)
     other = Tables(out, {}, force=True)
     with pytest.raises(BagError, match="another fdi fleet writes"):
@@ -298,7 +420,8 @@ def test_a_folder_of_something_else_is_left_alone(fleet, judged, tmp_path, capsy
     run(out, fleet / "heron", codes=[2])
     assert "flights.parquet is damaged" in capsys.readouterr().err
     parquet.write_table(
-        parquet.read_table(judged / "flights.parquet").replace_schema_metadata(), out / "flights.parquet"
+        parquet.read_table(judged / "flights.parquet").replace_schema_metadata(),
+        out / "flights.parquet",
     )
     run(out, fleet / "heron", "--force", codes=[2])
     assert "flights.parquet is no table of fdi fleet" in capsys.readouterr().err
@@ -307,12 +430,19 @@ def test_a_folder_of_something_else_is_left_alone(fleet, judged, tmp_path, capsy
     run(tmp_path / "mine", fleet / "heron", "--force", codes=[2])
     assert (tmp_path / "mine" / "fleet.html").read_text() == "years"
     run(tmp_path / "mine" / "fleet.html" / "o", fleet / "heron", codes=[2])
-    assert capsys.readouterr().err.splitlines()[-1].endswith("fleet.html/o: Not a directory")
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith("fleet.html/o: Not a directory")
+    )
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(fleet, judged, tmp_path, capsys):
     out = Path(shutil.copytree(judged, tmp_path / "o"))
-    limit, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limit, handler = (
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+    )
     # As much as a parameter file takes, and less than a table.
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))
     try:
@@ -327,5 +457,8 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fleet, judged, tmp_path, caps
 def test_where_nothing_could_be_judged_that_is_the_end(tmp_path, capsys):
     (tmp_path / "a.mcap").write_bytes(b"")
     run(tmp_path / "o", tmp_path, codes=[2])
-    assert f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'}" in capsys.readouterr().err
+    assert (
+        f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'}"
+        in capsys.readouterr().err
+    )
     assert (tmp_path / "o" / "flights.parquet").exists()

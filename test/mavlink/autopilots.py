@@ -46,7 +46,9 @@ def gentle(units: int, seed: int = 0, noise: float = 0.002) -> Motion:
     random = np.random.default_rng(seed)
 
     def rates(t: float) -> np.ndarray:
-        omega = np.array([0.5 * math.sin(0.8 * t), 0.4 * math.cos(1.1 * t), 0.3 * math.sin(0.5 * t)])
+        omega = np.array(
+            [0.5 * math.sin(0.8 * t), 0.4 * math.cos(1.1 * t), 0.3 * math.sin(0.5 * t)]
+        )
         return omega + random.normal(0.0, noise, (units, 3))
 
     return rates
@@ -57,7 +59,13 @@ def milli(value: float) -> int:
     return int(np.clip(value * 1000.0, -32768, 32767))
 
 
-MESSAGES = {26: "scaled_imu", 27: "raw_imu", 105: "highres_imu", 116: "scaled_imu2", 129: "scaled_imu3"}
+MESSAGES = {
+    26: "scaled_imu",
+    27: "raw_imu",
+    105: "highres_imu",
+    116: "scaled_imu2",
+    129: "scaled_imu3",
+}
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 
 
@@ -74,28 +82,41 @@ class Autopilot:
     key: bytes = b""
     utc: float | None = None
     loss: float = 0.0
-    rates: dict[int, float] = field(default_factory=dict)  # Hz by message id, without being asked
+    rates: dict[int, float] = field(
+        default_factory=dict
+    )  # Hz by message id, without being asked
     seed: int = 0
     texts: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, float] = field(default_factory=dict)
     commands: list[tuple[int, ...]] = field(default_factory=list)
     refuses: set[int] = field(default_factory=set)
-    parameters: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARAMETERS, 1.0))
+    parameters: dict[str, float] = field(
+        default_factory=lambda: dict.fromkeys(PARAMETERS, 1.0)
+    )
     read_only: set[str] = field(default_factory=set)
-    sets: list[tuple[int, str, float]] = field(default_factory=list)  # when each PARAM_SET came, ns, and what it said
+    sets: list[tuple[int, str, float]] = field(
+        default_factory=list
+    )  # when each PARAM_SET came, ns, and what it said
     armed: bool = False
     sent: int = 0
 
     def __post_init__(self) -> None:
         self.motion = self.motion or gentle(self.units, self.seed)
         self.start = self.boot  # where the motion's time counts from, ns
-        self.mav, self.inbound = mavlink.MAVLink(None, self.system, 1), mavlink.MAVLink(None)
+        self.mav, self.inbound = (
+            mavlink.MAVLink(None, self.system, 1),
+            mavlink.MAVLink(None),
+        )
         self.inbound.robust_parsing = True
         for codec in (self.mav, self.inbound):
             if self.key:
                 codec.signing.secret_key, codec.signing.sign_outgoing = self.key, True
-                codec.signing.timestamp = now_in_steps(time.time() if self.utc is None else self.utc)
-        self.intervals = {number: round(1e6 / rate) for number, rate in self.rates.items()}  # us by message id
+                codec.signing.timestamp = now_in_steps(
+                    time.time() if self.utc is None else self.utc
+                )
+        self.intervals = {
+            number: round(1e6 / rate) for number, rate in self.rates.items()
+        }  # us by message id
         self.due: dict[int, int] = {}
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
@@ -104,7 +125,9 @@ class Autopilot:
     @property
     def flies_with(self) -> int:
         """First IMU in use, from 0; -1: none."""
-        return next((k for k in range(self.units) if self.parameters[PARAMETERS[k]]), -1)
+        return next(
+            (k for k in range(self.units) if self.parameters[PARAMETERS[k]]), -1
+        )
 
     def reboot(self, now: int) -> None:
         """Start anew: the clock begins at zero, intervals are forgotten."""
@@ -134,16 +157,25 @@ class Autopilot:
         out: list[bytes] = []
         if now - self._beat >= NS:
             self._beat = now
-            kind = mavlink.MAV_AUTOPILOT_PX4 if self.stack == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+            kind = (
+                mavlink.MAV_AUTOPILOT_PX4
+                if self.stack == "px4"
+                else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+            )
             mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
-            self._send(self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, mode, 0, 4), out)
+            self._send(
+                self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, mode, 0, 4),
+                out,
+            )
         if self.stack == "px4" and now - self._asked >= NS // 10:
             self._asked = now
             self._send(self.mav.timesync_encode(0, self.clock(now) * 1000), out)
         for number, interval in list(self.intervals.items()):
             # ArduPilot sends all messages of an interval together, PX4 each from when it was asked for.
             step = interval * 1000 if self.stack != "px4" else 1
-            due = self.due.setdefault(number, -((self.boot - now) // step) * step + self.boot)
+            due = self.due.setdefault(
+                number, -((self.boot - now) // step) * step + self.boot
+            )
             if now >= due:
                 self.due[number] = max(due + interval * 1000, now - interval * 1000)
                 self._imu(number, now, out)
@@ -159,16 +191,26 @@ class Autopilot:
     def _imu(self, number: int, now: int, out: list[bytes]) -> None:
         if number not in MESSAGES or (number == 27 and self.stack == "px4"):
             return
-        encode, unit = getattr(self.mav, f"{MESSAGES[number]}_encode"), {116: 1, 129: 2}.get(number, 0)
+        encode, unit = (
+            getattr(self.mav, f"{MESSAGES[number]}_encode"),
+            {116: 1, 129: 2}.get(number, 0),
+        )
         if unit >= self.units:
             if unit < self.compasses:
-                self._send(encode(self.clock(now) // 1000, *(0,) * 6, 200, -30, 410), out)
+                self._send(
+                    encode(self.clock(now) // 1000, *(0,) * 6, 200, -30, 410), out
+                )
             return
         sampled = self._sampled(unit, now)
         rate = self.motion((sampled - self.start) / NS)[unit]
         stamp = self.clock(sampled if self.stack == "px4" else now)
         if number == 105:
-            self._send(encode(stamp, 0.0, 0.0, -9.80665, *map(float, rate), *(0.0,) * 7, 0x1FFF, 0), out)
+            self._send(
+                encode(
+                    stamp, 0.0, 0.0, -9.80665, *map(float, rate), *(0.0,) * 7, 0x1FFF, 0
+                ),
+                out,
+            )
         else:
             values = (0, 0, -1000, *(milli(v) for v in rate), 0, 0, 0)
             self._send(encode(stamp if number == 27 else stamp // 1000, *values), out)
@@ -181,7 +223,9 @@ class Autopilot:
             if name == "COMMAND_LONG":
                 self._command(message, out)
             elif name == "TIMESYNC" and message.tc1 == 0:
-                self._send(self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out)
+                self._send(
+                    self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out
+                )
             elif name in ("PARAM_SET", "PARAM_REQUEST_READ"):
                 self._parameter(message, now, out)
             elif name == "STATUSTEXT":
@@ -192,7 +236,11 @@ class Autopilot:
 
     def _parameter(self, message, now: int, out: list[bytes]) -> None:
         name = message.param_id
-        if message.target_system != self.system or name not in self.parameters or self.stack == "px4":
+        if (
+            message.target_system != self.system
+            or name not in self.parameters
+            or self.stack == "px4"
+        ):
             return
         if message.get_type() == "PARAM_SET":
             self.sets.append((now, name, message.param_value))
@@ -202,22 +250,37 @@ class Autopilot:
 
     def say_parameter(self, name: str, out: list[bytes]) -> None:
         value = self.parameters[name]
-        self._send(self.mav.param_value_encode(name.encode().ljust(16, b"\0"), value, 2, 1400, 65535), out)
+        self._send(
+            self.mav.param_value_encode(
+                name.encode().ljust(16, b"\0"), value, 2, 1400, 65535
+            ),
+            out,
+        )
 
     def _command(self, message, out: list[bytes]) -> None:
-        self.commands.append((message.command, int(message.param1), int(message.param2)))
+        self.commands.append(
+            (message.command, int(message.param1), int(message.param2))
+        )
         if message.target_system != self.system:
             return
         number, interval = int(message.param1), int(message.param2)
         known = MESSAGES.keys() - ({27} if self.stack == "px4" else set())
         if message.command != 511 or number not in known or number in self.refuses:
-            self._send(self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_FAILED), out)
+            self._send(
+                self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_FAILED),
+                out,
+            )
             return
         if interval <= 0:
             self.intervals.pop(number, None)
         else:
-            self.intervals[number] = interval if self.stack == "px4" else max(1, interval // 1000) * 1000
-        self._send(self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_ACCEPTED), out)
+            self.intervals[number] = (
+                interval if self.stack == "px4" else max(1, interval // 1000) * 1000
+            )
+        self._send(
+            self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_ACCEPTED),
+            out,
+        )
 
 
 class Driver:
@@ -335,7 +398,9 @@ class Conversation:
 
     def _send(self, data: bytes, peer: Any) -> None:
         message = self._check.parse_char(data)
-        assert message.get_type() in HARMLESS or (self.may_set and message.param_id in PARAMETERS)
+        assert message.get_type() in HARMLESS or (
+            self.may_set and message.param_id in PARAMETERS
+        )
         assert message.get_type() != "COMMAND_LONG" or message.command == 511
         assert message.get_type() != "TIMESYNC" or message.tc1 == 0
         assert message.get_type() != "HEARTBEAT" or message.autopilot == 8
@@ -353,7 +418,9 @@ class Conversation:
 
     def inject(self, data: bytes, peer: Any = None) -> None:
         """Bytes from anybody reach us now."""
-        self.samples += [(self.now, sample) for sample in self.vehicle.feed(peer, data, self.now)]
+        self.samples += [
+            (self.now, sample) for sample in self.vehicle.feed(peer, data, self.now)
+        ]
 
     def run(self, seconds: float) -> "Conversation":
         end = self.now + round(seconds * NS)
@@ -374,4 +441,8 @@ class Conversation:
 
     def of_unit(self, unit: int, since: float = math.inf) -> list[ImuSample]:
         """Samples of a unit that came in the last seconds."""
-        return [sample for at, sample in self.samples if sample.unit == unit and at > self.now - since * NS]
+        return [
+            sample
+            for at, sample in self.samples
+            if sample.unit == unit and at > self.now - since * NS
+        ]

@@ -14,7 +14,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdi_ros.mavlink.failover import GROUNDED, FailoverState, FailoverUnit, Known, decide
+from fdi_ros.mavlink.failover import (
+    GROUNDED,
+    FailoverState,
+    FailoverUnit,
+    Known,
+    decide,
+)
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -28,7 +34,10 @@ class Flight:
         self.random = random = np.random.default_rng(seed)
         self.count = int(random.integers(2, 4))
         self.limit = int(random.integers(1, self.count))
-        self.loss, self.slow = random.choice([0.0, 0.2, 0.5]), int(random.choice([10, 100, 700])) * MS
+        self.loss, self.slow = (
+            random.choice([0.0, 0.2, 0.5]),
+            int(random.choice([10, 100, 700])) * MS,
+        )
         self.now, self.state, self.done = 100 * NS, FailoverState(), Counter[str]()
         self.under_way: list[tuple[int, Callable[[], None]]] = []
         every = range(self.count)
@@ -53,7 +62,9 @@ class Flight:
     def travel(self, arrive: Callable[[], None]) -> None:
         for _ in range(1 + (self.random.random() < 0.1)):
             if self.linked and self.random.random() >= self.loss:
-                self.under_way.append((self.now + int(self.random.integers(1, self.slow)), arrive))
+                self.under_way.append(
+                    (self.now + int(self.random.integers(1, self.slow)), arrive)
+                )
 
     def send_text(self, k: int) -> None:
         """The autopilot says a parameter; one that was overtaken is dropped by its sequence number."""
@@ -61,7 +72,10 @@ class Flight:
 
         def arrive() -> None:
             if sent > self.newest[k]:
-                is_new = self.said[k][0] not in (None, value) and self.now - self.asked[k] > 2 * NS + STEP
+                is_new = (
+                    self.said[k][0] not in (None, value)
+                    and self.now - self.asked[k] > 2 * NS + STEP
+                )
                 self.touched[k] |= is_new and by == "other"
                 self.said[k], self.newest[k] = (value, self.now), sent
 
@@ -112,9 +126,13 @@ class Flight:
         k, begins = divmod(self.now // STEP % (10 * self.count), 10)
         if not begins:
             self.travel(lambda: self.send_text(k))
-        told = zip(self.said, self.declared, self.ok, self.well, self.delivers, strict=True)
+        told = zip(
+            self.said, self.declared, self.ok, self.well, self.delivers, strict=True
+        )
         units = tuple(FailoverUnit(*said, *rest) for said, *rest in told)
-        known = Known(units, self.linked, self.armed, self.disarmed, self.monitored, self.restore)
+        known = Known(
+            units, self.linked, self.armed, self.disarmed, self.monitored, self.restore
+        )
         self.state, actions = decide(self.state, known, self.now, self.limit)
         for action in actions:
             self.done[action.kind] += 1
@@ -130,9 +148,21 @@ class Flight:
             assert self.now - units[k].declared <= 3 * NS, "declared long ago"
             assert all(unit.use is not None for unit in units)
             assert units[k].use, "out already"
-            healthy = {j for j, unit in enumerate(units) if unit.use and unit.delivers and unit.ok}
+            healthy = {
+                j
+                for j, unit in enumerate(units)
+                if unit.use and unit.delivers and unit.ok
+            }
             # What we have just set to be out may be out, though it was not heard yet.
-            assert healthy - {j for j, at in enumerate(self.asked) if not self.wish[j] and self.now - at < 2 * NS} - {k}
+            assert (
+                healthy
+                - {
+                    j
+                    for j, at in enumerate(self.asked)
+                    if not self.wish[j] and self.now - at < 2 * NS
+                }
+                - {k}
+            )
             out = [order for order in self.state.orders.values() if order.is_out]
             assert len(out) <= self.limit < self.count
             assert not self.touched[k], "somebody else's"

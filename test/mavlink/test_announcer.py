@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.mavlink.report import AT_ONCE, CRITICAL, INFO, LENGTH, NOTHING_SEEN, WARNING, Announcer
+from fdi_ros.mavlink.report import (
+    AT_ONCE,
+    CRITICAL,
+    INFO,
+    LENGTH,
+    NOTHING_SEEN,
+    WARNING,
+    Announcer,
+)
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
 NS = 1_000_000_000
@@ -15,9 +23,16 @@ CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz"]
 
 
-def report(name: str, state: str, group: str = "", apart: str = "", repeats: str = "") -> StatusLine:
+def report(
+    name: str, state: str, group: str = "", apart: str = "", repeats: str = ""
+) -> StatusLine:
     """What a monitor reports of a channel."""
-    values = {"state": state, "one of": group, "apart (rad/s)": apart, "repeats for (s)": repeats}
+    values = {
+        "state": state,
+        "one of": group,
+        "apart (rad/s)": apart,
+        "repeats for (s)": repeats,
+    }
     return StatusLine(Level.OK, name, "", values=tuple(values.items()))
 
 
@@ -35,17 +50,26 @@ class Ground:
             self.now += NS // 20
             if k % 20 == 19:
                 self.announcer.hear([], self.now)
-            self.told += [(self.now / NS, *text) for text in self.announcer.due(self.now)]
+            self.told += [
+                (self.now / NS, *text) for text in self.announcer.due(self.now)
+            ]
         return [(severity, text) for _, severity, text in self.told[before:]]
 
 
 def test_declarations_are_told_and_suspicions_are_not() -> None:
     ground = Ground()
     assert ground.hear(report("imu_2.y", "SUSPECT")) == []
-    assert ground.hear(report("imu_2.y", "FAULTY")) == [(CRITICAL, "FDI: imu_2.y faulty, left out")]
+    assert ground.hear(report("imu_2.y", "FAULTY")) == [
+        (CRITICAL, "FDI: imu_2.y faulty, left out")
+    ]
     assert ground.hear(report("imu_2.y", "FAULTY")) == []
     assert ground.hear(report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y in use again")]
-    assert ground.hear(report("another.channel", "FAULTY"), report("imu_1.x", "no such state")) == []
+    assert (
+        ground.hear(
+            report("another.channel", "FAULTY"), report("imu_1.x", "no such state")
+        )
+        == []
+    )
 
 
 def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
@@ -57,28 +81,58 @@ def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
     assert ground.hear(*reports("OK", "0.25")) == [(WARNING, "FDI: imu_2 frozen")]
     assert ground.hear(*reports("OK", "1.25")) == []
     assert ground.hear(*reports("OK", "")) == [(INFO, "FDI: imu_2 in use again")]
-    assert ground.hear(*reports("FAULTY", "2.25")) == [(CRITICAL, "FDI: imu_2 faulty, left out")]
+    assert ground.hear(*reports("FAULTY", "2.25")) == [
+        (CRITICAL, "FDI: imu_2 faulty, left out")
+    ]
 
 
 @pytest.mark.parametrize(
     ("names", "state", "apart", "text"),
     [
         (CHANNELS[6:], "STALE", "", (WARNING, "FDI: imu_3 no data")),
-        (CHANNELS[:6:3], "AMBIGUOUS", "", (CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x")),
-        (CHANNELS[1:6:3], "AMBIGUOUS", "0.100 +- 0.002", (CRITICAL, "FDI: imu_1.y or imu_2.y wrong by 0.100 rad/s")),
-        (BOATS[1::3], "AMBIGUOUS", "0.100 +- 0.002", (CRITICAL, "FDI: one faulty of port_imu.y, starboard_imu.y")),
+        (
+            CHANNELS[:6:3],
+            "AMBIGUOUS",
+            "",
+            (CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x"),
+        ),
+        (
+            CHANNELS[1:6:3],
+            "AMBIGUOUS",
+            "0.100 +- 0.002",
+            (CRITICAL, "FDI: imu_1.y or imu_2.y wrong by 0.100 rad/s"),
+        ),
+        (
+            BOATS[1::3],
+            "AMBIGUOUS",
+            "0.100 +- 0.002",
+            (CRITICAL, "FDI: one faulty of port_imu.y, starboard_imu.y"),
+        ),
         (CHANNELS[:6], "AMBIGUOUS", "", (CRITICAL, "FDI: one faulty of imu_1, imu_2")),
         (CHANNELS[:1], "AMBIGUOUS", "", (CRITICAL, "FDI: imu_1.x faulty")),
         (CHANNELS[1:7], "AMBIGUOUS", "", (CRITICAL, "FDI: one faulty of 6 channels")),
-        (CHANNELS[6:], "AMBIGUOUS", "", (CRITICAL, "FDI: imu_3 faulty (axis cannot be told apart)")),
+        (
+            CHANNELS[6:],
+            "AMBIGUOUS",
+            "",
+            (CRITICAL, "FDI: imu_3 faulty (axis cannot be told apart)"),
+        ),
     ],
 )
-def test_a_unit_and_a_set_are_one_text(names: list[str], state: str, apart: str, text: tuple[int, str]) -> None:
+def test_a_unit_and_a_set_are_one_text(
+    names: list[str], state: str, apart: str, text: tuple[int, str]
+) -> None:
     ground = Ground(BOATS if names[0] in BOATS else CHANNELS)
     group = ", ".join(names) if state == "AMBIGUOUS" else ""
     assert ground.hear(*(report(name, state, group, apart) for name in names)) == [text]
     # That they come to be further apart is no news.
-    assert ground.hear(*(report(name, state, group, apart and "0.2 +- 0.002") for name in names), wait=5.0) == []
+    assert (
+        ground.hear(
+            *(report(name, state, group, apart and "0.2 +- 0.002") for name in names),
+            wait=5.0,
+        )
+        == []
+    )
 
 
 def test_the_whole_is_told_too() -> None:
@@ -86,24 +140,42 @@ def test_the_whole_is_told_too() -> None:
     again = [(INFO, "FDI: all is judged again")]
     for level, message, told in (
         (Level.STALE, "no sample yet", []),
-        (Level.ERROR, "no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", []),
-        (Level.ERROR, "no fused rate: withheld, as channels under doubt ...", [(CRITICAL, "FDI: no fused rate")]),
+        (
+            Level.ERROR,
+            "no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy",
+            [],
+        ),
+        (
+            Level.ERROR,
+            "no fused rate: withheld, as channels under doubt ...",
+            [(CRITICAL, "FDI: no fused rate")],
+        ),
         (Level.OK, "9 of 9 channels healthy", again),
-        (Level.ERROR, "3 of 6 channels healthy; no further fault would be seen", [(CRITICAL, f"FDI: {NOTHING_SEEN}")]),
+        (
+            Level.ERROR,
+            "3 of 6 channels healthy; no further fault would be seen",
+            [(CRITICAL, f"FDI: {NOTHING_SEEN}")],
+        ),
         (Level.STALE, "no sample for 3.0 s", [(CRITICAL, "FDI: no samples")]),
     ):
         assert ground.hear(StatusLine(level, WHOLE, message), wait=3.0) == told, message
     assert ground.announcer.due(ground.now + 4 * NS) == []
-    assert ground.announcer.due(ground.now + 5 * NS) == [(CRITICAL, "FDI: the monitor is silent")]
+    assert ground.announcer.due(ground.now + 5 * NS) == [
+        (CRITICAL, "FDI: the monitor is silent")
+    ]
 
 
 STATES = ["OK", "SUSPECT", "FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED", "EXCLUDED"]
 GROUPS = ["", "imu_1.x, imu_2.x", ", ".join(CHANNELS)]
-CHANGES = st.tuples(st.sampled_from(CHANNELS), st.sampled_from(STATES), st.sampled_from(GROUPS))
+CHANGES = st.tuples(
+    st.sampled_from(CHANNELS), st.sampled_from(STATES), st.sampled_from(GROUPS)
+)
 
 
 @given(st.lists(CHANGES, max_size=80))
-def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(changes) -> None:
+def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(
+    changes,
+) -> None:
     ground = Ground()
     states = dict.fromkeys(CHANNELS, "OK")
     for name, state, group in changes:
@@ -112,7 +184,10 @@ def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(chang
         states[name] = states[name] if state == "SUSPECT" else state
     busy = ground.now
     ground.hear(wait=15.0)
-    assert sum(at <= busy / NS for at, _, _ in ground.told) <= AT_ONCE + (busy / NS - 100) + 1
+    assert (
+        sum(at <= busy / NS for at, _, _ in ground.told)
+        <= AT_ONCE + (busy / NS - 100) + 1
+    )
     assert all(len(text) <= LENGTH and text.isascii() for _, _, text in ground.told)
     for name, state in states.items():
         known = ground.announcer._said[name][0]
@@ -123,5 +198,9 @@ def test_a_unit_that_comes_and_goes_silences_nothing() -> None:
     ground, told = Ground(), []
     for k in range(40):
         state = "STALE" if k % 2 else "OK"
-        told += ground.hear(report("imu_1.x", "FAULTY"), *(report(f"imu_3.{axis}", state) for axis in "xyz"), wait=0.05)
+        told += ground.hear(
+            report("imu_1.x", "FAULTY"),
+            *(report(f"imu_3.{axis}", state) for axis in "xyz"),
+            wait=0.05,
+        )
     assert (CRITICAL, "FDI: imu_1.x faulty, left out") in told[:2]

@@ -11,7 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.protocol import MESSAGES, MS, NS, BootClock, TimeSync, read, system_ahead, understood
+from fdi_ros.mavlink.protocol import (
+    MESSAGES,
+    MS,
+    NS,
+    BootClock,
+    TimeSync,
+    read,
+    system_ahead,
+    understood,
+)
 
 OVER = (1 << 32) * MS
 SHORT = st.integers(-32768, 32767)
@@ -23,13 +32,21 @@ def payload_of(message) -> bytes:
 
 
 @pytest.mark.parametrize("number", MESSAGES)
-@given(time=st.integers(1, 2**32 - 1), values=st.lists(SHORT, min_size=6, max_size=6), unit=st.integers(0, 3))
-def test_values_are_pymavlinks_in_our_units_and_axes(number: int, time: int, values: list[int], unit: int) -> None:
+@given(
+    time=st.integers(1, 2**32 - 1),
+    values=st.lists(SHORT, min_size=6, max_size=6),
+    unit=st.integers(0, 3),
+)
+def test_values_are_pymavlinks_in_our_units_and_axes(
+    number: int, time: int, values: list[int], unit: int
+) -> None:
     message, theirs = MESSAGES[number], mavlink.mavlink_map[number]
     assert (message.name, message.size) == (theirs.msgname, theirs.unpacker.size)
     acceleration, rate = values[:3], values[3:]
     if message.name == "HIGHRES_IMU":
-        made = mavlink.MAVLink_highres_imu_message(time, *map(float, values), *(0.0,) * 7, 0x3F, unit)
+        made = mavlink.MAVLink_highres_imu_message(
+            time, *map(float, values), *(0.0,) * 7, 0x3F, unit
+        )
         g = a = 1.0
     elif message.name == "RAW_IMU":
         made = mavlink.MAVLink_raw_imu_message(time, *values, 0, 0, 0, unit, 0)
@@ -42,14 +59,25 @@ def test_values_are_pymavlinks_in_our_units_and_axes(number: int, time: int, val
         assert reading is None
         return
     assert reading is not None
-    assert (reading.unit, reading.stamp) == (unit, 1000 * time * (1000 if number in (26, 116, 129) else 1))
-    np.testing.assert_allclose(reading.rate, [g * rate[0], -g * rate[1], -g * rate[2]], atol=1e-12)
-    np.testing.assert_allclose(reading.acceleration, np.array([1, -1, -1]) * a * np.array(acceleration), atol=1e-9)
+    assert (reading.unit, reading.stamp) == (
+        unit,
+        1000 * time * (1000 if number in (26, 116, 129) else 1),
+    )
+    np.testing.assert_allclose(
+        reading.rate, [g * rate[0], -g * rate[1], -g * rate[2]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        reading.acceleration,
+        np.array([1, -1, -1]) * a * np.array(acceleration),
+        atol=1e-9,
+    )
 
 
 @pytest.mark.parametrize("updated", [0, 0b000111, 0b011000])
 def test_a_gyro_that_is_not_new_is_no_sample(updated: int) -> None:
-    made = mavlink.MAVLink_highres_imu_message(5, 0.0, 0.0, -9.8, 0.1, 0.2, 0.3, *(0.0,) * 7, updated, 0)
+    made = mavlink.MAVLink_highres_imu_message(
+        5, 0.0, 0.0, -9.8, 0.1, 0.2, 0.3, *(0.0,) * 7, updated, 0
+    )
     assert read(105, payload_of(made)) is None
 
 
@@ -63,7 +91,9 @@ BEGIN = 10**16
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def answers(sync: TimeSync, remote: Callable[[int], int], trip: Callable[[int], int]) -> Iterator[tuple[int, bool]]:
+def answers(
+    sync: TimeSync, remote: Callable[[int], int], trip: Callable[[int], int]
+) -> Iterator[tuple[int, bool]]:
     """Ask ten times a second where it is due, for 30 s: the time after each answer, ns, and whether it was taken."""
     now = BEGIN
     while now < BEGIN + 30 * NS:
@@ -76,8 +106,12 @@ def answers(sync: TimeSync, remote: Callable[[int], int], trip: Callable[[int], 
         now += NS // 10
 
 
-@given(SEEDS, st.integers(-(10**15), 10**15), st.floats(-9e-5, 9e-5), st.floats(1e-5, 0.05))
-def test_the_offset_is_right_within_its_error(seed: int, offset: int, drift: float, shortest: float) -> None:
+@given(
+    SEEDS, st.integers(-(10**15), 10**15), st.floats(-9e-5, 9e-5), st.floats(1e-5, 0.05)
+)
+def test_the_offset_is_right_within_its_error(
+    seed: int, offset: int, drift: float, shortest: float
+) -> None:
     """Whatever the two ways take, and however they differ, up to 100 ppm."""
     random, sync = np.random.default_rng(seed), TimeSync()
 
@@ -87,7 +121,9 @@ def test_the_offset_is_right_within_its_error(seed: int, offset: int, drift: flo
     def off(now: int) -> int:
         return abs((sync.offset(now) or 0) - (remote(now) - now))
 
-    for now, _ in answers(sync, remote, lambda _: round(NS * shortest * (1 + random.exponential(2.0)))):
+    for now, _ in answers(
+        sync, remote, lambda _: round(NS * shortest * (1 + random.exponential(2.0)))
+    ):
         error = sync.error(now)
         # The offset in use follows at a bounded rate: so there is a time for it.
         assert not sync.synchronised or remote(now) <= 0 or off(now) <= error + 20 * MS
@@ -98,7 +134,9 @@ def test_the_offset_is_right_within_its_error(seed: int, offset: int, drift: flo
 
 
 @given(SEEDS, st.sampled_from([0.0, 0.1, 0.5, 0.9, 2.0]), st.integers(-2 * NS, 2 * NS))
-def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answer(seed: int, pace: float, step: int):
+def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answer(
+    seed: int, pace: float, step: int
+):
     """As of a simulation that is stopped, or slower than time, whatever short round trips there were before."""
     random, sync, turn = np.random.default_rng(seed), TimeSync(), BEGIN + 10 * NS
 
@@ -115,7 +153,9 @@ def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answ
 
 
 @given(st.integers(-(10**12), 10**12), st.integers(0, MS), st.integers(1, 2))
-def test_one_or_two_wrong_answers_change_nothing(wrong: int, trip: int, count: int) -> None:
+def test_one_or_two_wrong_answers_change_nothing(
+    wrong: int, trip: int, count: int
+) -> None:
     """However short the way that they seem to have taken; three in a row are believed."""
     sync, now = TimeSync(), BEGIN
     for k in range(30):
@@ -123,14 +163,21 @@ def test_one_or_two_wrong_answers_change_nothing(wrong: int, trip: int, count: i
         sent = sync.request(now)
         assert sent is not None
         is_wrong = 20 <= k < 20 + count and abs(wrong) > 20 * MS
-        sync.answer(sent, now + trip // 2 + wrong * is_wrong, now + (trip if is_wrong else 4 * MS))
+        sync.answer(
+            sent,
+            now + trip // 2 + wrong * is_wrong,
+            now + (trip if is_wrong else 4 * MS),
+        )
         assert abs(sync.offset(now + 4 * MS) or 0) <= 4 * MS
 
 
 @pytest.mark.parametrize(
-    ("sent", "remote", "after"), [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)]
+    ("sent", "remote", "after"),
+    [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)],
 )
-def test_an_answer_that_cannot_be_says_nothing_and_one_that_can_counts_once(sent: int, remote: int, after: int) -> None:
+def test_an_answer_that_cannot_be_says_nothing_and_one_that_can_counts_once(
+    sent: int, remote: int, after: int
+) -> None:
     sync = TimeSync()
     assert sync.request(NS) == NS
     assert not sync.answer(sent, remote, NS + after)
@@ -150,7 +197,10 @@ def test_without_answers_the_least_delayed_arrival_counts() -> None:
     assert 5 * MS <= -offset - 10 * NS < 6 * MS
 
 
-@given(start=st.integers(0, 2**33), steps=st.lists(st.integers(5, 500), min_size=1, max_size=50))
+@given(
+    start=st.integers(0, 2**33),
+    steps=st.lists(st.integers(5, 500), min_size=1, max_size=50),
+)
 def test_milliseconds_that_run_over_go_on(start: int, steps: list[int]) -> None:
     clock, true, now = BootClock(), start * MS, 10**15
     for step in [0, *steps]:
@@ -182,4 +232,10 @@ def test_the_time_of_the_system_is_measured_between_interruptions() -> None:
         return clock[0]
 
     for _ in range(200):
-        assert abs(system_ahead(tick, lambda: tick() + 1_790_000_000 * NS) - 1_790_000_000 * NS) <= 200
+        assert (
+            abs(
+                system_ahead(tick, lambda: tick() + 1_790_000_000 * NS)
+                - 1_790_000_000 * NS
+            )
+            <= 200
+        )

@@ -24,7 +24,9 @@ MS = 1_000_000
 KEY = bytes(range(32))
 
 
-def check_flight(talk: Conversation, rate: float = 50.0, since: float = 3.0, number: int = 0) -> None:
+def check_flight(
+    talk: Conversation, rate: float = 50.0, since: float = 3.0, number: int = 0
+) -> None:
     """All units at their rate; every sample is the motion's at its stamp, within resolution and error of the clock."""
     autopilot = talk.autopilots[number]
     for unit in range(autopilot.units):
@@ -33,7 +35,9 @@ def check_flight(talk: Conversation, rate: float = 50.0, since: float = 3.0, num
         stamps = np.array([sample.stamp for sample in samples])
         assert (np.diff(stamps) > 0).all()
         at = (stamps - autopilot.start) / NS
-        truth = np.column_stack([0.5 * np.sin(0.8 * at), -0.4 * np.cos(1.1 * at), -0.3 * np.sin(0.5 * at)])
+        truth = np.column_stack(
+            [0.5 * np.sin(0.8 * at), -0.4 * np.cos(1.1 * at), -0.3 * np.sin(0.5 * at)]
+        )
         error = np.array([sample.rate for sample in samples]) - truth
         # The noise of the motion, a step, and 6 ms of a motion of 0.6 rad/s^2.
         assert np.abs(error).max() < 5 * 0.002 + 0.001 + 0.004
@@ -54,9 +58,14 @@ def test_every_unit_comes_at_the_rate_asked_for(stack: str, kind: str) -> None:
     assert talk.vehicle.sync.error(talk.now) <= 3.2 * MS
     # Requests alone, as is checked of each: an answer to PX4's own would make it follow our clock.
     assert talk.sent["TIMESYNC"] > 5
-    stamps = [np.array([sample.stamp for sample in talk.of_unit(k)][-100:]) for k in range(3)]
+    stamps = [
+        np.array([sample.stamp for sample in talk.of_unit(k)][-100:]) for k in range(3)
+    ]
     # Of one instant, within the resolution.
-    assert stack == "px4" or max(np.abs(stamps[0] - other).max() for other in stamps[1:]) <= MS
+    assert (
+        stack == "px4"
+        or max(np.abs(stamps[0] - other).max() for other in stamps[1:]) <= MS
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,7 +77,9 @@ def test_every_unit_comes_at_the_rate_asked_for(stack: str, kind: str) -> None:
         (lambda: Autopilot("ardupilot", units=2, compasses=3), "SCALED_IMU"),
     ],
 )
-def test_one_imu_is_never_its_own_witness_and_a_compass_is_none(autopilot: Callable[[], Autopilot], kind: str) -> None:
+def test_one_imu_is_never_its_own_witness_and_a_compass_is_none(
+    autopilot: Callable[[], Autopilot], kind: str
+) -> None:
     talk = Conversation(autopilot(), kind=kind).run(6.0)
     assert talk.vehicle.kind == "SCALED_IMU"
     assert {sample.unit for _, sample in talk.samples} == {0, 1}
@@ -94,7 +105,9 @@ def cut(talk: Conversation) -> None:
     talk.cut = False
     talk.run(5.0)
     words = list(talk.vehicle.events)
-    assert [word for word in words if word.startswith(("nothing of ", "again"))] == words[-2:]
+    assert [
+        word for word in words if word.startswith(("nothing of ", "again"))
+    ] == words[-2:]
 
 
 def lower(talk: Conversation) -> None:
@@ -107,13 +120,22 @@ def lower(talk: Conversation) -> None:
 @pytest.mark.parametrize("stack", ["px4", "ardupilot"])
 @pytest.mark.parametrize(
     ("trouble", "restarts"),
-    [(reboot, {0, 1}), *((partial(step, seconds=by), {1}) for by in (-3000.0, -5.0, 20.0)), (cut, {0}), (lower, {0})],
+    [
+        (reboot, {0, 1}),
+        *((partial(step, seconds=by), {1}) for by in (-3000.0, -5.0, 20.0)),
+        (cut, {0}),
+        (lower, {0}),
+    ],
 )
-def test_after_whatever_happens_all_units_come_as_before(stack: str, trouble: Callable, restarts: set[int]) -> None:
+def test_after_whatever_happens_all_units_come_as_before(
+    stack: str, trouble: Callable, restarts: set[int]
+) -> None:
     talk = Conversation(Autopilot(stack, boot=-4000 * NS)).run(5.0)
     trouble(talk)
     assert talk.vehicle.clock.restarts in restarts
-    assert ("stepped" in " ".join(talk.vehicle.events)) == bool(talk.vehicle.clock.restarts)
+    assert ("stepped" in " ".join(talk.vehicle.events)) == bool(
+        talk.vehicle.clock.restarts
+    )
     check_flight(talk)
 
 
@@ -126,9 +148,15 @@ def slow_at_times(now: int) -> int:
     return 5 * MS if (now - 1000 * NS) // (4 * NS) % 2 else 400 * MS
 
 
-@pytest.mark.parametrize(("latency", "loss", "share"), [(jitter, 0.2, 0.4), (slow_at_times, 0.0, 0.7)])
-def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(latency: Callable, loss: float, share: float):
-    talk = Conversation(Autopilot("px4", loss=loss, seed=2), latency=lambda: latency(talk.now))
+@pytest.mark.parametrize(
+    ("latency", "loss", "share"), [(jitter, 0.2, 0.4), (slow_at_times, 0.0, 0.7)]
+)
+def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(
+    latency: Callable, loss: float, share: float
+):
+    talk = Conversation(
+        Autopilot("px4", loss=loss, seed=2), latency=lambda: latency(talk.now)
+    )
     talk.run(24.0)
     for unit in range(3):
         stamps = [sample.stamp for sample in talk.of_unit(unit)]
@@ -160,7 +188,10 @@ def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> N
 
 
 def test_the_same_system_from_another_address_is_left_aside() -> None:
-    one, other = Autopilot("px4"), Autopilot("px4", seed=5, rates={26: 50, 116: 50, 129: 50})
+    one, other = (
+        Autopilot("px4"),
+        Autopilot("px4", seed=5, rates={26: 50, 116: 50, 129: 50}),
+    )
     talk = Conversation(one, other, peers=(("a", 1), ("b", 2))).run(6.0)
     check_flight(talk)
     assert talk.vehicle.counts["from elsewhere"] > 500
@@ -198,7 +229,9 @@ def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> Non
 HEX = KEY.hex().encode()
 
 
-def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach_and_is_never_shown(tmp_path: Path) -> None:
+def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach_and_is_never_shown(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "key"
     path.touch(0o600)
     for data in (KEY, HEX, HEX.upper() + b"\n"):
@@ -206,7 +239,9 @@ def test_a_key_is_bytes_or_digits_that_nobody_else_can_reach_and_is_never_shown(
         assert read_key(str(path)) == KEY
     for data in (b"", b"secret", KEY[:31], HEX[:-2], bytes(5000)):
         path.write_bytes(data)
-        with pytest.raises(FdiError, match="is no key: expected 32 bytes, or 64 hexadecimal digits") as refused:
+        with pytest.raises(
+            FdiError, match="is no key: expected 32 bytes, or 64 hexadecimal digits"
+        ) as refused:
             read_key(str(path))
         assert not data or data.decode("latin1") not in str(refused.value)
     for mode in (0o640, 0o604, 0o620):
@@ -238,7 +273,9 @@ def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
     forged.signing.secret_key, forged.signing.sign_outgoing = bytes(32), True
     for link in range(256):
         forged.signing.link_id, forged.signing.timestamp = link, (1 << 48) - 1
-        talk.inject(bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(forged)))
+        talk.inject(
+            bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(forged))
+        )
     replayed = bytes(autopilot.mav.heartbeat_encode(2, 12, 0, 0, 4).pack(autopilot.mav))
     for _ in range(3):
         talk.inject(replayed)
@@ -257,8 +294,14 @@ def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
     assert talk.sent_to["here"] >= 3
     link = open_link("udpin:127.0.0.1:14999")
     link.trouble = ""
-    said = Reporter(link, talk.vehicle, ["imu_1"], ["/imu_1"]).lines("", "", talk.now)[0].message
-    assert re.search(r"rightly signed messages, but 864\d\d s old by this computer's clock", said), said
+    said = (
+        Reporter(link, talk.vehicle, ["imu_1"], ["/imu_1"])
+        .lines("", "", talk.now)[0]
+        .message
+    )
+    assert re.search(
+        r"rightly signed messages, but 864\d\d s old by this computer's clock", said
+    ), said
     assert autopilot.inbound.signing.goodsig_count > 1
     autopilot.mav.signing.timestamp = autopilot.inbound.signing.timestamp
     talk.run(6.0)
@@ -280,7 +323,9 @@ def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
 @given(pieces=st.lists(st.binary(max_size=300), max_size=30), seed=st.integers(0, 999))
 @example(pieces=600 * [b"\xfd\xff\x00"], seed=0)
 @example(pieces=600 * [struct.pack("<BBB", 0xFD, 9, 1)], seed=1)
-def test_garbage_between_messages_does_no_harm_and_what_is_left_of_it_does_not_grow(pieces, seed) -> None:
+def test_garbage_between_messages_does_no_harm_and_what_is_left_of_it_does_not_grow(
+    pieces, seed
+) -> None:
     talk = Conversation(Autopilot("ardupilot", seed=seed)).run(3.0)
     for piece in pieces:
         talk.inject(piece)

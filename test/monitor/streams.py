@@ -26,19 +26,36 @@ START = 1_600_000_000_000_000_000
 def body_rate(samples: int, size: float = 1.0) -> NDArray[np.float64]:
     """Smooth motion about all axes, (N, 3) rad/s."""
     t = np.arange(samples) / RATE
-    return size * np.column_stack([np.sin(0.7 * t), 0.6 * np.cos(1.1 * t), 0.8 * np.sin(0.3 * t + 1)])
+    return size * np.column_stack(
+        [np.sin(0.7 * t), 0.6 * np.cos(1.1 * t), 0.8 * np.sin(0.3 * t + 1)]
+    )
 
 
 def swing(seconds: NDArray[np.float64], size: float = 0.5) -> NDArray[np.float64]:
     """Quick motion about all axes, (N, 3) rad/s."""
-    return size * np.sin(2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3]) + np.arange(3.0))
+    return size * np.sin(
+        2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3]) + np.arange(3.0)
+    )
 
 
-def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0, late: float = 0.0) -> Block:
+def stream(
+    geometry: Geometry,
+    samples: int,
+    size: float = 1.0,
+    seed: int = 0,
+    late: float = 0.0,
+) -> Block:
     """White noise of SIGMA on every channel of a moving vehicle, stamped so many seconds late."""
     rng = np.random.default_rng(seed)
-    z = body_rate(samples, size) @ geometry.axes.T + rng.normal(0, SIGMA, (samples, geometry.n))
-    return Block(START + round(1e9 * late) + np.arange(samples, dtype=np.int64) * round(1e9 / RATE), z)
+    z = body_rate(samples, size) @ geometry.axes.T + rng.normal(
+        0, SIGMA, (samples, geometry.n)
+    )
+    return Block(
+        START
+        + round(1e9 * late)
+        + np.arange(samples, dtype=np.int64) * round(1e9 / RATE),
+        z,
+    )
 
 
 def config(**changes: object) -> Config:
@@ -47,7 +64,11 @@ def config(**changes: object) -> Config:
     The detector is one that judges each sample by itself: its verdicts can be foretold to the sample.
     """
     settings = {name.replace("__", "."): value for name, value in changes.items()}
-    given = {"detector.name": "likelihood_ratio", "noise.noise_std": SIGMA, "sample_rate": RATE}
+    given = {
+        "detector.name": "likelihood_ratio",
+        "noise.noise_std": SIGMA,
+        "sample_rate": RATE,
+    }
     return Config.from_parameters({**given, **settings})
 
 
@@ -59,7 +80,11 @@ def parallel(count: int, **changes: object) -> Config:
 
 def mounted(axes: NDArray[np.float64], **changes: object) -> Config:
     """Settings of channels along these axes (n, 3), whatever housings they are in, judged by `sequential`."""
-    axis = {"geometry.preset": "axes", "geometry.axes": axes.ravel().tolist(), "detector.name": "sequential"}
+    axis = {
+        "geometry.preset": "axes",
+        "geometry.axes": axes.ravel().tolist(),
+        "detector.name": "sequential",
+    }
     return config(input="channels", **axis, **changes)
 
 
@@ -68,20 +93,30 @@ def struck(block: Block, faults: Sequence[str], names: Sequence[str]) -> Block:
     return Injector([parse_fault(fault) for fault in faults], names).apply(block)
 
 
-def run(pipeline: Pipeline, samples: int, *faults: str, **options: float) -> tuple[Block, Output]:
+def run(
+    pipeline: Pipeline, samples: int, *faults: str, **options: float
+) -> tuple[Block, Output]:
     """A stream, of these options, with faults injected, and what a monitor makes of it."""
-    block = struck(stream(pipeline.geometry, samples, **options), faults, pipeline.channel_names)
+    block = struck(
+        stream(pipeline.geometry, samples, **options), faults, pipeline.channel_names
+    )
     return block, pipeline.process(block)
 
 
 def told(pipeline: Pipeline) -> dict[str, StatusLine]:
     """What an operator is told of a monitor as it stands, by name."""
-    return {line.name.removeprefix(PREFIX): line for line in describe(pipeline.status())}
+    return {
+        line.name.removeprefix(PREFIX): line for line in describe(pipeline.status())
+    }
 
 
 def declarations(pipeline: Pipeline, output: Output) -> list[tuple[str, str]]:
     """Declared channels in order: name and state."""
-    return [(pipeline.channel_names[e.channel], e.after.name) for e in output.events if e.declares]
+    return [
+        (pipeline.channel_names[e.channel], e.after.name)
+        for e in output.events
+        if e.declares
+    ]
 
 
 def seconds(event: Event) -> float:
@@ -91,7 +126,10 @@ def seconds(event: Event) -> float:
 
 def states_of(pipeline: Pipeline, output: Output, name: str) -> set[ChannelState]:
     """Every state a channel was in."""
-    return {ChannelState(s) for s in np.unique(output.state[:, pipeline.channel_names.index(name)])}
+    return {
+        ChannelState(s)
+        for s in np.unique(output.state[:, pipeline.channel_names.index(name)])
+    }
 
 
 def output_of(n: int, events: Sequence[Event] = (), **fields: object) -> Output:

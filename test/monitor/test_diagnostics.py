@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.diagnostics import DIAGNOSTICS, InputStatus, Level, StatusLine, describe, encode_diagnostics
+from fdi_ros.monitor.diagnostics import (
+    DIAGNOSTICS,
+    InputStatus,
+    Level,
+    StatusLine,
+    describe,
+    encode_diagnostics,
+)
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import SampleRateCheck
@@ -51,15 +58,29 @@ SEQUENTIAL = {"detector__name": "sequential"}
     [
         (config(hardware_id="7"), [], "monitor", Level.OK, WELL),
         (config(), lost(2, 2, 2, 2), "monitor", Level.ERROR, "no fused rate"),
-        (config(), lost(1, 2, 3), "monitor", Level.ERROR, "0 of 6 channels healthy; no further fault would be seen"),
+        (
+            config(),
+            lost(1, 2, 3),
+            "monitor",
+            Level.ERROR,
+            "0 of 6 channels healthy; no further fault would be seen",
+        ),
         (config(bias__startup_bias_duration=9.0), [], "monitor", Level.ERROR, LEARNS),
-        (config(excluded_channels=("g1",)), [], "g1", Level.WARN, "taken out by the operator"),
+        (
+            config(excluded_channels=("g1",)),
+            [],
+            "g1",
+            Level.WARN,
+            "taken out by the operator",
+        ),
         (config(), GONE, "g2", Level.STALE, "gives no data"),
         # A set of whole units is called by the units.
         (parallel(2, **SEQUENTIAL), of_unit("xyz"), "imu_2.y", Level.ERROR, UNITS),
     ],
 )
-def test_what_is_said(monitor: Config, faults: list[str], name: str, level: Level, words: str) -> None:
+def test_what_is_said(
+    monitor: Config, faults: list[str], name: str, level: Level, words: str
+) -> None:
     pipeline = Pipeline(monitor)
     run(pipeline, 600, *faults)
     lines, status = told(pipeline), pipeline.status()
@@ -67,11 +88,22 @@ def test_what_is_said(monitor: Config, faults: list[str], name: str, level: Leve
     assert lines[name].message.startswith(words)
     assert status.has_rate == ("no fused rate" not in lines["monitor"].message)
     assert {line.hardware_id for line in lines.values()} == {monitor.hardware_id}
-    assert lines["monitor"].level != Level.OK or {line.level for line in lines.values()} == {Level.OK}
-    refused = replace(status, has_rate=False, withheld=False, bias_state="refused, not at rest: g1 had mean 0.5 rad/s")
-    assert describe(refused)[0].message.startswith(f"no fused rate: biases not learned: {refused.bias_state}")
+    assert lines["monitor"].level != Level.OK or {
+        line.level for line in lines.values()
+    } == {Level.OK}
+    refused = replace(
+        status,
+        has_rate=False,
+        withheld=False,
+        bias_state="refused, not at rest: g1 had mean 0.5 rad/s",
+    )
+    assert describe(refused)[0].message.startswith(
+        f"no fused rate: biases not learned: {refused.bias_state}"
+    )
     silent = describe(status, silent=12.4)
-    assert {(line.level, line.message) for line in silent} == {(Level.STALE, "no sample for 12.4 s")}
+    assert {(line.level, line.message) for line in silent} == {
+        (Level.STALE, "no sample for 12.4 s")
+    }
 
 
 def test_an_isolated_fault_by_how_much_and_since_when() -> None:
@@ -81,25 +113,37 @@ def test_an_isolated_fault_by_how_much_and_since_when() -> None:
     assert pipeline.status().apart is None, "of three units no pair is apart"
     line, values = lines["imu_2.y"], dict(lines["imu_2.y"].values)
     assert (line.level, values["state"]) == (Level.ERROR, "FAULTY")
-    error, seconds = line.message.removeprefix("disagrees with the others by ").split(" rad/s for ")
+    error, seconds = line.message.removeprefix("disagrees with the others by ").split(
+        " rad/s for "
+    )
     assert float(error) == pytest.approx(0.21, abs=0.01)
     assert seconds.endswith(" s; isolated and left out")
     assert float(seconds.split()[0]) == pytest.approx(4.0, abs=0.15)
     assert abs(float(values["residual (rad/s)"])) == pytest.approx(0.21, abs=0.02)
     assert lines["monitor"].level == Level.WARN
-    assert lines["monitor"].message.startswith("8 of 9 channels healthy; a further fault would be")
+    assert lines["monitor"].message.startswith(
+        "8 of 9 channels healthy; a further fault would be"
+    )
 
 
 @pytest.mark.parametrize("detector", ["sequential", "likelihood_ratio"])
 @pytest.mark.parametrize("size", [0.03, -0.3])
-def test_of_two_parallel_units_the_axis_is_named_and_by_how_much_they_are_apart(detector: str, size: float) -> None:
+def test_of_two_parallel_units_the_axis_is_named_and_by_how_much_they_are_apart(
+    detector: str, size: float
+) -> None:
     pipeline = Pipeline(parallel(2, detector__name=detector))
     run(pipeline, 600, f"channel=imu_2.y kind=bias size={size} start=2")
     lines, pair = told(pipeline), pipeline.status().apart
     assert pair.channels == ("imu_1.y", "imu_2.y")
     assert "no further fault would be isolated" in lines["monitor"].message
-    assert abs(pair.size - abs(size)) < (4 * pair.std if detector == "sequential" else 0.01) < 0.02
-    apart = f"the y axis of imu_1 or imu_2, {plus_minus(pair.size, pair.std)} rad/s apart"
+    assert (
+        abs(pair.size - abs(size))
+        < (4 * pair.std if detector == "sequential" else 0.01)
+        < 0.02
+    )
+    apart = (
+        f"the y axis of imu_1 or imu_2, {plus_minus(pair.size, pair.std)} rad/s apart"
+    )
     assert apart in lines["monitor"].message
     words = f"{apart}: one of the two is faulty, the evidence cannot tell which; for "
     for name in pair.channels:
@@ -118,13 +162,31 @@ NOTHING_YET = Pipeline(config()).status()
     st.floats(allow_nan=True, allow_infinity=True),
     st.integers(0, 2**62),
 )
-def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, since) -> None:
-    channel = ChannelStatus("g1", state, reason, since, ("a", "b"), error, residual, SECOND, {"samples": 100})
-    status = replace(NOTHING_YET, channels=(channel,), stamp=2 * SECOND, samples=5, has_rate=True)
+def test_only_ok_is_ok_and_every_word_is_there(
+    state, reason, error, residual, since
+) -> None:
+    channel = ChannelStatus(
+        "g1",
+        state,
+        reason,
+        since,
+        ("a", "b"),
+        error,
+        residual,
+        SECOND,
+        {"samples": 100},
+    )
+    status = replace(
+        NOTHING_YET, channels=(channel,), stamp=2 * SECOND, samples=5, has_rate=True
+    )
     whole, line = describe(status)
     assert (line.level == Level.OK) == (state == ChannelState.OK)
     assert whole.level != Level.OK or state == ChannelState.OK
-    for text in (whole.message, line.message, *(value for pair in (*whole.values, *line.values) for value in pair)):
+    for text in (
+        whole.message,
+        line.message,
+        *(value for pair in (*whole.values, *line.values) for value in pair),
+    ):
         assert isinstance(text, str)
         assert "nan" not in text.split()
         assert "\n" not in text
@@ -135,18 +197,38 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
     ("change", "level", "words"),
     [
         ({}, Level.OK, "delivers"),
-        ({"silent": None, "live": False, "received": 0}, Level.STALE, "no message yet on imu_1/data_raw"),
+        (
+            {"silent": None, "live": False, "received": 0},
+            Level.STALE,
+            "no message yet on imu_1/data_raw",
+        ),
         ({"silent": 3.2, "live": False}, Level.STALE, "silent for 3.2 s"),
         ({"lag": 0.045}, Level.WARN, "stamps stay 45.0 ms behind the other inputs'"),
         ({"lag": 0.0015}, Level.OK, "delivers"),
         ({"offset": 3600.0}, Level.WARN, "stamps are 60 min behind the clock"),
         ({"offset": -5.0}, Level.WARN, "stamps are 5.0 s ahead of the clock"),
-        ({"offset": 45_333_180.0}, Level.WARN, "525 days behind the clock (of a recording? then use_sim_time"),
+        (
+            {"offset": 45_333_180.0},
+            Level.WARN,
+            "525 days behind the clock (of a recording? then use_sim_time",
+        ),
         ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
-        ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
-        ({"recent": {"ahead": 7}}, Level.WARN, "stamps ahead of the clock, refused (7)"),
+        (
+            {"recent": {"malformed": 2}, "error": "array has 5 values"},
+            Level.WARN,
+            "malformed messages (2)",
+        ),
+        (
+            {"recent": {"ahead": 7}},
+            Level.WARN,
+            "stamps ahead of the clock, refused (7)",
+        ),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
-        ({"live": False, "arrives": True, "recent": {"late": 50}}, Level.STALE, "can be used; messages too late"),
+        (
+            {"live": False, "arrives": True, "recent": {"late": 50}},
+            Level.STALE,
+            "can be used; messages too late",
+        ),
     ],
 )
 def test_inputs(change, level, words) -> None:
@@ -158,7 +240,9 @@ def test_inputs(change, level, words) -> None:
 
 def test_a_wrong_sample_rate_is_told_once_it_is_measured():
     sampling, count, stamp = SampleRateCheck(10.0), 0, 10**18
-    for k, (samples, ms) in enumerate([(100, 1000), (30, 1000), (100, 1000), (99, 1000), (101, 1000), (100, 1000)]):
+    for k, (samples, ms) in enumerate(
+        [(100, 1000), (30, 1000), (100, 1000), (99, 1000), (101, 1000), (100, 1000)]
+    ):
         assert not sampling.words, k
         sampling.check(count := count + samples, stamp := stamp + ms * 1_000_000)
     assert sampling.words.startswith("samples come at 100 Hz, sample_rate is 10 Hz")
@@ -177,24 +261,39 @@ BEGIN = 10**18
 UNTIL_REST_ENDS = 4.0
 LOOSE = {"noise.bias_walk": [2e-4], "bias.max_drift": 0.01}
 SET = {"imus.delays": (0.0, 0.001)}
-THREE = {"imus.topics": ["/a", "/b", "/c"], "imus.names": ["a", "b", "c"], "imus.mounts": ()}
+THREE = {
+    "imus.topics": ["/a", "/b", "/c"],
+    "imus.names": ["a", "b", "c"],
+    "imus.mounts": (),
+}
 
 
 def made(**changes: Any) -> Pipeline:
-    return Pipeline(Config.from_file(CONFIG, {"detector.name": "sequential", **changes}))
+    return Pipeline(
+        Config.from_file(CONFIG, {"detector.name": "sequential", **changes})
+    )
 
 
 def rate(t: NDArray[np.float64], rest: float) -> NDArray[np.float64]:
     """Swift turns about all axes, (N, 3) rad/s, up to 10 rad/s^2; at rest before."""
-    swing = np.column_stack([np.sin(9 * t), 0.6 * np.cos(11 * t), 0.8 * np.sin(6 * t + 1)])
+    swing = np.column_stack(
+        [np.sin(9 * t), 0.6 * np.cos(11 * t), 0.8 * np.sin(6 * t + 1)]
+    )
     return swing * np.clip(t - rest, 0, 1)[:, None]
 
 
-def flight(pipeline: Pipeline, seconds: float, late: tuple[float, ...] = (), rest: float = UNTIL_REST_ENDS) -> Block:
+def flight(
+    pipeline: Pipeline,
+    seconds: float,
+    late: tuple[float, ...] = (),
+    rest: float = UNTIL_REST_ENDS,
+) -> Block:
     """White noise on units of which each has its values stamped late by so much."""
     t = np.arange(round(100 * seconds)) * 0.01
     axes, late = pipeline.geometry.axes, late or (0.0,) * (pipeline.geometry.n // 3)
-    z = np.hstack([rate(t - late[u], rest) @ axes[3 * u : 3 * u + 3].T for u in range(len(late))])
+    z = np.hstack(
+        [rate(t - late[u], rest) @ axes[3 * u : 3 * u + 3].T for u in range(len(late))]
+    )
     z += np.random.default_rng(1).normal(0, NOISE, z.shape)
     return Block(BEGIN + np.arange(len(t), dtype=np.int64) * 10**7, z)
 
@@ -202,15 +301,37 @@ def flight(pipeline: Pipeline, seconds: float, late: tuple[float, ...] = (), res
 @pytest.mark.parametrize(
     ("changes", "late", "delays", "words"),
     [
-        ({}, (0.0, 0.004), (0.0, 0.004), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's"),
-        ({}, (0.0, -0.004), (0.0, -0.004), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms early against imu_1's"),
-        (SET, (0.0, 0.004), (0.0, 0.004), "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's"),
-        (THREE, (0.005, 0.0, 0.0), (0.0, -0.005, -0.005), "a as a whole: its stamps are 5.0 +- 0.1 ms late against"),
+        (
+            {},
+            (0.0, 0.004),
+            (0.0, 0.004),
+            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+        ),
+        (
+            {},
+            (0.0, -0.004),
+            (0.0, -0.004),
+            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms early against imu_1's",
+        ),
+        (
+            SET,
+            (0.0, 0.004),
+            (0.0, 0.004),
+            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+        ),
+        (
+            THREE,
+            (0.005, 0.0, 0.0),
+            (0.0, -0.005, -0.005),
+            "a as a whole: its stamps are 5.0 +- 0.1 ms late against",
+        ),
         ({}, (0.0, 0.0), (0.0, 0.0), ""),
         ({"detector.name": "likelihood_ratio"}, (0.0, 0.004), (), ""),
     ],
 )
-def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(changes, late, delays, words):
+def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(
+    changes, late, delays, words
+):
     pipeline = made(**changes)
     output = pipeline.process(flight(pipeline, 12, late))
     status, lines = pipeline.status(), told(pipeline)
@@ -223,7 +344,9 @@ def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(changes, late, d
     if words:
         assert abs(status.delays[1] - delays[1]) < 4 * status.delay_std[1]
         hint = json.loads(message.split("imus.delays: ")[1].rstrip(")"))
-        assert hint == pytest.approx(np.add(late, changes.get("imus.delays", 0.0)), abs=3e-4)
+        assert hint == pytest.approx(
+            np.add(late, changes.get("imus.delays", 0.0)), abs=3e-4
+        )
         assert lines["monitor"].level == Level.WARN
         assert {lines[name].level for name in pipeline.channel_names} == {Level.OK}
 
@@ -233,16 +356,25 @@ def test_a_start_in_motion_is_followed_and_what_stays_unknown_is_said():
     block = flight(pipeline, 14, rest=-2.0)
     offset = np.array([0.01, -0.01, 0.0, 0.01, 0.0, -0.005])
     output = pipeline.process(Block(block.stamp, block.z + offset))
-    assert output.valid[400:].all(), "it judges and gives a rate after the time of one average"
+    assert output.valid[400:].all(), (
+        "it judges and gives a rate after the time of one average"
+    )
     assert not declarations(pipeline, output)
     status, seen = pipeline.status(), pipeline.geometry.S @ offset
     assert "the common bias is unknown to 0.02 rad/s" in status.bias_state
-    drift, std = (np.array([getattr(channel, name) for channel in status.channels]) for name in ("drift", "bias_std"))
-    assert np.abs(pipeline.geometry.S @ drift - seen).max() < 0.002, "what the channels see of each other is learned"
+    drift, std = (
+        np.array([getattr(channel, name) for channel in status.channels])
+        for name in ("drift", "bias_std")
+    )
+    assert np.abs(pipeline.geometry.S @ drift - seen).max() < 0.002, (
+        "what the channels see of each other is learned"
+    )
     assert status.bias == pytest.approx(drift)
     assert (std < 0.005).all()
     spread = np.sqrt(np.diag(output.covariance[-1]))
-    assert (spread >= np.sqrt(np.diag(pipeline.geometry.covariance(0.02**2)))).all(), "the rest is in the covariance"
+    assert (spread >= np.sqrt(np.diag(pipeline.geometry.covariance(0.02**2)))).all(), (
+        "the rest is in the covariance"
+    )
     value = dict(told(pipeline)["imu_1.x"].values)["of that followed in flight (rad/s)"]
     assert float(value) == pytest.approx(drift[0], rel=1e-3)
 
@@ -253,7 +385,9 @@ def test_a_noisy_channel_is_told_and_stays_in_use():
     block.z[600:, 1] += np.random.default_rng(2).normal(0, 8 * NOISE, 600)
     assert not declarations(pipeline, pipeline.process(block))
     lines, channel = told(pipeline), pipeline.status().channels[1]
-    warned = {name: line.level for name, line in lines.items() if line.level != Level.OK}
+    warned = {
+        name: line.level for name, line in lines.items() if line.level != Level.OK
+    }
     assert warned == {"monitor": Level.WARN, "imu_1.y": Level.WARN}
     assert 4 < channel.noise < 9
     words = f"agrees with the others; noise {channel.noise:.1f} times noise_std and above the others'"
@@ -266,16 +400,22 @@ def test_a_gyro_that_begins_far_off_is_used_and_told_as_it_may_be_faulty():
     learned = {"bias__startup_bias_duration": 1.0, "bias__turn_on_std": 0.01}
     for size, level in ((0.03, Level.OK), (0.08, Level.WARN)):
         pipeline = Pipeline(config(**learned))
-        z = 1e-4 * np.random.default_rng(1).standard_normal((600, 6)) + size * (np.arange(6) == 1)
+        z = 1e-4 * np.random.default_rng(1).standard_normal((600, 6)) + size * (
+            np.arange(6) == 1
+        )
         pipeline.process(Block(np.arange(600) * SECOND // 100, z))
         lines = told(pipeline)
         assert lines["g2"].level == lines["monitor"].level == level
-        assert ("began with a bias of 0.08" in lines["g2"].message) == (level == Level.WARN)
+        assert ("began with a bias of 0.08" in lines["g2"].message) == (
+            level == Level.WARN
+        )
         assert lines["g3"].level == Level.OK
 
 
 def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_own_name():
-    config = Config.from_file(CONFIG.with_name("three_imus.yaml"), LOOSE | {"noise.bias_walk": [2e-3]})
+    config = Config.from_file(
+        CONFIG.with_name("three_imus.yaml"), LOOSE | {"noise.bias_walk": [2e-3]}
+    )
     pipeline = Pipeline(config)
     block = flight(pipeline, 120, rest=1e9)
     block.z[500:, 0] += 1.2e-6 * np.arange(len(block.z) - 500)
@@ -286,14 +426,20 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
     assert line.message.endswith("a fault beyond 0.01 (bias.max_drift)")
     pipeline.process(block[9000:])
     status, line = pipeline.status(), told(pipeline)["imu_1.x"]
-    assert [c.name for c in status.channels if c.state == ChannelState.FAULTY] == ["imu_1.x"]
+    assert [c.name for c in status.channels if c.state == ChannelState.FAULTY] == [
+        "imu_1.x"
+    ]
     assert status.channels[0].reason == Reason.DRIFTED
-    assert line.message.startswith("has drifted: its bias is beyond bias.max_drift by 0.0")
+    assert line.message.startswith(
+        "has drifted: its bias is beyond bias.max_drift by 0.0"
+    )
     assert line.level == Level.ERROR
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_a_unit_that_gives_old_values_is_told_within_the_time_for_it(count: int) -> None:
+def test_a_unit_that_gives_old_values_is_told_within_the_time_for_it(
+    count: int,
+) -> None:
     pipeline = Pipeline(parallel(count, **SEQUENTIAL))
     block = stream(pipeline.geometry, 1000)
     block.z[700:, 3:6] = block.z[699, 3:6]
@@ -317,7 +463,9 @@ def test_what_withholds_the_rate_is_what_is_said() -> None:
     pipeline.process(block)
     line = told(pipeline)["monitor"]
     assert line.level == Level.ERROR
-    assert line.message.startswith("no fused rate: withheld, as all channels repeat their values in motion")
+    assert line.message.startswith(
+        "no fused rate: withheld, as all channels repeat their values in motion"
+    )
 
 
 def test_followed_biases_outlive_a_restart(tmp_path):
@@ -342,7 +490,9 @@ def test_followed_biases_outlive_a_restart(tmp_path):
     output = after.process(Block(block.stamp + SECOND, block.z))
     assert output.valid.all()
     unknown = after.geometry.covariance(0.02**2)
-    assert (np.diag(output.covariance[-1]) >= np.diag(unknown)).all(), "and stands in the covariance"
+    assert (np.diag(output.covariance[-1]) >= np.diag(unknown)).all(), (
+        "and stands in the covariance"
+    )
 
 
 def test_the_walk_since_a_state_was_saved_is_in_what_is_restored(tmp_path):
@@ -350,9 +500,14 @@ def test_the_walk_since_a_state_was_saved_is_in_what_is_restored(tmp_path):
     before, after = (made(**{"noise.bias_walk": [walk]}) for _ in range(2))
     before.process(flight(before, 8))
     StateFile(path, 1e4).save(before)
-    path.write_text(json.dumps({**json.loads(path.read_text()), "saved": time.time() - 400.0}))
+    path.write_text(
+        json.dumps({**json.loads(path.read_text()), "saved": time.time() - 400.0})
+    )
     assert StateFile(path, 1e4).restore(after)
-    saved, restored = (one.detector.states[0]["estimator"]["states"]["p"].diagonal()[:6] for one in (before, after))
+    saved, restored = (
+        one.detector.states[0]["estimator"]["states"]["p"].diagonal()[:6]
+        for one in (before, after)
+    )
     assert (restored >= (saved + (walk * 20) ** 2) * (1 - 1e-6)).all()
 
 
@@ -360,14 +515,18 @@ def test_the_walk_since_a_state_was_saved_is_in_what_is_restored(tmp_path):
     "copied",
     [
         lambda values: values,
-        lambda values: values @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T,
+        lambda values: (
+            values @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T
+        ),
         lambda values: 1.01 * values,
         lambda values: np.vstack([values[:3], values[:-3]]),
     ],
 )
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("detector", ["sequential", "likelihood_ratio"])
-def test_of_two_topics_of_one_sensor_the_second_is_unchecked_within_five_seconds(copied, count, detector) -> None:
+def test_of_two_topics_of_one_sensor_the_second_is_unchecked_within_five_seconds(
+    copied, count, detector
+) -> None:
     pipeline = Pipeline(parallel(count, detector__name=detector))
     block = stream(pipeline.geometry, 1500)
     # The sensor of both is off from the start: two against a healthy third.
@@ -376,16 +535,25 @@ def test_of_two_topics_of_one_sensor_the_second_is_unchecked_within_five_seconds
     block.z[100:110, 4] = np.nan
     output = pipeline.process(block)
     assert (output.state[500:, 3:6] == ChannelState.UNCHECKED).all()
-    assert not (output.state[500:, 6:] == ChannelState.FAULTY).any(), "a sensor and its copy outvote no healthy unit"
+    assert not (output.state[500:, 6:] == ChannelState.FAULTY).any(), (
+        "a sensor and its copy outvote no healthy unit"
+    )
     if count == 2:
-        assert np.isinf(output.level[500:]).all(), "nothing checks the one sensor there is"
+        assert np.isinf(output.level[500:]).all(), (
+            "nothing checks the one sensor there is"
+        )
     status, lines = pipeline.status(), told(pipeline)
     whole, line = lines["monitor"], lines["imu_2.x"]
-    assert not {"imu_2.x", "imu_2.y", "imu_2.z"} & {*status.can_detect, *status.can_isolate}
+    assert not {"imu_2.x", "imu_2.y", "imu_2.z"} & {
+        *status.can_detect,
+        *status.can_isolate,
+    }
     assert whole.level >= Level.WARN
     assert "imu_1 (/imu_1) and imu_2 (/imu_2) give the same values" in whole.message
     assert "imu_3 (" not in whole.message
-    assert line.message.startswith("gives the values of another unit: one sensor, no redundancy")
+    assert line.message.startswith(
+        "gives the values of another unit: one sensor, no redundancy"
+    )
     assert "left out" in line.message
 
 
@@ -404,26 +572,36 @@ def coarse(z: NDArray[np.float64]) -> None:
 
 @pytest.mark.parametrize("size", [0.0, 1.0])
 @pytest.mark.parametrize("change", [lossy, impossible, coarse, lambda z: None])
-def test_copies_are_found_where_messages_are_lost_and_no_others(change, size: float) -> None:
+def test_copies_are_found_where_messages_are_lost_and_no_others(
+    change, size: float
+) -> None:
     pipeline = Pipeline(parallel(3, **SEQUENTIAL))
     block = stream(pipeline.geometry, 1500, size=size)
     change(block.z)
     pipeline.process(block)
-    assert pipeline.status().copies == ((("imu_1 (/imu_1)", "imu_3 (/imu_3)"),) if change is lossy else ())
+    assert pipeline.status().copies == (
+        (("imu_1 (/imu_1)", "imu_3 (/imu_3)"),) if change is lossy else ()
+    )
 
 
-TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9)
+TEXTS = st.text(
+    st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9
+)
 VALUES = st.lists(st.tuples(TEXTS, TEXTS), max_size=3).map(tuple)
 LINES = st.builds(StatusLine, st.sampled_from(Level), TEXTS, TEXTS, TEXTS, VALUES)
 
 
 @settings(max_examples=60)
 @given(st.lists(LINES, max_size=3), st.integers(0, 2**31 * 10**9 - 10**9))
-def test_diagnostics_are_the_bytes_of_rosbags(drawn: list[StatusLine], now: int) -> None:
+def test_diagnostics_are_the_bytes_of_rosbags(
+    drawn: list[StatusLine], now: int
+) -> None:
     data = encode_diagnostics(drawn, now)
     message = STORE.deserialize_cdr(data, DIAGNOSTICS.type)
     assert bytes(STORE.serialize_cdr(message, DIAGNOSTICS.type)) == data
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == now
     for line, read in zip(drawn, message.status, strict=True):
         values = tuple((pair.key, pair.value) for pair in read.values)
-        assert line == StatusLine(read.level, read.name, read.message, read.hardware_id, values)
+        assert line == StatusLine(
+            read.level, read.name, read.message, read.hardware_id, values
+        )

@@ -9,17 +9,36 @@ import re
 
 import numpy as np
 import pytest
-from monitor.streams import RATE, SIGMA, body_rate, config, declarations, parallel, run, states_of, stream, told
+from monitor.streams import (
+    RATE,
+    SIGMA,
+    body_rate,
+    config,
+    declarations,
+    parallel,
+    run,
+    states_of,
+    stream,
+    told,
+)
 
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 
 SEQUENTIAL = {"detector__name": "sequential"}
-BRIEF = [f"channel=imu_1.z kind=bias size=0.3 start={s} stop={s + 1}" for s in (5, 8, 11)]
+BRIEF = [
+    f"channel=imu_1.z kind=bias size=0.3 start={s} stop={s + 1}" for s in (5, 8, 11)
+]
 DRIFT = ["channel=imu_1.x kind=bias size=0.0035 start=5"]
-STUCK, RAILS = "channel=imu_2.y kind=stuck start=10", "channel=imu_2.x kind=stuck size=4.1 start=5"
-JUMP, DEAD = f"channel=imu_1.x kind=bias size={np.radians(2)} start=5", "channel=imu_2.y kind=dropout start=2"
+STUCK, RAILS = (
+    "channel=imu_2.y kind=stuck start=10",
+    "channel=imu_2.x kind=stuck size=4.1 start=5",
+)
+JUMP, DEAD = (
+    f"channel=imu_1.x kind=bias size={np.radians(2)} start=5",
+    "channel=imu_2.y kind=dropout start=2",
+)
 
 
 @pytest.mark.parametrize(
@@ -30,31 +49,70 @@ JUMP, DEAD = f"channel=imu_1.x kind=bias size={np.radians(2)} start=5", "channel
         # PX4 passes 10.5 deg/s on one of three units: here 2 deg/s is found at once.
         (parallel(3), 1000, [JUMP], "imu_1.x", 0.1, Reason.DISAGREES),
         # A channel rails while the others see no such motion.
-        (parallel(3, health__max_rate=4.0), 1000, [RAILS], "imu_2.x", 1.0, Reason.DISAGREES),
+        (
+            parallel(3, health__max_rate=4.0),
+            1000,
+            [RAILS],
+            "imu_2.x",
+            1.0,
+            Reason.DISAGREES,
+        ),
         # A brief fault comes and goes three times, and is latched.
         (parallel(3), 2000, BRIEF, "imu_1.z", 0.1, Reason.DISAGREES),
         # A drift below every threshold is found by the drift test, does not return, and shows in no single sample.
-        (parallel(3, detector__name="cusum"), 6000, DRIFT, "imu_1.x", 20.0, Reason.DISAGREES),
-        (parallel(3, detector__name="cusum", decision__latch=False), 6000, DRIFT, "imu_1.x", 20.0, Reason.DISAGREES),
+        (
+            parallel(3, detector__name="cusum"),
+            6000,
+            DRIFT,
+            "imu_1.x",
+            20.0,
+            Reason.DISAGREES,
+        ),
+        (
+            parallel(3, detector__name="cusum", decision__latch=False),
+            6000,
+            DRIFT,
+            "imu_1.x",
+            20.0,
+            Reason.DISAGREES,
+        ),
         (parallel(3), 6000, DRIFT, "", 0.0, Reason.NONE),
     ],
 )
-def test_the_right_channel_is_declared_once_and_in_time(settings, samples, faults, declared, within, reason):
+def test_the_right_channel_is_declared_once_and_in_time(
+    settings, samples, faults, declared, within, reason
+):
     pipeline = Pipeline(settings)
     _, output = run(pipeline, samples, *faults)
-    assert declarations(pipeline, output) == ([(declared, "FAULTY")] if declared else [])
+    assert declarations(pipeline, output) == (
+        [(declared, "FAULTY")] if declared else []
+    )
     start = float(faults[0].partition("start=")[2].split()[0])
     for event in output.events:
-        assert not event.declares or (event.reason == reason and start <= event.row / RATE < start + within)
+        assert not event.declares or (
+            event.reason == reason and start <= event.row / RATE < start + within
+        )
     assert np.isfinite(output.rate).all()
     for channel in {*pipeline.channel_names} - {declared}:
-        assert states_of(pipeline, output, channel) <= {ChannelState.OK, ChannelState.UNCHECKED, ChannelState.SUSPECT}
-    assert not declared or output.state[-1, pipeline.channel_names.index(declared)] == ChannelState.FAULTY
+        assert states_of(pipeline, output, channel) <= {
+            ChannelState.OK,
+            ChannelState.UNCHECKED,
+            ChannelState.SUSPECT,
+        }
+    assert (
+        not declared
+        or output.state[-1, pipeline.channel_names.index(declared)]
+        == ChannelState.FAULTY
+    )
 
 
 def test_one_axis_sticks_in_motion_too_slow_for_the_residual_to_show():
     """A value held exactly, while the others drift away by less than any residual test would dare to call a fault."""
-    pipeline = Pipeline(config(detector__false_alarms_per_hour=0, detector__false_alarm_probability=1e-300))
+    pipeline = Pipeline(
+        config(
+            detector__false_alarms_per_hour=0, detector__false_alarm_probability=1e-300
+        )
+    )
     block = stream(pipeline.geometry, 3000, size=0.0)
     ramp = np.clip(np.arange(3000) / RATE - 10, 0, None)[:, None] * 0.01
     z = block.z + ramp * pipeline.geometry.axes[:, :1].T
@@ -73,14 +131,18 @@ def test_one_axis_sticks_in_motion_too_slow_for_the_residual_to_show():
         (config(), 0.15, np.s_[500:501]),
     ],
 )
-def test_a_value_repeats_because_the_sensor_is_still_and_quantised(settings, noise, rows):
+def test_a_value_repeats_because_the_sensor_is_still_and_quantised(
+    settings, noise, rows
+):
     pipeline = Pipeline(settings)
     block = stream(pipeline.geometry, 900, size=0.0)
     z = np.round(np.random.default_rng(3).normal(0, noise, block.z.shape)) * SIGMA
     assert (np.diff(z[:, 0]) == 0).mean() > 0.9
     z[rows, 2] += 0.5
     output = pipeline.process(Block(block.stamp, z))
-    assert declarations(pipeline, output) == ([("g3", "FAULTY")] if len(z[rows]) > 1 else [])
+    assert declarations(pipeline, output) == (
+        [("g3", "FAULTY")] if len(z[rows]) > 1 else []
+    )
     assert output.valid.all()
     assert len(z[rows]) or (output.state[4:] == ChannelState.OK).all()
 
@@ -100,7 +162,11 @@ def test_all_channels_freeze_and_agree_with_each_other(value):
 def test_one_bad_unit_shifts_the_mean_and_the_right_one_is_blamed(size):
     pipeline = Pipeline(parallel(3))
     _, output = run(pipeline, 1000, f"channel=imu_2 kind=bias size={size} start=5")
-    assert {name for name, _ in declarations(pipeline, output)} == {"imu_2.x", "imu_2.y", "imu_2.z"}
+    assert {name for name, _ in declarations(pipeline, output)} == {
+        "imu_2.x",
+        "imu_2.y",
+        "imu_2.z",
+    }
     assert np.abs(output.rate[600:] - body_rate(1000)[600:]).max() < 5 * SIGMA
 
 
@@ -134,7 +200,12 @@ def test_a_fault_after_hours_of_good_flight_is_declared_as_fast(hours):
     # Time passes; the same samples, a minute apart, stand for any number of them.
     for k in range(21 if hours else 0):
         pipeline.process(stream(pipeline.geometry, 5000, late=60.0 * k))
-    _, output = run(pipeline, 5000, "channel=g4 kind=bias size=0.03 start=10", late=3600 * (hours + 1))
+    _, output = run(
+        pipeline,
+        5000,
+        "channel=g4 kind=bias size=0.03 start=10",
+        late=3600 * (hours + 1),
+    )
     (declared,) = [event for event in output.events if event.declares]
     assert (declared.channel, declared.after) == (3, ChannelState.FAULTY)
     assert declared.row / RATE - 10 == pytest.approx(0.03, abs=0.011)
@@ -147,19 +218,30 @@ def test_a_unit_that_gives_nothing_is_stale_and_what_an_operator_took_out_is_exc
     status = [(c.state, c.reason) for c in pipeline.status().channels]
     assert set(status[6:]) == {(ChannelState.STALE, Reason.NO_DATA)}
     assert status[0] == (ChannelState.EXCLUDED, Reason.OPERATOR)
-    assert (output.state[:, 6] == ChannelState.STALE).argmax() / RATE == pytest.approx(5.1, abs=0.02)
+    assert (output.state[:, 6] == ChannelState.STALE).argmax() / RATE == pytest.approx(
+        5.1, abs=0.02
+    )
     assert declarations(pipeline, output) == []
     assert output.valid.all()
 
 
 def test_two_parallel_units_disagree_and_which_is_wrong_stays_open_even_alone():
     pipeline = Pipeline(parallel(2))
-    faults = ["channel=imu_2.y kind=bias size=0.2 start=3", "channel=imu_1 kind=triad_loss start=6"]
+    faults = [
+        "channel=imu_2.y kind=bias size=0.2 start=3",
+        "channel=imu_1 kind=triad_loss start=6",
+    ]
     _, output = run(pipeline, 1000, *faults)
-    assert set(declarations(pipeline, output)) == {("imu_1.y", "AMBIGUOUS"), ("imu_2.y", "AMBIGUOUS")}
+    assert set(declarations(pipeline, output)) == {
+        ("imu_1.y", "AMBIGUOUS"),
+        ("imu_2.y", "AMBIGUOUS"),
+    }
     assert pipeline.status().channels[4].group == ("imu_1.y", "imu_2.y")
     # Neither can be left out without losing the axis: the doubt is in the covariance, and stays when one goes silent.
-    error, std = np.abs(output.rate - body_rate(1000))[:, 1], np.sqrt(output.covariance[:, 1, 1])
+    error, std = (
+        np.abs(output.rate - body_rate(1000))[:, 1],
+        np.sqrt(output.covariance[:, 1, 1]),
+    )
     assert error[599] == pytest.approx(0.1, abs=0.02)
     assert error[599] < std[599]
     assert error[-1] > 0.15
@@ -175,19 +257,28 @@ def test_a_sensor_saturates_in_a_hard_manoeuvre():
     assert 0.05 < clipped.mean() < 0.6
     assert declarations(pipeline, output) == []
     assert (output.state[clipped] == ChannelState.SUSPECT).all()
-    free = np.array([k >= 4 and not clipped[max(0, k - 8) : k + 1].any() for k in range(3000)])
+    free = np.array(
+        [k >= 4 and not clipped[max(0, k - 8) : k + 1].any() for k in range(3000)]
+    )
     assert 0.1 < free.mean() < 0.9
     assert (output.state[free] == ChannelState.OK).all()
-    assert sum(channel.counts["out of range"] for channel in pipeline.status().channels) == clipped.sum()
+    assert (
+        sum(channel.counts["out of range"] for channel in pipeline.status().channels)
+        == clipped.sum()
+    )
 
 
 def test_a_unit_dead_at_start_up_does_not_keep_the_others_from_learning_their_bias():
     pipeline = Pipeline(parallel(3, bias__startup_bias_duration=2.0))
-    _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=0 stop=5", size=0.0)
+    _, output = run(
+        pipeline, 1000, "channel=imu_3 kind=triad_loss start=0 stop=5", size=0.0
+    )
     assert output.valid[200:].all()
     assert "imu_3.x" in pipeline.status().bias_state
     # Back at 5 s, but its bias is unknown: not used, and said so, until the bias is learned anew.
-    assert {(c.state, c.reason) for c in pipeline.status().channels[6:]} == {(ChannelState.UNCHECKED, Reason.BIAS)}
+    assert {(c.state, c.reason) for c in pipeline.status().channels[6:]} == {
+        (ChannelState.UNCHECKED, Reason.BIAS)
+    }
     assert declarations(pipeline, output) == []
     pipeline.relearn_bias()
     pipeline.process(stream(pipeline.geometry, 400, size=0.0, seed=1, late=20.0))
@@ -241,9 +332,12 @@ TWO, THREE = parallel(2, **SEQUENTIAL), parallel(3, **SEQUENTIAL)
 
 @pytest.mark.parametrize("gone", [[1, 0], [1, 1, 0], [1, 0, 0]])
 @pytest.mark.parametrize(
-    ("settings", "channels"), [*itertools.product((TWO, THREE), (ALONE, UNIT)), (config(**SEQUENTIAL), ALONE)]
+    ("settings", "channels"),
+    [*itertools.product((TWO, THREE), (ALONE, UNIT)), (config(**SEQUENTIAL), ALONE)],
 )
-def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(settings, channels, gone):
+def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(
+    settings, channels, gone
+):
     """Not there in turn and wrong in between, from 6 s on."""
     pipeline = Pipeline(settings)
     block, missing = stream(pipeline.geometry, 1200), np.resize(gone, 600) == 1
@@ -251,7 +345,11 @@ def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(settin
         block.z[600:, c] = np.where(missing, np.nan, block.z[600:, c] + 1.0)
     output = pipeline.process(block)
     names = [pipeline.channel_names[c] for c in channels]
-    faulty = {pipeline.channel_names[e.channel]: e for e in output.events if e.after == ChannelState.FAULTY}
+    faulty = {
+        pipeline.channel_names[e.channel]: e
+        for e in output.events
+        if e.after == ChannelState.FAULTY
+    }
     assert [*faulty] == names
     assert all(event.row / RATE < 8.0 for event in faulty.values())
     assert output.valid.all()
@@ -273,7 +371,10 @@ def test_a_unit_that_is_not_received_in_turn_is_left_out_and_not_called_faulty(g
     check_rate(output)
     assert np.abs(output.rate - body_rate(1200))[700:].max() < 0.02
     channel = pipeline.status().channels[3]
-    assert (channel.state, channel.reason) == (ChannelState.SUSPECT, Reason.INTERMITTENT)
+    assert (channel.state, channel.reason) == (
+        ChannelState.SUSPECT,
+        Reason.INTERMITTENT,
+    )
     check_share(told(pipeline)["imu_2.x"], gone)
 
 
@@ -296,11 +397,15 @@ def slower(received, share):
 @pytest.mark.parametrize(
     ("settings", "lose"),
     [
-        *itertools.product((THREE, parallel(2), config()), (at_random, in_bursts, reboots)),
+        *itertools.product(
+            (THREE, parallel(2), config()), (at_random, in_bursts, reboots)
+        ),
         *((THREE, functools.partial(slower, share=share)) for share in (2, 3, 5)),
     ],
 )
-def test_values_that_a_driver_drops_or_a_slower_unit_does_not_have_are_no_fault(settings, lose):
+def test_values_that_a_driver_drops_or_a_slower_unit_does_not_have_are_no_fault(
+    settings, lose
+):
     pipeline = Pipeline(settings)
     block = stream(pipeline.geometry, 6000)
     received = block.delivered
@@ -308,15 +413,22 @@ def test_values_that_a_driver_drops_or_a_slower_unit_does_not_have_are_no_fault(
     block.z[~received] = np.nan
     # What is lost now and then comes as NaN, what is lost for long does not come.
     came = received if lose not in (at_random, in_bursts) else None
-    assert declarations(pipeline, pipeline.process(Block(block.stamp, block.z, came))) == []
+    assert (
+        declarations(pipeline, pipeline.process(Block(block.stamp, block.z, came)))
+        == []
+    )
 
 
 @pytest.mark.parametrize("step", [0.001, 0.0005])
-def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_in_a_steady_turn(step):
+def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_in_a_steady_turn(
+    step,
+):
     times = {"health__stuck_time": 0.5, "health__stuck_time_at_rest": 0.0}
     pipeline = Pipeline(parallel(3, **SEQUENTIAL, noise__noise_std=0.006, **times))
     seconds_of = np.arange(4000) / RATE
-    turn = np.interp(seconds_of, [10, 10.5, 14, 14.5], [0.0, 0.7, 0.7, 0.0]) + 0.0008 * np.sin(9 * seconds_of)
+    turn = np.interp(
+        seconds_of, [10, 10.5, 14, 14.5], [0.0, 0.7, 0.7, 0.0]
+    ) + 0.0008 * np.sin(9 * seconds_of)
     rate = np.column_stack([0.1 * turn, np.zeros_like(turn), turn])
     z = np.round(rate @ pipeline.geometry.axes.T / step) * step
     output = pipeline.process(Block(stream(pipeline.geometry, 4000).stamp, z))
@@ -327,7 +439,9 @@ def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_i
 
 @pytest.mark.parametrize("stuck", [False, True])
 def test_a_value_that_stands_within_one_step_of_its_sensor_is_not_stuck(stuck):
-    pipeline = Pipeline(parallel(3, health__stuck_time=0.2, health__stuck_time_at_rest=0.0))
+    pipeline = Pipeline(
+        parallel(3, health__stuck_time=0.2, health__stuck_time_at_rest=0.0)
+    )
     step, t = 0.024, np.arange(1500) / RATE
     # Quick motion shows the step; then the body turns to and fro by less than the sensor can resolve.
     size = np.where(t < 5.0, 0.3, 0.1 if stuck else 0.0115)
@@ -341,4 +455,6 @@ def test_a_value_that_stands_within_one_step_of_its_sensor_is_not_stuck(stuck):
     found = pipeline.status().channels[3]
     assert (found.state == ChannelState.FAULTY) == stuck
     assert stuck or found.counts["stuck"] == 0
-    assert {e.channel for e in output.events if e.after == ChannelState.FAULTY} == ({3} if stuck else set())
+    assert {e.channel for e in output.events if e.after == ChannelState.FAULTY} == (
+        {3} if stuck else set()
+    )

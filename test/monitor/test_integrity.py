@@ -25,8 +25,17 @@ ALL = np.ones(6, dtype=bool)
 
 
 def integrity(geometry=None, noise=1.0, *, prior=1e-3, risk=1e-5):
-    settings = {"integrity.risk": risk, "integrity.fault_rate": -math.log1p(-prior), "integrity.exposure": 1.0}
-    return Integrity(config(**settings).integrity, ALARM, geometry or Geometry.two_triad_cone(), NoiseModel(noise))
+    settings = {
+        "integrity.risk": risk,
+        "integrity.fault_rate": -math.log1p(-prior),
+        "integrity.exposure": 1.0,
+    }
+    return Integrity(
+        config(**settings).integrity,
+        ALARM,
+        geometry or Geometry.two_triad_cone(),
+        NoiseModel(noise),
+    )
 
 
 def block(z, first=0):
@@ -53,7 +62,9 @@ class Exceedance:
         for size in (0, 1, 2):
             weight = p**size * (1 - p) ** (n - size)
             for chosen in combinations(range(n), size):
-                worst = max(self.under(fault, level, draws) for fault in self.faults(chosen))
+                worst = max(
+                    self.under(fault, level, draws) for fault in self.faults(chosen)
+                )
                 parts.append((weight * worst[0], weight * worst[1]))
         values, errors = np.array(parts).T
         return values.sum(), np.sqrt((errors**2).sum())
@@ -95,14 +106,24 @@ def level_and_limits(settings, rate, remaining):
     pipeline.core["remaining"] = 1e-3 * remaining
     geometry = pipeline.geometry
     output = pipeline.process(block(np.tile(geometry.axes @ rate, (3, 1))))
-    growth, limit = pipeline.core["now"]["growth"][0, : geometry.n], pipeline.subsets["limit"][-1, : geometry.n]
+    growth, limit = (
+        pipeline.core["now"]["growth"][0, : geometry.n],
+        pipeline.subsets["limit"][-1, : geometry.n],
+    )
     parts = geometry.S**2
-    return 1e3 * output.level[-1], 1e3 * limit * np.sqrt(parts @ growth / parts.sum(axis=1))
+    return 1e3 * output.level[-1], 1e3 * limit * np.sqrt(
+        parts @ growth / parts.sum(axis=1)
+    )
 
 
 @pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, 0.3, 0.0)])
-@pytest.mark.parametrize(("remaining", "prior", "risk"), [(0.0, 1e-2, 1e-3), (0.0, 1e-4, 1e-5), (0.5, 1e-3, 1e-4)])
-def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate, remaining, prior, risk):
+@pytest.mark.parametrize(
+    ("remaining", "prior", "risk"),
+    [(0.0, 1e-2, 1e-3), (0.0, 1e-4, 1e-5), (0.5, 1e-3, 1e-4)],
+)
+def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(
+    rate, remaining, prior, risk
+):
     """Errors of noise, of scale factors as the body turns, and of biases that hang together as is worst for an axis."""
     scale = 0.003
     settings = config(
@@ -117,7 +138,9 @@ def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate
     level, limit = level_and_limits(settings, np.array(rate), remaining)
     std = np.sqrt(1 + (1e3 * scale * geometry.axes @ np.array(rate)) ** 2)
     for axis in (0, 2):
-        root = np.column_stack([np.diag(std), remaining * np.sign(geometry.least_squares[axis])])
+        root = np.column_stack(
+            [np.diag(std), remaining * np.sign(geometry.least_squares[axis])]
+        )
         simulated = Exceedance(geometry, prior, axis, root, limit)
         value, error = simulated.of(level[axis], 1000)
         assert value + 1.645 * error <= risk
@@ -127,7 +150,9 @@ def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate
 
 @settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["cone", "parallel", "any"]))
-def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_grow_alike(seed, mounting):
+def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_grow_alike(
+    seed, mounting
+):
     rng = np.random.default_rng(seed)
     axes = rng.standard_normal((6, 3))
     geometry = {
@@ -136,7 +161,10 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
         "any": Geometry(axes / np.linalg.norm(axes, axis=1)[:, None]),
     }[mounting]
     noise = NoiseModel(rng.uniform(1.0, 3.0, 6))
-    own, subsets = integrity(geometry, noise.noise_std, prior=1e-4, risk=1e-7), prepare_subsets(geometry, noise)
+    own, subsets = (
+        integrity(geometry, noise.noise_std, prior=1e-4, risk=1e-7),
+        prepare_subsets(geometry, noise),
+    )
     own.fill(subsets, 63)
     level, growth = np.zeros(3), np.zeros(12)
     for ratio in (np.full(6, rng.uniform(1.0, 9.0)), rng.uniform(1.0, 9.0, 6)):
@@ -145,10 +173,22 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
         fill_level(subsets[63], 6, 63, growth, level)
         assert (level >= exact.level * (1 - 1e-9)).all()
         alike = ratio.min() == ratio.max()
-        assert (level <= exact.level * (1 + 1e-9 if alike else math.sqrt(ratio.max() / ratio.min()))).all()
+        assert (
+            level
+            <= exact.level
+            * (1 + 1e-9 if alike else math.sqrt(ratio.max() / ratio.min()))
+        ).all()
         # And the test that it rests on is the exact one.
-        given = (np.pad(geometry.axes, ((0, 6), (0, 0))), np.pad(noise.noise_std, (0, 6)), 6, 63, growth)
-        residual = np.pad(np.where(np.isfinite(exact.limit), exact.limit, 0.0), (0, 6)) * (1 - 1e-9)
+        given = (
+            np.pad(geometry.axes, ((0, 6), (0, 0))),
+            np.pad(noise.noise_std, (0, 6)),
+            6,
+            63,
+            growth,
+        )
+        residual = np.pad(
+            np.where(np.isfinite(exact.limit), exact.limit, 0.0), (0, 6)
+        ) * (1 - 1e-9)
         assert passes_test(subsets[63], *given, residual)
         residual[rng.integers(6)] *= 1 + 1e-6
         assert not passes_test(subsets[63], *given, residual)
@@ -157,15 +197,23 @@ def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_g
 def test_without_faults_the_level_is_the_quantile_of_the_noise():
     level = integrity(noise=0.01, prior=0.0, risk=1e-4).of(ALL).level
     # H'H = 2 I: every component has half the variance of a channel.
-    assert level == pytest.approx(0.01 * np.sqrt(0.5) * NormalDist().inv_cdf(1 - 0.5e-4) * np.ones(3), rel=1e-9)
+    assert level == pytest.approx(
+        0.01 * np.sqrt(0.5) * NormalDist().inv_cdf(1 - 0.5e-4) * np.ones(3), rel=1e-9
+    )
 
 
 @given(st.floats(1e-6, 1e-2), st.floats(1e-9, 1e-3), st.floats(1e-4, 10.0))
 def test_the_level_grows_with_noise_and_priors_and_falls_with_risk(prior, risk, noise):
     level = integrity(prior=prior, risk=risk).of(ALL).level
-    assert integrity(noise=noise, prior=prior, risk=risk).of(ALL).level == pytest.approx(noise * level, rel=1e-9)
-    assert (integrity(prior=2 * prior, risk=risk).of(ALL).level >= level * (1 - 1e-9)).all()
-    assert (integrity(prior=prior, risk=2 * risk).of(ALL).level <= level * (1 + 1e-9)).all()
+    assert integrity(noise=noise, prior=prior, risk=risk).of(
+        ALL
+    ).level == pytest.approx(noise * level, rel=1e-9)
+    assert (
+        integrity(prior=2 * prior, risk=risk).of(ALL).level >= level * (1 - 1e-9)
+    ).all()
+    assert (
+        integrity(prior=prior, risk=2 * risk).of(ALL).level <= level * (1 + 1e-9)
+    ).all()
 
 
 @pytest.mark.parametrize(
@@ -180,9 +228,15 @@ def test_the_level_grows_with_noise_and_priors_and_falls_with_risk(prior, risk, 
         (0, 1e-4, 2e-8, False),
     ],
 )
-def test_a_level_is_given_where_redundancy_or_priors_bear_the_risk(channels, prior, risk, given):
+def test_a_level_is_given_where_redundancy_or_priors_bear_the_risk(
+    channels, prior, risk, given
+):
     geometry = None if channels else Geometry.from_triads([np.eye(3), np.eye(3)])
-    level = integrity(geometry, prior=prior, risk=risk).of(np.arange(6) < (channels or 6)).level
+    level = (
+        integrity(geometry, prior=prior, risk=risk)
+        .of(np.arange(6) < (channels or 6))
+        .level
+    )
     assert (np.isfinite(level) == given).all()
 
 
@@ -198,7 +252,9 @@ def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     assert (level[:200] == level[0]).all()
     assert (level[300:] == level[300]).all()
     # A later level was foreseen for the worst loss.
-    assert np.isinf(healthy.status().protection_level_after_loss).all(), "no sample yet: no rate, no level"
+    assert np.isinf(healthy.status().protection_level_after_loss).all(), (
+        "no sample yet: no rate, no level"
+    )
     healthy.process(block(z[:200]))
     status = healthy.status()
     assert status.protection_level == tuple(level[0])
@@ -224,10 +280,17 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
 def test_a_rate_of_channels_under_doubt_says_so_in_covariance_and_level_or_is_withheld_if_asked_for():
     """Two units mounted alike in a turn, of which the second comes loose: it feels other axes."""
     t = np.arange(400) / 100
-    rate = np.column_stack([1.5 * np.sin(2 * t), 0.8 * np.cos(1.3 * t), 0.5 * np.sin(t)])
+    rate = np.column_stack(
+        [1.5 * np.sin(2 * t), 0.8 * np.cos(1.3 * t), 0.5 * np.sin(t)]
+    )
     other = np.vstack([rate[:200], rate[200:, [1, 2, 0]]])
-    z = np.hstack([rate, other]) + 0.0025 * np.random.default_rng(8).standard_normal((400, 6))
-    pipeline, open_ = Pipeline(parallel(2, publish_under_doubt=False)), Pipeline(parallel(2))
+    z = np.hstack([rate, other]) + 0.0025 * np.random.default_rng(8).standard_normal(
+        (400, 6)
+    )
+    pipeline, open_ = (
+        Pipeline(parallel(2, publish_under_doubt=False)),
+        Pipeline(parallel(2)),
+    )
     output, published = pipeline.process(block(z)), open_.process(block(z))
     np.testing.assert_array_equal(output.state, published.state)
     doubt = np.isin(output.state, (ChannelState.SUSPECT, ChannelState.AMBIGUOUS))
@@ -235,22 +298,32 @@ def test_a_rate_of_channels_under_doubt_says_so_in_covariance_and_level_or_is_wi
     assert all_doubted[210:].all()
     assert published.valid.all()
     assert np.isinf(published.level[all_doubted]).all()
-    error, std = np.abs(published.rate - rate), np.sqrt(np.diagonal(published.covariance, axis1=1, axis2=2))
+    error, std = (
+        np.abs(published.rate - rate),
+        np.sqrt(np.diagonal(published.covariance, axis1=1, axis2=2)),
+    )
     assert error[all_doubted].max() > 0.5
     assert (error < 3 * std)[all_doubted].all()
     np.testing.assert_array_equal(output.valid, ~doubt.any(axis=1))
     assert np.isnan(output.rate[~output.valid]).all()
     assert np.isnan(output.covariance[~output.valid]).all()
     assert pipeline.status().withheld
-    assert told(pipeline)["monitor"].message.startswith("no fused rate: withheld, as channels under doubt")
+    assert told(pipeline)["monitor"].message.startswith(
+        "no fused rate: withheld, as channels under doubt"
+    )
     pipeline.reconfigure(open_.config)
     assert pipeline.process(block(z[-1:], len(z))).valid.all()
     assert not pipeline.status().withheld
 
 
 def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
-    assert np.isinf(Pipeline(config(integrity__risk=0.0)).process(block(np.zeros((3, 6)))).level).all()
-    with pytest.raises(ConfigError, match=r"fault_rate has 2 values, expected 1 or 6 \(one per channel\)"):
+    assert np.isinf(
+        Pipeline(config(integrity__risk=0.0)).process(block(np.zeros((3, 6)))).level
+    ).all()
+    with pytest.raises(
+        ConfigError,
+        match=r"fault_rate has 2 values, expected 1 or 6 \(one per channel\)",
+    ):
         Pipeline(config(integrity__fault_rate=[1e-4, 1e-4]))
 
 
@@ -260,9 +333,21 @@ def test_what_no_hypothesis_explains_is_in_the_covariance(seed: int) -> None:
     settings = mounted(np.tile(np.eye(3), (3, 1)), noise__noise_std=0.003)
     rng, seconds = np.random.default_rng(seed), np.arange(6000) / 100.0
     z = 0.003 * rng.standard_normal((6000, 9))
-    z[:, :3] += (0.02 * np.clip(seconds - 20.0, 0.0, None))[:, None] * rng.permutation([0.2, 0.5, 0.84])
-    output = Pipeline(settings).process(Block((1e9 * seconds).astype(np.int64) + 10**18, z))
+    z[:, :3] += (0.02 * np.clip(seconds - 20.0, 0.0, None))[:, None] * rng.permutation(
+        [0.2, 0.5, 0.84]
+    )
+    output = Pipeline(settings).process(
+        Block((1e9 * seconds).astype(np.int64) + 10**18, z)
+    )
     rate, covariance = output.rate[2500:], output.covariance[2500:]
     stated = np.isfinite(rate).all(axis=1)
-    nees = np.einsum("ki,kij,kj->k", rate[stated], np.linalg.inv(covariance[stated]), rate[stated]) / 3
+    nees = (
+        np.einsum(
+            "ki,kij,kj->k",
+            rate[stated],
+            np.linalg.inv(covariance[stated]),
+            rate[stated],
+        )
+        / 3
+    )
     assert nees.mean() < 3.0

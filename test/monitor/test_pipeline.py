@@ -12,7 +12,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, run, seconds, stream
+from monitor.streams import (
+    SIGMA,
+    START,
+    body_rate,
+    config,
+    declarations,
+    parallel,
+    run,
+    seconds,
+    stream,
+)
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config
@@ -25,7 +35,18 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output, Reason
 from fdi_ros.monitor.pipeline import EVENTS, Pipeline
 
-FIELDS = ("stamp", "rate", "covariance", "valid", "statistic", "threshold", "alarm", "state", "residual", "level")
+FIELDS = (
+    "stamp",
+    "rate",
+    "covariance",
+    "valid",
+    "statistic",
+    "threshold",
+    "alarm",
+    "state",
+    "residual",
+    "level",
+)
 
 
 def joined(parts: list[Output]) -> Output:
@@ -35,7 +56,9 @@ def joined(parts: list[Output]) -> Output:
 
 def same(left: Output, right: Output) -> None:
     for name in FIELDS:
-        np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(left, name), getattr(right, name), err_msg=name
+        )
     assert list(left.events) == list(right.events)
 
 
@@ -59,7 +82,9 @@ def troubled(pipeline: Pipeline, seed: int, samples: int = 400) -> Block:
         elif kind == 1:
             z[start:stop, channel] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
         elif kind == 2:
-            received[start:stop, channel - channel % 3 : channel - channel % 3 + 3] = False
+            received[start:stop, channel - channel % 3 : channel - channel % 3 + 3] = (
+                False
+            )
         elif kind == 3:
             z[start:stop, channel] = z[start, channel]
         elif kind == 4:
@@ -72,17 +97,34 @@ def troubled(pipeline: Pipeline, seed: int, samples: int = 400) -> Block:
 
 SETTINGS: list[Config] = [
     config(),
-    config(decision__latch=False, decision__clean_time=0.2, noise__scale_std=0.01, noise__timing_std=5e-4),
+    config(
+        decision__latch=False,
+        decision__clean_time=0.2,
+        noise__scale_std=0.01,
+        noise__timing_std=5e-4,
+    ),
     parallel(3, detector__name="max_residual", health__stuck_time_at_rest=0.3),
-    parallel(2, bias__startup_bias_duration=0.5, bias__max_rest_rate=10.0, noise__timing_std=1e-4),
+    parallel(
+        2,
+        bias__startup_bias_duration=0.5,
+        bias__max_rest_rate=10.0,
+        noise__timing_std=1e-4,
+    ),
     config(detector__name="guaranteed", geometry__preset="dodecahedron"),
 ]
-OF_FIVE = config(detector__name="determinant", geometry__preset="cone", geometry__cone_channels=5)
+OF_FIVE = config(
+    detector__name="determinant", geometry__preset="cone", geometry__cone_channels=5
+)
 EVERY: list[Config] = [
     *SETTINGS,
-    *(config(detector__name=name, detector__run_length=1e4) for name in sorted({*DETECTORS} - {"determinant"})),
+    *(
+        config(detector__name=name, detector__run_length=1e4)
+        for name in sorted({*DETECTORS} - {"determinant"})
+    ),
     OF_FIVE,
-    parallel(3, noise__timing_std=2e-4, decision__latch=False, decision__clean_time=0.5),
+    parallel(
+        3, noise__timing_std=2e-4, decision__latch=False, decision__clean_time=0.5
+    ),
 ]
 CUTS = st.lists(st.integers(0, 400)) | st.just(list(range(400)))
 """Anywhere, or at every sample."""
@@ -94,20 +136,32 @@ def test_cutting_the_stream_anywhere_changes_nothing(seed, which, at):
     """With every detector, and after losses too: nothing may differ, to the last bit and counter."""
     whole, pieces = Pipeline(which), Pipeline(which)
     block = troubled(whole, seed)
-    same(whole.process(block), joined([pieces.process(part) for part in cut(block, at)]))
+    same(
+        whole.process(block), joined([pieces.process(part) for part in cut(block, at)])
+    )
     assert repr(whole.status()) == repr(pieces.status())
 
 
-ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, np.nan, np.inf, 34.9])
+ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
+    [0.0, np.nan, np.inf, 34.9]
+)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from(SETTINGS), st.lists(ANY_FLOAT, min_size=1))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(SETTINGS),
+    st.lists(ANY_FLOAT, min_size=1),
+)
 @settings(max_examples=40)
 def test_never_a_nan_in_a_published_rate(seed, which, junk):
     pipeline = Pipeline(which)
     rng = np.random.default_rng(seed)
     block = stream(pipeline.geometry, 60, seed=seed % 1000)
-    z = np.where(rng.random(block.z.shape) < rng.random(), rng.choice(junk, block.z.shape), block.z)
+    z = np.where(
+        rng.random(block.z.shape) < rng.random(),
+        rng.choice(junk, block.z.shape),
+        block.z,
+    )
     received = rng.random(block.z.shape) < rng.choice([0.5, 0.99, 1.0])
     output = pipeline.process(Block(block.stamp, z, received))
     assert np.isfinite(output.rate[output.valid]).all()
@@ -120,24 +174,37 @@ def test_the_fused_rate_is_as_good_as_its_covariance_says():
     pipeline = Pipeline(config())
     block = stream(pipeline.geometry, 20_000)
     output = pipeline.process(block)
-    np.testing.assert_allclose(output.residual, block.z - output.rate @ pipeline.geometry.axes.T, atol=1e-12)
+    np.testing.assert_allclose(
+        output.residual, block.z - output.rate @ pipeline.geometry.axes.T, atol=1e-12
+    )
     error = output.rate - body_rate(20_000)
-    normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(output.covariance), error)
+    normalised = np.einsum(
+        "ni,nij,nj->n", error, np.linalg.inv(output.covariance), error
+    )
     # Mean of a chi-square with 3 degrees of freedom over 20 000 samples: standard error 0.017.
     assert normalised.mean() == pytest.approx(3.0, abs=0.06)
-    assert np.sqrt(np.trace(output.covariance[-1])) == pytest.approx(SIGMA * pipeline.geometry.gdop)
+    assert np.sqrt(np.trace(output.covariance[-1])) == pytest.approx(
+        SIGMA * pipeline.geometry.gdop
+    )
 
 
 def test_second_and_third_fault_down_to_detection_only():
     pipeline = Pipeline(config(geometry__preset="dodecahedron"))
-    faults = ["channel=g1 kind=bias size=0.5 start=2", "channel=g4 kind=bias size=-0.5 start=5"]
+    faults = [
+        "channel=g1 kind=bias size=0.5 start=2",
+        "channel=g4 kind=bias size=-0.5 start=5",
+    ]
     _, output = run(pipeline, 1000, *faults)
     assert declarations(pipeline, output) == [("g1", "FAULTY"), ("g4", "FAULTY")]
     status = pipeline.status()
     assert status.can_isolate == ()
     assert set(status.can_detect) == {"g2", "g3", "g5", "g6"}
-    _, output = run(pipeline, 1000, *faults, "channel=g2 kind=bias size=0.5 start=0.01", late=20.0)
-    assert set(declarations(pipeline, output)) == {(name, "AMBIGUOUS") for name in ("g2", "g3", "g5", "g6")}
+    _, output = run(
+        pipeline, 1000, *faults, "channel=g2 kind=bias size=0.5 start=0.01", late=20.0
+    )
+    assert set(declarations(pipeline, output)) == {
+        (name, "AMBIGUOUS") for name in ("g2", "g3", "g5", "g6")
+    }
 
 
 @pytest.mark.parametrize(
@@ -145,16 +212,25 @@ def test_second_and_third_fault_down_to_detection_only():
     [
         # Two parallel triads, one channel taken out: a fault of its twin would go unseen.
         (["imu_1.x"], {"imu_2.x"}, "imu_2.x"),
-        (["imu_1.x", "imu_1.y", "imu_1.z"], {"imu_2.x", "imu_2.y", "imu_2.z"}, "3 channels"),
+        (
+            ["imu_1.x", "imu_1.y", "imu_1.z"],
+            {"imu_2.x", "imu_2.y", "imu_2.z"},
+            "3 channels",
+        ),
     ],
 )
-def test_what_nothing_checks_gives_a_rate_and_is_not_called_healthy(out, unchecked, words):
+def test_what_nothing_checks_gives_a_rate_and_is_not_called_healthy(
+    out, unchecked, words
+):
     pipeline = Pipeline(parallel(2, excluded_channels=out))
     output = pipeline.process(stream(pipeline.geometry, 100))
     status = pipeline.status()
     assert output.valid.all()
     states = {c.name: c.state for c in status.channels if c.name not in out}
-    assert states == {name: ChannelState.UNCHECKED if name in unchecked else ChannelState.OK for name in states}
+    assert states == {
+        name: ChannelState.UNCHECKED if name in unchecked else ChannelState.OK
+        for name in states
+    }
     assert not unchecked & set(status.can_detect)
     assert words in status.note
 
@@ -177,7 +253,10 @@ def test_a_reset_clears_what_is_over_and_what_lasts_is_declared_again(lasts):
     rows = np.s_[600:900] if lasts else np.s_[:100]
     output = pipeline.process(Block(block.stamp[rows] + 20_000_000_000, block.z[rows]))
     assert declarations(pipeline, output) == ([("g4", "FAULTY")] if lasts else [])
-    assert lasts or [(e.channel, e.after.name) for e in output.events] == [(3, "UNCHECKED"), (3, "OK")]
+    assert lasts or [(e.channel, e.after.name) for e in output.events] == [
+        (3, "UNCHECKED"),
+        (3, "OK"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -187,8 +266,14 @@ def test_a_reset_clears_what_is_over_and_what_lasts_is_declared_again(lasts):
         ({"excluded_channels": ["g1", "g2", "g3", "g5"]}, "do not span"),
         ({"decision.latch": False}, "latch cannot change"),
         # Too high for this sample rate: seen only after the detector was built.
-        ({"detector.false_alarms_per_hour": 3.6e6}, "false-alarm probability per sample is 10"),
-        ({"noise.acceleration_window": 0.8, "sample_rate": 2000.0}, "1600 samples at 2000 Hz, expected at most 1000"),
+        (
+            {"detector.false_alarms_per_hour": 3.6e6},
+            "false-alarm probability per sample is 10",
+        ),
+        (
+            {"noise.acceleration_window": 0.8, "sample_rate": 2000.0},
+            "1600 samples at 2000 Hz, expected at most 1000",
+        ),
     ],
 )
 def test_a_change_that_is_refused_changes_nothing(change, words):
@@ -203,12 +288,26 @@ def test_a_change_that_is_refused_changes_nothing(change, words):
 def test_channels_are_excluded_without_preparing_all_anew(detector):
     """A live node is deaf meanwhile; and what it says is what one that was built so says."""
     options = {"detector__name": detector, "bias__fixed": [0.0] * 6}
-    pipeline, built = Pipeline(config(**options)), Pipeline(config(**options, excluded_channels=["g4"]))
+    pipeline, built = (
+        Pipeline(config(**options)),
+        Pipeline(config(**options, excluded_channels=["g4"])),
+    )
     pipeline.prepare()
-    prepared = pipeline.detector, pipeline.integrity, pipeline.subsets["has_level"].sum()
+    prepared = (
+        pipeline.detector,
+        pipeline.integrity,
+        pipeline.subsets["has_level"].sum(),
+    )
     pipeline.reconfigure(built.config)
-    assert (pipeline.detector, pipeline.integrity, pipeline.subsets["has_level"].sum()) == prepared
-    said, expected = (run(one, 1000, "channel=g2 kind=bias size=0.5 start=5")[1] for one in (pipeline, built))
+    assert (
+        pipeline.detector,
+        pipeline.integrity,
+        pipeline.subsets["has_level"].sum(),
+    ) == prepared
+    said, expected = (
+        run(one, 1000, "channel=g2 kind=bias size=0.5 start=5")[1]
+        for one in (pipeline, built)
+    )
     assert declarations(pipeline, said) == declarations(built, expected) != []
     np.testing.assert_array_equal(said.rate, expected.rate)
     np.testing.assert_array_equal(said.level, expected.level)
@@ -221,17 +320,31 @@ def test_channels_are_excluded_without_preparing_all_anew(detector):
 def test_steps_end_where_something_happens_and_events_say_the_row_of_their_sample():
     pipeline, whole = Pipeline(config()), Pipeline(config())
     block, output = run(whole, 1000, "channel=g4 kind=bias size=0.5 start=5")
-    assert [output.stamp[event.row] for event in output.events] == [event.stamp for event in output.events]
+    assert [output.stamp[event.row] for event in output.events] == [
+        event.stamp for event in output.events
+    ]
     assert output.alarm[500]
-    assert np.abs(output.rate - body_rate(1000)).max() < 6 * SIGMA, "never fused, from its first alarm on"
+    assert np.abs(output.rate - body_rate(1000)).max() < 6 * SIGMA, (
+        "never fused, from its first alarm on"
+    )
     seen = []
     for step in pipeline.steps(block):
-        assert all(event.stamp == step.stamp[-1] and event.row == len(step) - 1 for event in step.events)
+        assert all(
+            event.stamp == step.stamp[-1] and event.row == len(step) - 1
+            for event in step.events
+        )
         if any(event.declares for event in step.events):
             assert pipeline.status().channels[3].state == ChannelState.FAULTY
-        seen += [(event.channel, event.after.name, seconds(event)) for event in step.events]
-    assert seen[-2:] == [(3, "SUSPECT", pytest.approx(5.0)), (3, "FAULTY", pytest.approx(5.03))]
-    assert seen == [(event.channel, event.after.name, seconds(event)) for event in output.events]
+        seen += [
+            (event.channel, event.after.name, seconds(event)) for event in step.events
+        ]
+    assert seen[-2:] == [
+        (3, "SUSPECT", pytest.approx(5.0)),
+        (3, "FAULTY", pytest.approx(5.03)),
+    ]
+    assert seen == [
+        (event.channel, event.after.name, seconds(event)) for event in output.events
+    ]
 
 
 @pytest.mark.parametrize(
@@ -239,7 +352,10 @@ def test_steps_end_where_something_happens_and_events_say_the_row_of_their_sampl
     [
         (Block(np.array([START]), np.zeros((1, 5))), "expected .N, 6."),
         (Block(np.array([START, START]), np.zeros((2, 6))), "do not increase"),
-        (Block(np.array([0, 2**63], dtype=np.uint64), np.zeros((2, 6))), "expected within"),
+        (
+            Block(np.array([0, 2**63], dtype=np.uint64), np.zeros((2, 6))),
+            "expected within",
+        ),
         (Block(np.array([-(2**62)]), np.zeros((1, 6))), "expected within"),
         (Block(np.array([START]), np.zeros((1, 6))), "does not come after"),
     ],
@@ -259,11 +375,20 @@ def test_what_is_no_stream_is_refused(block, words):
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ((np.arange(10), np.zeros((9, 6))), "stamps have shape .10,. of int64, expected .9,. whole numbers, ns"),
+        (
+            (np.arange(10), np.zeros((9, 6))),
+            "stamps have shape .10,. of int64, expected .9,. whole numbers, ns",
+        ),
         ((np.array([0.1, 0.2]), np.zeros((2, 6))), "of float64"),
-        ((np.arange(2), np.zeros(2)), "samples have shape .2,. of float64, expected .N, n. real numbers"),
+        (
+            (np.arange(2), np.zeros(2)),
+            "samples have shape .2,. of float64, expected .N, n. real numbers",
+        ),
         ((np.arange(2), np.zeros((2, 6), dtype=complex)), "complex128, expected"),
-        ((np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)), "received has shape .2, 6. of bool"),
+        (
+            (np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)),
+            "received has shape .2, 6. of bool",
+        ),
         ((np.arange(2), np.zeros((2, 6)), "all"), "received has shape .. of"),
     ],
 )
@@ -281,9 +406,16 @@ def test_any_memory_layout_gives_the_same():
 
 def test_more_events_than_are_written_down_at_once():
     """Noise far beyond the settings brings events in every other sample."""
-    pipeline = Pipeline(config(decision__latch=False, decision__clean_time=0.02, decision__confirm_alarms=1))
+    pipeline = Pipeline(
+        config(
+            decision__latch=False, decision__clean_time=0.02, decision__confirm_alarms=1
+        )
+    )
     block = stream(pipeline.geometry, 9000)
-    loud = Block(block.stamp, block.z + np.random.default_rng(3).normal(0, 20 * SIGMA, block.z.shape))
+    loud = Block(
+        block.stamp,
+        block.z + np.random.default_rng(3).normal(0, 20 * SIGMA, block.z.shape),
+    )
     output = pipeline.process(loud)
     assert len(output.events) > 2 * EVENTS
     pieces = Pipeline(pipeline.config)
@@ -312,10 +444,19 @@ DOUBTS = ((ChannelState.FAULTY,), (ChannelState.SUSPECT, ChannelState.AMBIGUOUS)
 def test_no_level_vouches_for_a_channel_in_doubt(name, seed):
     """Sample by sample: what is FAULTY is not fused, and with what is SUSPECT or AMBIGUOUS there is no level."""
     under_doubt = seed % 2 == 0
-    pipeline = Pipeline(config(detector__name=name, decision__latch=seed % 3 > 0, publish_under_doubt=under_doubt))
+    pipeline = Pipeline(
+        config(
+            detector__name=name,
+            decision__latch=seed % 3 > 0,
+            publish_under_doubt=under_doubt,
+        )
+    )
     for block in cut(troubled(pipeline, seed), list(range(1, 400))):
         output, fused = pipeline.process(block), int(pipeline.core["now"]["fused"][0])
-        in_state = [sum(1 << int(i) for i in np.flatnonzero(np.isin(output.state[0], states))) for states in DOUBTS]
+        in_state = [
+            sum(1 << int(i) for i in np.flatnonzero(np.isin(output.state[0], states)))
+            for states in DOUBTS
+        ]
         assert not output.valid[0] or not fused & in_state[0]
         assert not (fused & in_state[1]) or not np.isfinite(output.level[0]).any()
         assert under_doubt or not output.valid[0] or not fused & in_state[1]
@@ -330,15 +471,29 @@ class Decider:
     """The decision, told of one sample after the other."""
 
     def __init__(self, alarms, window):
-        self.limits, self.own, self.seen = allocate(PathSettings), allocate(Decision), allocate(Evidence)
-        for name, value in {"n": N, "alarms": alarms, "window": window, "latch": True}.items():
+        self.limits, self.own, self.seen = (
+            allocate(PathSettings),
+            allocate(Decision),
+            allocate(Evidence),
+        )
+        for name, value in {
+            "n": N,
+            "alarms": alarms,
+            "window": window,
+            "latch": True,
+        }.items():
             self.limits[name] = value
         self.stamp = 0
 
     def take(self, members, isolated=False, **more):
         """Whether a sample whose alarm names these channels changes what is declared."""
         self.stamp += 1
-        told = {"suspected": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
+        told = {
+            "suspected": mask_of(members),
+            "isolated": isolated and bool(members),
+            "judged": True,
+            "checked": ALL,
+        }
         for name in self.seen.dtype.names:
             self.seen[name] = {**told, "stamp": self.stamp, **more}.get(name, 0)
         return decide(self.limits[0], self.own[0], self.seen[0])
@@ -368,7 +523,9 @@ def by_hand(sets, isolated, alarms, window):
 
 
 @given(
-    data=st.lists(st.tuples(st.sampled_from(SETS), st.booleans()), min_size=1, max_size=40),
+    data=st.lists(
+        st.tuples(st.sampled_from(SETS), st.booleans()), min_size=1, max_size=40
+    ),
     alarms=st.integers(1, 5),
     extra=st.integers(0, 5),
 )
@@ -376,7 +533,9 @@ def by_hand(sets, isolated, alarms, window):
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     decider, window = Decider(alarms, alarms + extra), alarms + extra
     expected = by_hand(*zip(*data, strict=True), alarms, window)
-    declares = next((row for row, sample in enumerate(data) if decider.take(*sample)), None)
+    declares = next(
+        (row for row, sample in enumerate(data) if decider.take(*sample)), None
+    )
     if expected is None:
         assert declares is None
     else:

@@ -47,25 +47,41 @@ class Ear:
 def messages(block, units):
     """The Imu messages of a stream: unit and bytes, the units of one sample half a millisecond apart."""
     template = ImuTemplate("imu")
-    for stamp, row in zip(block.stamp.tolist(), block.z.reshape(len(block), units, 3).tolist(), strict=True):
+    for stamp, row in zip(
+        block.stamp.tolist(),
+        block.z.reshape(len(block), units, 3).tolist(),
+        strict=True,
+    ):
         for unit in range(units):
             yield unit, template.fill(stamp + unit * 500_000, row[unit], (0.0,) * 9)
 
 
 @pytest.mark.parametrize("units", [2, 3, 4])
 def test_message_by_message_equals_the_whole_stream(units):
-    settings = parallel(units, bias__startup_bias_duration=0.5, bias__max_rest_rate=10.0, noise__timing_std=1e-4)
+    settings = parallel(
+        units,
+        bias__startup_bias_duration=0.5,
+        bias__max_rest_rate=10.0,
+        noise__timing_std=1e-4,
+    )
     ear, offline = Ear(Pipeline(settings)), Pipeline(settings)
-    faults = "channel=imu_2.y kind=bias size=0.5 start=2", "channel=imu_1.x kind=dropout start=3 stop=3.2"
+    faults = (
+        "channel=imu_2.y kind=bias size=0.5 start=2",
+        "channel=imu_1.x kind=dropout start=3 stop=3.2",
+    )
     block, _ = run(Pipeline(settings), 400, *faults, size=0.02)
     sent = list(messages(block, units))
     for unit, data in sent:
         ear.take(unit, data)
     stamps, values = zip(*(ImuSource.parse(data, 3) for _, data in sent), strict=True)
     given = np.array([unit for unit, _ in sent]), np.array(stamps), np.array(values)
-    output = offline.process(Alignment(units, 2_000_000, 100_000_000).push_block(*given))
+    output = offline.process(
+        Alignment(units, 2_000_000, 100_000_000).push_block(*given)
+    )
     assert list(ear.events) == list(output.events)
-    figures = np.array([ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity])
+    figures = np.array(
+        [ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity]
+    )
     np.testing.assert_array_equal(figures[:, 0], output.statistic)
     np.testing.assert_array_equal(figures[:, 2 : 2 + 3 * units], output.state)
     np.testing.assert_array_equal(figures[:, -3:], output.level)
@@ -76,8 +92,16 @@ def test_message_by_message_equals_the_whole_stream(units):
 
 def test_arrays_are_stamped_when_they_arrive_even_by_a_clock_set_back():
     pipeline = Pipeline(config())
-    ear, template, z = Ear(pipeline), ChannelsTemplate(6), stream(pipeline.geometry, 60).z.tolist()
-    clock = [START + k * STEP for k in range(20)] + [START + 19 * STEP] + [START - 10**9 + k * STEP for k in range(39)]
+    ear, template, z = (
+        Ear(pipeline),
+        ChannelsTemplate(6),
+        stream(pipeline.geometry, 60).z.tolist(),
+    )
+    clock = (
+        [START + k * STEP for k in range(20)]
+        + [START + 19 * STEP]
+        + [START - 10**9 + k * STEP for k in range(39)]
+    )
     for stamp, values in zip(clock, z, strict=True):
         ear.take(0, template.fill(values), stamp)
     stamps = list(ear.rates())
@@ -90,20 +114,32 @@ def test_arrays_are_stamped_when_they_arrive_even_by_a_clock_set_back():
 
 @pytest.mark.parametrize("leap", [-0.06, -0.03, 0.004, 0.03, 0.06])
 @pytest.mark.parametrize("motion", [0.0, 1.0])
-def test_a_clock_that_leaps_once_by_less_than_the_timeout_blames_no_other_unit(leap, motion):
+def test_a_clock_that_leaps_once_by_less_than_the_timeout_blames_no_other_unit(
+    leap, motion
+):
     """From the leap on the unit tells of another instant: in motion it disagrees by as much; a few ms are a delay."""
-    pipeline, template = Pipeline(parallel(3, detector__name="sequential")), ImuTemplate("imu")
+    pipeline, template = (
+        Pipeline(parallel(3, detector__name="sequential")),
+        ImuTemplate("imu"),
+    )
     ear, block = Ear(pipeline), stream(pipeline.geometry, 2000, size=motion)
-    for k, (stamp, row) in enumerate(zip(block.stamp.tolist(), block.z.reshape(2000, 3, 3).tolist(), strict=True)):
+    for k, (stamp, row) in enumerate(
+        zip(block.stamp.tolist(), block.z.reshape(2000, 3, 3).tolist(), strict=True)
+    ):
         for unit in range(3):
             leapt = unit == 1 and k >= 1000
-            ear.take(unit, template.fill(stamp + round(1e9 * leap) * leapt, row[unit], (0.0,) * 9))
+            ear.take(
+                unit,
+                template.fill(stamp + round(1e9 * leap) * leapt, row[unit], (0.0,) * 9),
+            )
     assert len(ear.fused) == len(ear.integrity) >= 1990, "a rate in every sample"
     declared = [event for event in ear.events if event.declares]
     assert bool(declared) == (motion > 0.0 and abs(leap) > 0.01)
     assert {event.channel for event in declared[:3]} <= {3, 4, 5}
     assert all((event.stamp - block.stamp[1000]) / 1e9 < 0.3 for event in declared[:3])
-    assert {event.channel for event in declared if event.after == ChannelState.FAULTY} <= {3, 4, 5}
+    assert {
+        event.channel for event in declared if event.after == ChannelState.FAULTY
+    } <= {3, 4, 5}
     counts = ear.receiver.counts(1)
     lost = counts["missing"] if leap > 0 else counts["duplicate"] + counts["backward"]
     assert lost == (0 if leap == 0.004 else round(abs(leap) / 0.01))
@@ -117,7 +153,9 @@ def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     for k, (unit, data) in enumerate(messages(block, 3)):
         if k % 60 == 59:
             thresholds.append(ChannelsSource.parse(ear.integrity[-1], 14)[1][1])
-            pipeline.reconfigure(pipeline.config.replaced({"detector.name": names[k // 60 % 4]}))
+            pipeline.reconfigure(
+                pipeline.config.replaced({"detector.name": names[k // 60 % 4]})
+            )
             gc.collect()
         ear.take(unit, data)
     assert len(ear.integrity) >= 99

@@ -23,22 +23,32 @@ from fdi_ros.monitor.state_file import StateFile
 
 LEARNING = {"bias__startup_bias_duration": 1.0, "detector__name": "sequential"}
 OFFSET = 0.01
-COUNT = sum(len(places) for kind in ERROR_KINDS for places in places_of(kind.name, 6, 2))
+COUNT = sum(
+    len(places) for kind in ERROR_KINDS for places in places_of(kind.name, 6, 2)
+)
 """Error states of six channels in two units."""
-NOTHING = {"value": [0.0] * COUNT, "covariance": [0.0] * (COUNT * (COUNT + 1) // 2), "late": [0.0, 0.0]}
+NOTHING = {
+    "value": [0.0] * COUNT,
+    "covariance": [0.0] * (COUNT * (COUNT + 1) // 2),
+    "late": [0.0, 0.0],
+}
 NAMES = [f"g{k}" for k in range(1, 7)]
 TURN = (Geometry.two_triad_cone().axes @ [0.15, 0.0, 0.0]).tolist()
 
 
 def rest(pipeline, samples=300, seed=0):
-    z = np.random.default_rng(seed).normal(OFFSET, SIGMA, (samples, pipeline.geometry.n))
+    z = np.random.default_rng(seed).normal(
+        OFFSET, SIGMA, (samples, pipeline.geometry.n)
+    )
     return Block(START + np.arange(samples, dtype=np.int64) * 10_000_000, z)
 
 
 def flown(**changes):
     """A monitor that has learned its bias and declared g4."""
     pipeline = Pipeline(config(**{**LEARNING, **changes}))
-    pipeline.process(struck(rest(pipeline), ["channel=g4 kind=bias size=0.5 start=2"], NAMES))
+    pipeline.process(
+        struck(rest(pipeline), ["channel=g4 kind=bias size=0.5 start=2"], NAMES)
+    )
     assert pipeline.status().channels[3].state == ChannelState.FAULTY
     return pipeline
 
@@ -73,14 +83,22 @@ def test_a_restarted_monitor_goes_on_where_it_was(path):
     assert after.status().bias == pytest.approx(before.status().bias, abs=1e-10)
     assert after.status().bias_state == "restored from the state file"
     output = after.process(stream(after.geometry, 100))
-    assert output.valid.all(), "it need not learn the bias again, and so gives a rate at once, in motion too"
+    assert output.valid.all(), (
+        "it need not learn the bias again, and so gives a rate at once, in motion too"
+    )
     assert (output.state[:, 3] == ChannelState.FAULTY).all()
-    assert after.status().channels[3].reason == before.status().channels[3].reason == Reason.DISAGREES
+    assert (
+        after.status().channels[3].reason
+        == before.status().channels[3].reason
+        == Reason.DISAGREES
+    )
 
 
 def test_written_once_for_each_change(path):
     file, pipeline = StateFile(path, 60.0), Pipeline(config())
-    block = struck(rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], NAMES)
+    block = struck(
+        rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], NAMES
+    )
     tried = []
     for k in range(0, 400, 20):
         pipeline.process(block[k : k + 20])
@@ -100,9 +118,18 @@ def test_written_once_for_each_change(path):
         ({"bias": {"g1": 0.0}}, "damaged"),
         ({"errors": {"value": [0.0], "covariance": [1.0], "late": []}}, "damaged"),
         ({"errors": {**NOTHING, "value": [math.nan] * COUNT}}, "damaged"),
-        ({"errors": {**NOTHING, "covariance": [-1.0] * (COUNT * (COUNT + 1) // 2)}}, "damaged"),
-        ({"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}}, "error state 11 is 0.5"),
-        ({"bias": {f"g{k}": 0.5 for k in range(1, 7)}}, "at most 0.1 (bias.max_rest_rate)"),
+        (
+            {"errors": {**NOTHING, "covariance": [-1.0] * (COUNT * (COUNT + 1) // 2)}},
+            "damaged",
+        ),
+        (
+            {"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}},
+            "error state 11 is 0.5",
+        ),
+        (
+            {"bias": {f"g{k}": 0.5 for k in range(1, 7)}},
+            "at most 0.1 (bias.max_rest_rate)",
+        ),
         ({"bias": dict(zip(NAMES, TURN, strict=True))}, "pass for a turn of 0.15"),
         ({"bias": {f"g{k}": float("nan") for k in range(1, 7)}}, "damaged"),
         ({"known": ["g9"]}, "damaged"),
@@ -125,14 +152,26 @@ def test_what_does_not_fit_is_left_and_said(path, written, change, words):
     assert not file.is_rejected
 
 
-@pytest.mark.parametrize("content", [b"", b'{"format": 2', b'{\n "format": "\xff', b'{"format":' + b"[" * 100_000])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b'{"format": 2', b'{\n "format": "\xff', b'{"format":' + b"[" * 100_000],
+)
 def test_damaged_files_are_said_to_be(path, content):
     path.write_bytes(content)
     assert "damaged" in left(path, Pipeline(config())).words
 
 
 @pytest.mark.parametrize(
-    "content", [b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}']
+    "content",
+    [
+        b"[]",
+        b"null",
+        b"{",
+        b"\xff\xfe",
+        b"1" * 5000,
+        b"/**:\n  ros__parameters: {}",
+        b'{"name": "x"}',
+    ],
 )
 def test_what_is_no_state_is_never_replaced(path, content):
     pipeline, old = Pipeline(config()), path.with_suffix(".json.old")
@@ -140,20 +179,31 @@ def test_what_is_no_state_is_never_replaced(path, content):
     with pytest.raises(ConfigError, match="holds no state of a monitor"):
         StateFile(path, 60.0).restore(pipeline)
     path.rename(old)
-    with pytest.raises(ConfigError, match=r"state.json.old' holds no state of a monitor"):
+    with pytest.raises(
+        ConfigError, match=r"state.json.old' holds no state of a monitor"
+    ):
         StateFile(path, 60.0).restore(pipeline)
     assert old.read_bytes() == content
 
 
-def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(path, written):
-    pipeline, elsewhere, old = Pipeline(config(**LEARNING)), path.with_name("elsewhere"), path.with_suffix(".json.old")
+def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(
+    path, written
+):
+    pipeline, elsewhere, old = (
+        Pipeline(config(**LEARNING)),
+        path.with_name("elsewhere"),
+        path.with_suffix(".json.old"),
+    )
     elsewhere.write_text(written)
 
     def link() -> None:
         path.unlink()
         path.symlink_to(elsewhere)
 
-    changes = {"others can write it (mode 666)": lambda: path.chmod(0o666), "it is a link": link}
+    changes = {
+        "others can write it (mode 666)": lambda: path.chmod(0o666),
+        "it is a link": link,
+    }
     if os.geteuid() == 0:
         changes["it belongs to another user (54321)"] = lambda: os.chown(path, 54321, 0)
     for words, change in changes.items():
@@ -161,18 +211,30 @@ def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(path
         path.write_text(written)
         change()
         file = left(path, pipeline)
-        assert f"no state taken from {path}: {words}; it is kept as state.json.old" == file.words
+        assert (
+            f"no state taken from {path}: {words}; it is kept as state.json.old"
+            == file.words
+        )
         assert file.save(pipeline)
         assert old.read_text() == elsewhere.read_text() == written
         assert StateFile(path, 60.0).restore(pipeline)
         assert not path.is_symlink()
     # Nor is what lies at any name that a state might be written under.
-    assert sorted(one.name for one in path.parent.iterdir()) == ["elsewhere", "state.json", "state.json.old"]
+    assert sorted(one.name for one in path.parent.iterdir()) == [
+        "elsewhere",
+        "state.json",
+        "state.json.old",
+    ]
 
 
 def test_another_geometry_is_another_configuration(path, written):
     path.write_text(written)
-    assert "another configuration" in left(path, Pipeline(config(geometry__preset="dodecahedron", **LEARNING))).words
+    assert (
+        "another configuration"
+        in left(
+            path, Pipeline(config(geometry__preset="dodecahedron", **LEARNING))
+        ).words
+    )
 
 
 def test_no_file_yet_and_no_folder(tmp_path, path):
@@ -209,7 +271,9 @@ def test_what_cannot_be_written_is_said_and_leaves_the_former_state(path):
 
 @pytest.mark.parametrize("name", ["px4", "ardupilot", "three_imus"])
 def test_a_state_of_before_the_first_sample_is_taken_over(path, root, name):
-    settings = Config.from_file(root / "config" / f"{name}.yaml", {"bias.startup_bias_duration": 0.0})
+    settings = Config.from_file(
+        root / "config" / f"{name}.yaml", {"bias.startup_bias_duration": 0.0}
+    )
     assert StateFile(path, 3600.0).save(Pipeline.from_config(settings))
     file = StateFile(path, 3600.0)
     assert file.restore(Pipeline.from_config(settings))
@@ -218,7 +282,11 @@ def test_a_state_of_before_the_first_sample_is_taken_over(path, root, name):
 
 def test_a_set_and_a_drift_outlive_a_restart(path):
     settings = parallel(2, detector__name="sequential")
-    pipeline, again, file = Pipeline(settings), Pipeline(settings), StateFile(path, 3600.0)
+    pipeline, again, file = (
+        Pipeline(settings),
+        Pipeline(settings),
+        StateFile(path, 3600.0),
+    )
     block, _ = run(pipeline, 400, "channel=imu_2.y kind=bias size=0.3 start=2")
     pipeline.core[0]["decision"]["faulty"] |= 1
     pipeline.core[0]["decision"]["why"][0] = WHY.index("drifted")

@@ -11,7 +11,14 @@ import numpy as np
 from fdi_ros.faults.fault import load_scenario
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
+from fdi_ros.replay.summary import (
+    BiasResult,
+    MonitorResult,
+    ProtectionLevel,
+    SampleRate,
+    StreamResult,
+    Summary,
+)
 
 SCENARIO = Path(__file__).parents[2] / "config" / "scenarios" / "every_kind.yaml"
 """Every kind of fault once."""
@@ -20,7 +27,12 @@ SCENARIO = Path(__file__).parents[2] / "config" / "scenarios" / "every_kind.yaml
 def examples(channel, unit, start, stop):
     """A fault of each kind by its name; kinds that strike a whole unit strike that one."""
     return {
-        fault.kind.name: replace(fault, channel=unit if fault.kind.whole_unit else channel, start=start, stop=stop)
+        fault.kind.name: replace(
+            fault,
+            channel=unit if fault.kind.whole_unit else channel,
+            start=start,
+            stop=stop,
+        )
         for fault in load_scenario(SCENARIO)
     }
 
@@ -44,7 +56,11 @@ class Keep(Sink):
     def output(self):
         """All that it said."""
         rows = np.concatenate([output.rows for output in self.outputs])
-        return Output(rows, self.outputs[0].n, [event for output in self.outputs for event in output.events])
+        return Output(
+            rows,
+            self.outputs[0].n,
+            [event for output in self.outputs for event in output.events],
+        )
 
 
 def summary_of(scores, bag="bag"):

@@ -20,7 +20,11 @@ from fdi_ros.monitor.output import ChannelState
 from fdi_ros.replay.outputs import OutputBag
 from fdi_ros.replay.run import replay
 
-NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
+NAMES = {
+    "/fused": IMU,
+    "/fdi_node/integrity": ARRAY,
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +32,18 @@ def written(tmp_path_factory, root, flight):
     """The bundled flight with a fault, and what the pipeline said of it."""
     path = tmp_path_factory.mktemp("written") / "out"
     config = Config.from_file(root / "config" / "two_imus.yaml")
-    request = (flight, config, (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),))
+    request = (
+        flight,
+        config,
+        (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),),
+    )
     keep = Keep()
     with OutputBag(path, config, 6) as bag:
         summary = replay(*request, sinks=[bag, keep])
     output = keep.output
-    integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])
+    integrity = np.column_stack(
+        [output.statistic, output.threshold, output.state, output.level]
+    )
     return path, output, integrity, summary, request
 
 
@@ -47,9 +57,16 @@ def read_by(path, rosbags):
                 schemas[connection.topic] = connection.digest
         return messages, schemas
     with next(path.glob("*.mcap")).open("rb") as file:
-        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+        for schema, channel, message in make_reader(
+            file, validate_crcs=True
+        ).iter_messages():
             messages[channel.topic].append((message.log_time, message.data))
-            schemas[channel.topic] = (schema.name, schema.encoding, schema.data.decode(), channel.message_encoding)
+            schemas[channel.topic] = (
+                schema.name,
+                schema.encoding,
+                schema.data.decode(),
+                channel.message_encoding,
+            )
     return messages, schemas
 
 
@@ -64,10 +81,19 @@ def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
         stamp, rate = message.header.stamp, message.angular_velocity
         assert stamp.sec * 10**9 + stamp.nanosec == output.stamp[k]
         assert (rate.x, rate.y, rate.z) == tuple(output.rate[k])
-        np.testing.assert_array_equal(message.angular_velocity_covariance, output.covariance[k].ravel())
-        assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1
+        np.testing.assert_array_equal(
+            message.angular_velocity_covariance, output.covariance[k].ravel()
+        )
+        assert (
+            message.orientation_covariance[0]
+            == message.linear_acceleration_covariance[0]
+            == -1
+        )
         assert message.header.frame_id == "base_link"
-    values = [STORE.deserialize_cdr(data, ARRAY).data for _, data in messages["/fdi_node/integrity"]]
+    values = [
+        STORE.deserialize_cdr(data, ARRAY).data
+        for _, data in messages["/fdi_node/integrity"]
+    ]
     np.testing.assert_array_equal(values, integrity)
     with Recording(bag) as recording:
         originals = defaultdict(list)
@@ -87,15 +113,27 @@ def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
     for change in changes:
         assert np.abs(times - change).min() < 5_000_000
     detected = summary.scores.faults[0].detected_at_s
-    (at,) = [event.stamp for event in output.events if event.after == ChannelState.FAULTY]
-    first = next(data for time, data in messages if time >= at and time - at < 5_000_000)
-    status = {s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status}
+    (at,) = [
+        event.stamp for event in output.events if event.after == ChannelState.FAULTY
+    ]
+    first = next(
+        data for time, data in messages if time >= at and time - at < 5_000_000
+    )
+    status = {
+        s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status
+    }
     assert status["fdi_node: imu_1.y"].level == 2
     assert "isolated and left out" in status["fdi_node: imu_1.y"].message
     assert detected == pytest.approx(20.03, abs=0.02)
-    last = {s.name: s for s in STORE.deserialize_cdr(messages[-1][1], NAMES["/diagnostics"]).status}
+    last = {
+        s.name: s
+        for s in STORE.deserialize_cdr(messages[-1][1], NAMES["/diagnostics"]).status
+    }
     inputs = [s for name, s in last.items() if name.startswith("fdi_node: input")]
-    assert [{kv.key: kv.value for kv in s.values}["received"] for s in inputs] == ["6001", "6001"]
+    assert [{kv.key: kv.value for kv in s.values}["received"] for s in inputs] == [
+        "6001",
+        "6001",
+    ]
 
 
 def test_schemas_and_type_hashes_are_those_of_jazzy(written):
@@ -105,7 +143,10 @@ def test_schemas_and_type_hashes_are_those_of_jazzy(written):
         assert schemas[topic] == (name, "ros2msg", definition, "cdr")
         assert digests[topic] == STORE.hash_rihs01(name)
     # As `ros2 topic info --verbose` shows them on Jazzy.
-    assert digests["/fused"] == "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"
+    assert (
+        digests["/fused"]
+        == "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"
+    )
 
 
 def test_the_output_is_a_recording_that_replays_to_the_same(written):

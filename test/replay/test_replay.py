@@ -55,8 +55,14 @@ def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound
     config, faulty = cone(root, **UNCALIBRATED), Keep()
     summary = replay(flight, config, (fault,), start=FIRST, end=END, sinks=[faulty])
     stamp = faulty.output.stamp
-    truth = Injector([fault], build_geometry(config).channel_names, int(stamp[0]) - round(FIRST * 1e9))
-    np.testing.assert_array_equal(faulty.z[~truth.struck(stamp)], sound.z[~truth.struck(stamp)])
+    truth = Injector(
+        [fault],
+        build_geometry(config).channel_names,
+        int(stamp[0]) - round(FIRST * 1e9),
+    )
+    np.testing.assert_array_equal(
+        faulty.z[~truth.struck(stamp)], sound.z[~truth.struck(stamp)]
+    )
     np.testing.assert_array_equal(faulty.z, truth.apply(Block(stamp, sound.z)).z)
     (found,) = summary.scores.faults
     assert summary.scores.start_s == pytest.approx(FIRST, abs=0.01)
@@ -64,7 +70,9 @@ def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound
     assert fault.start <= found.detected_at_s < fault.stop + GRACE
     assert found.delay_s == pytest.approx(found.detected_at_s - fault.start, abs=1e-9)
     assert set(found.declared_channels) & set(fault.channel.split(","))
-    assert not found.isolated or set(fault.channel.split(",")) <= set(found.declared_channels)
+    assert not found.isolated or set(fault.channel.split(",")) <= set(
+        found.declared_channels
+    )
     assert not found.isolated or found.isolated_at_s >= found.detected_at_s
     assert not summary.scores.declared
 
@@ -93,17 +101,26 @@ def test_the_error_without_a_monitor_is_that_of_least_squares(told, root):
     assert rms.before_detection < rms.without_monitor
 
 
-@pytest.mark.parametrize(("file", "channel"), [("two_triads.yaml", "g2"), ("two_imus.yaml", "imu_1.y")])
-def test_the_six_gyros_as_one_array_and_as_two_imus_say_the_same(file, channel, told, root, flight):
+@pytest.mark.parametrize(
+    ("file", "channel"), [("two_triads.yaml", "g2"), ("two_imus.yaml", "imu_1.y")]
+)
+def test_the_six_gyros_as_one_array_and_as_two_imus_say_the_same(
+    file, channel, told, root, flight
+):
     """Sound, no declaration; of a fault the same one at the same sample."""
     config = Config.from_file(root / "config" / file)
     summary = replay(flight, config)
     assert summary.scores.declared == ()
     severity, words = verdict(summary)
     assert severity is Severity.GOOD
-    assert re.fullmatch(r"HEALTHY: no fault declared in 60.0 s; 6 channels, each checked in 9\d% .* or more\.", words)
+    assert re.fullmatch(
+        r"HEALTHY: no fault declared in 60.0 s; 6 channels, each checked in 9\d% .* or more\.",
+        words,
+    )
     assert sentences(summary) == []
-    (fault,) = replay(flight, config, (parse_fault(f"channel={channel} {BIAS}"),)).scores.faults
+    (fault,) = replay(
+        flight, config, (parse_fault(f"channel={channel} {BIAS}"),)
+    ).scores.faults
     assert fault.declared_channels == (channel,)
     assert fault.delay_s == pytest.approx(told.scores.faults[0].delay_s, abs=0.0101)
 
@@ -116,21 +133,33 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     assert summary.scores.samples_judged > 0.5 * summary.scores.samples
     severity, words = verdict(summary)
     assert severity is Severity.BAD
-    assert re.fullmatch(r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", words)
+    assert re.fullmatch(
+        r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", words
+    )
     (second,) = sentences(summary)
     assert re.fullmatch(
         r"At the end not checked: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
         r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
         second,
     )
-    assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary.monitor.note
-    for check, met in (("false=0", False), ("false=0 unchecked<=6", True), ("unchecked<6", False)):
+    assert (
+        "only 3 channels are left: a fault of one would not be seen, 4 are needed"
+        in summary.monitor.note
+    )
+    for check, met in (
+        ("false=0", False),
+        ("false=0 unchecked<=6", True),
+        ("unchecked<6", False),
+    ):
         assert (failures(parse_check(check, 0), summary) == []) == met
     # A fault injected up to the end is no surprise; one that ends before is no reason.
     whole = written(tmp_path, z)
     for stop, expected in ((" stop=5.5", 0), ("", 0)):
         fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
-        assert len(failures(parse_check("false=0", 1), replay(whole, CALM, (fault,)))) == expected
+        assert (
+            len(failures(parse_check("false=0", 1), replay(whole, CALM, (fault,))))
+            == expected
+        )
 
 
 def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
@@ -149,7 +178,9 @@ def test_channels_much_noisier_than_the_others_are_told_of(tmp_path, noise, chan
     z = recordings.flight(2000)[1]
     z[:, 4] += np.random.default_rng(3).normal(0, noise, len(z))
     lines = noisy_lines(replay(written(tmp_path, z), CALM))
-    assert [line.partition(" is much noisier than the others")[0] for line in lines] == channels
+    assert [
+        line.partition(" is much noisier than the others")[0] for line in lines
+    ] == channels
 
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
@@ -159,8 +190,13 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     assert summary.scores.samples_judged == 0
     severity, words = verdict(summary)
     assert severity is Severity.UNKNOWN
-    assert words.startswith("CANNOT TELL: not one of 200 samples was judged; bias refused")
-    assert failures(parse_check("false=0", 0), summary)[0] == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
+    assert words.startswith(
+        "CANNOT TELL: not one of 200 samples was judged; bias refused"
+    )
+    assert (
+        failures(parse_check("false=0", 0), summary)[0]
+        == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
+    )
     assert failures(parse_check("false=0 judged>=0 unchecked<=6", 0), summary) == []
 
 
@@ -185,7 +221,11 @@ def calm(block, units):
 
 
 def declared(pipeline, output):
-    return [(pipeline.channel_names[e.channel], e.after.name, e.stamp) for e in output.events if e.declares]
+    return [
+        (pipeline.channel_names[e.channel], e.after.name, e.stamp)
+        for e in output.events
+        if e.declares
+    ]
 
 
 def test_shaken_to_saturation_it_declares_no_sound_channel(recording, units):
@@ -198,12 +238,16 @@ def test_shaken_to_saturation_it_declares_no_sound_channel(recording, units):
     # 3 s at rest for the bias, then a rate for every sample up to there.
     assert output.valid[188:11_251].all()
     assert pipeline.status().bias_state == "learned"
-    counted = sum(channel.counts["out of range"] for channel in pipeline.status().channels)
+    counted = sum(
+        channel.counts["out of range"] for channel in pipeline.status().channels
+    )
     assert counted == (np.abs(whole.z) >= 34.8).sum() > 100
 
 
 @pytest.mark.parametrize("when", ["rest", "motion"])
-@pytest.mark.parametrize("channel", [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"])
+@pytest.mark.parametrize(
+    "channel", [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
+)
 def test_a_bias_on_any_one_channel_is_isolated(block, units, calm, channel, when):
     seconds = (block.stamp - block.stamp[0]) / 1e9
     speed = np.linalg.norm(calm.rate, axis=1)

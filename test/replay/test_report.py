@@ -28,10 +28,22 @@ from fdi_ros.report.layout import Section, html_table, page
 from fdi_ros.system.text import shown
 
 ROOT = Path(__file__).parents[2]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
 DRIVER = shutil.which("chromedriver")
-FAULTS = ("channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50")
-REPLAY = ["replay", str(ROOT / "bags" / "cone_flight"), "--config", str(ROOT / "config" / "two_triads.yaml")]
+FAULTS = (
+    "channel=g2 kind=bias size=0.2 start=20",
+    "channel=g6 kind=drift size=0.05 start=30 stop=50",
+)
+REPLAY = [
+    "replay",
+    str(ROOT / "bags" / "cone_flight"),
+    "--config",
+    str(ROOT / "config" / "two_triads.yaml"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +55,12 @@ def folder(tmp_path_factory):
 def report(folder):
     path = folder / "report.html"
     words = [*REPLAY, "--detector", "likelihood_ratio"]
-    assert command_line.main([*words, "--report", str(path), "--fault", FAULTS[0], "--fault", FAULTS[1]]) == 0
+    assert (
+        command_line.main(
+            [*words, "--report", str(path), "--fault", FAULTS[0], "--fault", FAULTS[1]]
+        )
+        == 0
+    )
     return path
 
 
@@ -58,10 +75,14 @@ def driver():
     options.binary_location = CHROMIUM
     switches = "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking"
     switches += " disable-component-update disable-sync disable-dev-shm-usage window-size=1300,2600"
-    with tempfile.TemporaryDirectory(prefix="fdi_browser_", ignore_cleanup_errors=True) as profile:
+    with tempfile.TemporaryDirectory(
+        prefix="fdi_browser_", ignore_cleanup_errors=True
+    ) as profile:
         for switch in [*switches.split(), f"user-data-dir={profile}"]:
             options.add_argument(f"--{switch}")
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+        options.set_capability(
+            "goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"}
+        )
         driver = webdriver.Chrome(options=options, service=Service(DRIVER))
         try:
             yield driver
@@ -94,12 +115,18 @@ def wait(driver, condition, seconds=60):
 
 
 def complaints(driver):
-    return [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    return [
+        entry
+        for entry in driver.get_log("browser")
+        if entry["level"] in ("SEVERE", "WARNING")
+    ]
 
 
 def data_of(text):
     """What the scripts of a page draw."""
-    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+    return json.loads(
+        re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1]
+    )
 
 
 @contextmanager
@@ -117,29 +144,46 @@ def plot(number, rest=""):
     return f"figure[data-figure='{number}'] {rest}"
 
 
-def test_the_plots_are_drawn_with_the_faults_and_without_a_word_on_the_console_or_a_request(browser, report):
-    lines = "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
+def test_the_plots_are_drawn_with_the_faults_and_without_a_word_on_the_console_or_a_request(
+    browser, report
+):
+    lines = (
+        "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
+    )
     drawn = ask(browser, f"[...document.querySelectorAll('figure')].map({lines})")
     # Timeline, statistic, three axes of the rate, six residuals, spectrum, protection level.
     assert [len(figure) for figure in drawn[:2]] == [0, 2]
     assert sum(map(len, drawn[2:5])) >= 3 * (1 + 4)
     assert list(map(len, drawn[5:])) == [1] * 6 + [6, 3]
     assert min(length for figure in drawn for length in figure) > 20
-    bars = ask(browser, f'document.querySelectorAll("{plot(0, "g[clip-path] rect")}").length')
+    bars = ask(
+        browser, f'document.querySelectorAll("{plot(0, "g[clip-path] rect")}").length'
+    )
     assert bars >= 6 + 2
     assert complaints(browser) == []
-    sent = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
-    asked = [one["params"]["request"]["url"] for one in sent if one["method"] == "Network.requestWillBeSent"]
+    sent = [
+        json.loads(entry["message"])["message"]
+        for entry in browser.get_log("performance")
+    ]
+    asked = [
+        one["params"]["request"]["url"]
+        for one in sent
+        if one["method"] == "Network.requestWillBeSent"
+    ]
     # The browser asks itself for the parts of its own empty first page.
     own = ("chrome:", "chrome-untrusted:", "data:", "blob:")
     assert {url for url in asked if not url.startswith(own)} == {report.as_uri()}
     # Faults are shaded, and their detection is marked, in every plot over time.
     count = "n => [...document.querySelectorAll('figure')].map(f => f.querySelectorAll(n).length)"
     shaded, detected, isolated = (
-        ask(browser, f"({count})('{name}')") for name in ("rect.fault", ".detected", ".isolated")
+        ask(browser, f"({count})('{name}')")
+        for name in ("rect.fault", ".detected", ".isolated")
     )
     assert shaded == detected == isolated == [2] * 11 + [0, 2]
-    told = ask(browser, "[...document.querySelectorAll('figure .mark title')].map(t => t.textContent)")
+    told = ask(
+        browser,
+        "[...document.querySelectorAll('figure .mark title')].map(t => t.textContent)",
+    )
     assert "bias on g2: detected at 20.030 s" in told
 
 
@@ -151,7 +195,11 @@ def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     assert all(span == whole[0] for span in whole)
     area = browser.find_element("css selector", plot(1, ".stage"))
     width = area.size["width"]
-    drag = ActionChains(browser).move_to_element_with_offset(area, -width // 4, 0).click_and_hold()
+    drag = (
+        ActionChains(browser)
+        .move_to_element_with_offset(area, -width // 4, 0)
+        .click_and_hold()
+    )
     drag.move_by_offset(width // 8, 0).move_by_offset(width // 8, 0).release().perform()
     wait(browser, "links.time.range[0] > 10")
     # The link of the page shows the same to whoever it is passed on to.
@@ -161,7 +209,9 @@ def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     assert all(span == zoomed[0] for span in zoomed)
     assert zoomed[0] == pytest.approx([14, 29], abs=1.5)
     # In the narrower view every sample is drawn.
-    drawn = ask(browser, f'document.querySelector("{plot(5, "path.line")}").getAttribute("d")')
+    drawn = ask(
+        browser, f'document.querySelector("{plot(5, "path.line")}").getAttribute("d")'
+    )
     assert len(re.findall("[ML]", drawn)) <= 100 * (zoomed[0][1] - zoomed[0][0]) + 3
     ActionChains(browser).move_to_element(area).double_click().perform()
     wait(browser, "links.time.range[0] < 1")
@@ -173,7 +223,10 @@ def test_a_link_to_a_time_shows_it_and_contents_lead_to_all_sections(driver, rep
     assert ask(driver, "links.time.range") == [20, 25]
     lost = "[...document.querySelectorAll('nav a')].filter(a => !document.querySelector(a.getAttribute('href')))"
     assert ask(driver, f"{lost}.length") == 0
-    assert ask(driver, "document.querySelectorAll('nav a').length === document.querySelectorAll('section').length")
+    assert ask(
+        driver,
+        "document.querySelectorAll('nav a').length === document.querySelectorAll('section').length",
+    )
     driver.get("about:blank")
 
 
@@ -193,7 +246,9 @@ def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     wait(browser, "links.time.range === links.time.all")
     browser.execute_script("arguments[0].blur()", area)
     assert ask(browser, lines) == []
-    named = ask(browser, "[...document.querySelectorAll('.stage')].map(s => s.ariaLabel)")
+    named = ask(
+        browser, "[...document.querySelectorAll('.stage')].map(s => s.ariaLabel)"
+    )
     assert all(len(words) > 20 for words in named)
     assert "g2" in named[6]
 
@@ -204,7 +259,16 @@ def pages(folder, report):
     words = {
         "geometry": ["geometry", str(ROOT / "config" / "three_imus.yaml")],
         "setup": ["setup", REPLAY[1], "--output", str(folder / "setup.yaml")],
-        "sweep": ["sweep", *REPLAY[1:], "--times", "1", "--within", "1", "--fault", "kind=bias size=0.3"],
+        "sweep": [
+            "sweep",
+            *REPLAY[1:],
+            "--times",
+            "1",
+            "--within",
+            "1",
+            "--fault",
+            "kind=bias size=0.3",
+        ],
     }
     made = {"replay": report} | {name: folder / f"{name}.html" for name in words}
     for name, given in words.items():
@@ -212,7 +276,9 @@ def pages(folder, report):
     return made
 
 
-def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, pages):
+def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(
+    driver, pages
+):
     lines = "const r = document.createRange(); r.selectNodeContents(c); return r.getClientRects().length"
     short = f"[...document.querySelectorAll('.scroll:not(.fold) td:not(.long)')].filter(c => {{ {lines} > 1 }})"
     cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
@@ -244,20 +310,53 @@ def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
 def test_a_plot_without_values_is_not_drawn():
     empty = {"data": [{"type": "scatter", "x": [1], "y": [None]}], "layout": {}}
     drawn = {"data": [{"type": "scatter", "x": [1], "y": [2.0]}], "layout": {}}
-    text = page("title", [], [Section("one", "Of it.", figures=[empty]), Section("two", figures=[empty, drawn])])
+    text = page(
+        "title",
+        [],
+        [
+            Section("one", "Of it.", figures=[empty]),
+            Section("two", figures=[empty, drawn]),
+        ],
+    )
     assert text.count("<figure") == 1
-    assert text.count("Nothing to draw") == text.count("Of it. Nothing to draw: there are no values.") == 1
+    assert (
+        text.count("Nothing to draw")
+        == text.count("Of it. Nothing to draw: there are no values.")
+        == 1
+    )
 
 
 def made(geometry, time, residual, faults=(), episodes=(), bag="bag"):
     """The page of samples at these times, s, and with these residuals (N, n), and the faults and episodes of them."""
-    random, drawn, count = np.random.default_rng(0), Report(geometry, 1 / np.diff(time).min()), len(time)
+    random, drawn, count = (
+        np.random.default_rng(0),
+        Report(geometry, 1 / np.diff(time).min()),
+        len(time),
+    )
     for rows in np.array_split(np.arange(count), max(2, count // 50_000)):
-        figures = {"rate": random.normal(size=(len(rows), 3)), "statistic": np.abs(random.normal(size=len(rows)))}
-        figures |= {"covariance": 1e-4 * np.eye(3), "residual": residual[rows], "threshold": 6.0, "valid": True}
-        drawn.add(None, output_of(geometry.n, stamp=np.round(1e9 * time[rows]).astype(np.int64), **figures), None)
-    scores = Scores(count, time[-1], faults, (), FaultEffect(), 0.0, count, count, 0, ())
-    return drawn.html(replace(summary_of(scores, bag), story=Story((), episodes)), {"recording": bag})
+        figures = {
+            "rate": random.normal(size=(len(rows), 3)),
+            "statistic": np.abs(random.normal(size=len(rows))),
+        }
+        figures |= {
+            "covariance": 1e-4 * np.eye(3),
+            "residual": residual[rows],
+            "threshold": 6.0,
+            "valid": True,
+        }
+        drawn.add(
+            None,
+            output_of(
+                geometry.n, stamp=np.round(1e9 * time[rows]).astype(np.int64), **figures
+            ),
+            None,
+        )
+    scores = Scores(
+        count, time[-1], faults, (), FaultEffect(), 0.0, count, count, 0, ()
+    )
+    return drawn.html(
+        replace(summary_of(scores, bag), story=Story((), episodes)), {"recording": bag}
+    )
 
 
 def noise(rows, n):
@@ -266,7 +365,9 @@ def noise(rows, n):
 
 def test_no_curve_is_drawn_over_a_hole():
     # Holes of 2 s within what is handed on at once, and one between.
-    time = 0.01 * np.arange(200) + 2.0 * np.searchsorted([50, 100, 150], np.arange(200), side="right")
+    time = 0.01 * np.arange(200) + 2.0 * np.searchsorted(
+        [50, 100, 150], np.arange(200), side="right"
+    )
     store = data_of(made(Geometry.cone(6), time, noise(200, 6)))["store"]
     kind, series = store["series"]["residual.3"]
     values = np.frombuffer(base64.b64decode(series), dtype=f"<{kind}")
@@ -283,13 +384,34 @@ def test_names_stay_text_in_page_and_plots(driver, folder):
     fault = Outcome(nasty, (nasty,), nasty, None, 0.05, None, detected_at_s=0.06)
     step = Step(0.1, "FAULTY", (nasty,), nasty)
     evidence, rate = Evidence("", None, 0, None), RateMeanwhile(1.0, None, None, None)
-    false = Episode(1, "FAULTY", (nasty,), nasty, 0.1, 0.1, 0.2, True, (step,), (), None, evidence, rate)
-    path.write_text(made(geometry, 0.01 * np.arange(200), noise(200, 4), (fault,), (false,), nasty))
+    false = Episode(
+        1,
+        "FAULTY",
+        (nasty,),
+        nasty,
+        0.1,
+        0.1,
+        0.2,
+        True,
+        (step,),
+        (),
+        None,
+        evidence,
+        rate,
+    )
+    path.write_text(
+        made(geometry, 0.01 * np.arange(200), noise(200, 4), (fault,), (false,), nasty)
+    )
     opened(driver, path)
-    driver.execute_script("links.time.over = links.time.charts[2]; links.time.point(0.1)")
+    driver.execute_script(
+        "links.time.over = links.time.charts[2]; links.time.point(0.1)"
+    )
     assert ask(driver, "document.querySelectorAll('img').length") == 0
     for text in (".readout')", ".mark title')"):
-        said = ask(driver, f"[...document.querySelectorAll('{text}].map(e => e.textContent).join(' ')")
+        said = ask(
+            driver,
+            f"[...document.querySelectorAll('{text}].map(e => e.textContent).join(' ')",
+        )
         assert shown(nasty) in said
     assert "\u202e" not in path.read_text()
     assert complaints(driver) == []
@@ -301,7 +423,10 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
     shaken.write_text(made(Geometry.cone(6), 0.01 * np.arange(6000), residual))
     opened(driver, shaken)
     figure = "sections.find(s => s.plots.length === 6)"
-    high, noted = f"{figure}.plots[2].y.range[1]", f"{figure}.element.querySelectorAll('.cut').length"
+    high, noted = (
+        f"{figure}.plots[2].y.range[1]",
+        f"{figure}.element.querySelectorAll('.cut').length",
+    )
     assert ask(driver, high) < 0.1
     assert ask(driver, noted) == 6
     driver.execute_script(f"{figure}.scale.click()")
@@ -310,7 +435,12 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
 
 
 SORTED = {
-    "name": ["2024-05-03.mcap", "2024-05-10.mcap", "2024-11-02.mcap", "2025-01-01.mcap"],
+    "name": [
+        "2024-05-03.mcap",
+        "2024-05-10.mcap",
+        "2024-11-02.mcap",
+        "2025-01-01.mcap",
+    ],
     "log": ["9_59_01.ulg", "10_2_45.ulg", "10_23_45.ulg", "a"],
     "fault": ["bias 0.02 rad/s", "bias 0.1 rad/s", "bias 2 rad/s", "bias 10 rad/s"],
     "duration": ["0.7 min", "3.5 min", "12.0 min", "-"],
@@ -320,10 +450,17 @@ SORTED = {
 """Cells of each column in their order."""
 
 
-def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(driver, folder):
+def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(
+    driver, folder
+):
     path = folder / "sorted.html"
-    rows = [[cells[(k * 3 + shift) % 4] for shift, cells in enumerate(SORTED.values())] for k in range(4)]
-    path.write_text(page("sorted", [], [Section("", "", html_table(list(SORTED), rows, sort=True))]))
+    rows = [
+        [cells[(k * 3 + shift) % 4] for shift, cells in enumerate(SORTED.values())]
+        for k in range(4)
+    ]
+    path.write_text(
+        page("sorted", [], [Section("", "", html_table(list(SORTED), rows, sort=True))])
+    )
     opened(driver, path)
     for column, (name, cells) in enumerate(SORTED.items()):
         shown = f"""document.querySelectorAll("thead button")[{column}].click();

@@ -24,7 +24,10 @@ from fdi_ros.replay.summary import as_json
 from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep
 from fdi_ros.replay.words import failures, parse_check, summary_text, verdict
 
-JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
+JUDGEMENT = re.compile(
+    r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b",
+    re.I,
+)
 """Words that only an injected fault makes true."""
 ARMINGS = (30.0, 100.0)
 """Seconds of each arming, and when the second begins."""
@@ -37,11 +40,17 @@ def faulty(tmp_path_factory, root, recording):
     config = Config.from_file(root / "config" / "three_imus.yaml")
     block = read_block(recording, config)[:5000]
     fault = parse_fault("channel=imu_2.y kind=drift size=0.0035 start=55")
-    block = Injector([fault], Geometry.from_triads([np.eye(3)] * 3).channel_names).apply(block)
-    return write_bag(path, imu_messages(block.stamp, block.z, config.imus.topics, apart=1000))
+    block = Injector(
+        [fault], Geometry.from_triads([np.eye(3)] * 3).channel_names
+    ).apply(block)
+    return write_bag(
+        path, imu_messages(block.stamp, block.z, config.imus.topics, apart=1000)
+    )
 
 
-def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_path, faulty, root):
+def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(
+    fdi, tmp_path, faulty, root
+):
     page, told = (tmp_path / name for name in ("page.html", "told.json"))
     words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
     code, out, _ = fdi(*words, "--report", page, "--json", told)
@@ -61,10 +70,22 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     assert first[:-1] in html.unescape(visible(page))
     summary = json.loads(told.read_text())
     (episode,) = summary["episodes"]
-    assert (episode["state"], episode["channels"], episode["stretch"]) == ("FAULTY", ["imu_2.y"], 1)
+    assert (episode["state"], episode["channels"], episode["stretch"]) == (
+        "FAULTY",
+        ["imu_2.y"],
+        1,
+    )
     assert f"FAULTY: {episode['words'].replace(' FAULTY', '')}." == first
     assert summary["verdict"] == {"severity": "bad", "words": first}
-    assert {"samples", "duration_s", "seconds", "faults", "declared", "events", "fault_effect_rad_s"} <= set(summary)
+    assert {
+        "samples",
+        "duration_s",
+        "seconds",
+        "faults",
+        "declared",
+        "events",
+        "fault_effect_rad_s",
+    } <= set(summary)
     assert "imu_2.y" in {one["channel"] for one in summary["declared"]}
 
 
@@ -90,14 +111,18 @@ def visible(path):
     ],
 )
 def test_a_check_works_without_an_injected_fault(check, unmet, told):
-    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3).channel_names), told)
+    found = failures(
+        parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3).channel_names), told
+    )
     assert found[0].startswith(unmet) if unmet else found == [], found
 
 
 def two_armings(path, write, *, faulty=True):
     """Three units, disarmed for 70 s in between; 5 s into the second arming imu_2.y is off by 0.08 rad/s."""
     units = logs.units(3, seconds=ARMINGS[0], start=10.0)
-    for unit, later in zip(units, logs.units(3, seconds=ARMINGS[0], start=110.0, seed=1), strict=True):
+    for unit, later in zip(
+        units, logs.units(3, seconds=ARMINGS[0], start=110.0, seed=1), strict=True
+    ):
         for name, values in vars(later).items():
             setattr(unit, name, np.concatenate([getattr(unit, name), values]))
     units[2].rate[3500:, 1] += np.float32(0.08 * faulty)
@@ -120,31 +145,49 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     assert (one.stretch, one.state, one.channels) == (2, "FAULTY", ("imu_2.y",))
     assert one.start_s == pytest.approx(105.0, abs=0.5)
     assert verdict(summary).words == f"FAULTY: {one.words.replace(' FAULTY', '')}."
-    assert "\nnote: stretch 1: 0.000 s to 29.990 s, 90 % judged, nothing declared\n" in text
-    assert "\nnote: stretch 2: 100.000 s to 129.990 s, 100 % judged, 1 episode\n" in text
+    assert (
+        "\nnote: stretch 1: 0.000 s to 29.990 s, 90 % judged, nothing declared\n"
+        in text
+    )
+    assert (
+        "\nnote: stretch 2: 100.000 s to 129.990 s, 100 % judged, 1 episode\n" in text
+    )
     assert [round(one["start_s"]) for one in as_json(summary)["stretches"]] == [0, 100]
     # What stood at the end of the first is no evidence in the second.
     early = parse_fault("channel=imu_0.x kind=bias size=0.1 start=20 stop=50")
     first, second = replay(*armings, (early,)).story.episodes
-    assert (first.stretch, first.channels, first.injected) == (1, ("imu_0.x",), ("bias on imu_0.x",))
+    assert (first.stretch, first.channels, first.injected) == (
+        1,
+        ("imu_0.x",),
+        ("bias on imu_0.x",),
+    )
     assert (second.stretch, second.channels, second.injected) == (2, ("imu_2.y",), ())
     late = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
-    with pytest.raises(FaultError, match=r"starts at 60 s, expected at most 29\.99 s or at least"):
+    with pytest.raises(
+        FaultError, match=r"starts at 60 s, expected at most 29\.99 s or at least"
+    ):
         replay(*armings, (late,))
 
 
 def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
     config = armings[1]
-    block = read_block(two_armings(tmp_path / "sound.bin", logs.write_dataflash, faulty=False), config)
+    block = read_block(
+        two_armings(tmp_path / "sound.bin", logs.write_dataflash, faulty=False), config
+    )
     plan = Plan(parse_swept("kind=bias size=0.2"), times=9, within=5.0)
     (tried,) = sweep([Subject("all", config, block)], plan)
     assert len(tried.times) == 9
     assert tried.skipped == ()
-    first, second = ([at for at in tried.times if (at > 50) == late] for late in (False, True))
+    first, second = (
+        [at for at in tried.times if (at > 50) == late] for late in (False, True)
+    )
     assert min(len(first), len(second)) >= 3
     assert max(first) + 5 <= ARMINGS[0] < ARMINGS[1] <= min(second)
     assert {trial.scored.outcome.value for trial in tried.trials} == {"named"}
-    with pytest.raises(FaultError, match="in no piece of it without a gap long enough to watch a fault for 40 s"):
+    with pytest.raises(
+        FaultError,
+        match="in no piece of it without a gap long enough to watch a fault for 40 s",
+    ):
         sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
 
 
@@ -155,13 +198,33 @@ def test_errors_and_words_of_a_log_are_told_at_their_times(tmp_path, fdi):
     """Three IMUs from 10 s on; a switch of the lane at 12 s, an error that is over at 13 s, words at 11 s."""
     extra = logs.format_record(5, "ERR", "QBB", "TimeUS,Subsys,ECode")
     for second, subsystem, code in ((12, 24, 1), (13, 16, 0)):
-        extra += logs.HEAD + struct.pack("<BQBB", 5, second * 1_000_000, subsystem, code)
-    extra += logs.HEAD + struct.pack("<BQ64s", 66, 11_000_000, b"EKF3 IMU0 is using GPS\r\n")
-    log = logs.write_dataflash(tmp_path / "log.bin", logs.units(3, seconds=6.0, start=10.0), extra=extra)
+        extra += logs.HEAD + struct.pack(
+            "<BQBB", 5, second * 1_000_000, subsystem, code
+        )
+    extra += logs.HEAD + struct.pack(
+        "<BQ64s", 66, 11_000_000, b"EKF3 IMU0 is using GPS\r\n"
+    )
+    log = logs.write_dataflash(
+        tmp_path / "log.bin", logs.units(3, seconds=6.0, start=10.0), extra=extra
+    )
     config, page = tmp_path / "config.yaml", tmp_path / "page.html"
     fdi("inspect", log, "--output", config, "--quiet")
-    told = json.loads(fdi("replay", log, "--config", config, "--json", "-", "--report", page, "--quiet").out)
-    assert [(round(one["at_s"], 2), one["kind"], one["text"]) for one in told["autopilot"]] == [
+    told = json.loads(
+        fdi(
+            "replay",
+            log,
+            "--config",
+            config,
+            "--json",
+            "-",
+            "--report",
+            page,
+            "--quiet",
+        ).out
+    )
+    assert [
+        (round(one["at_s"], 2), one["kind"], one["text"]) for one in told["autopilot"]
+    ] == [
         (1.0, "MSG", "EKF3 IMU0 is using GPS"),
         (2.0, "ERR", "EKF lane switched to 1"),
         (3.0, "ERR", "EKF check: resolved"),
@@ -170,8 +233,12 @@ def test_errors_and_words_of_a_log_are_told_at_their_times(tmp_path, fdi):
 
 
 def test_messages_that_px4_logs_are_told(tmp_path):
-    message = logs.ulog_message(b"L", struct.pack("<cQ", b"4", 12_000_000) + b"EKF2 0 lost")
-    log = logs.write_ulog(tmp_path / "log.ulg", logs.units(2, seconds=4.0, start=10.0), gps=False)
+    message = logs.ulog_message(
+        b"L", struct.pack("<cQ", b"4", 12_000_000) + b"EKF2 0 lost"
+    )
+    log = logs.write_ulog(
+        tmp_path / "log.ulg", logs.units(2, seconds=4.0, start=10.0), gps=False
+    )
     log.write_bytes(log.read_bytes() + message)
     with Recording(log) as recording:
         (one,) = recording.texts

@@ -21,8 +21,22 @@ from fdi_ros.faults.fault import Injector, load_scenario
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind, Scored, score
-from fdi_ros.replay.sweep import Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
-from fdi_ros.replay.sweep_report import lines_of, smallest, sound_lines, sweep_page, sweep_text
+from fdi_ros.replay.sweep import (
+    Plan,
+    Subject,
+    judged_with,
+    onsets_of,
+    parse_swept,
+    sweep,
+    try_faults,
+)
+from fdi_ros.replay.sweep_report import (
+    lines_of,
+    smallest,
+    sound_lines,
+    sweep_page,
+    sweep_text,
+)
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -62,12 +76,29 @@ def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector):
             fault = kind.fault(pipeline.channel_names[k % 6], onset.at, -1.0, seed=k)
             found = judged_with(pipeline, onset, fault)
             end = int(np.searchsorted(block.stamp, onset.block.stamp[-1])) + 1
-            full = Pipeline(config).process(Injector([fault], pipeline.channel_names).apply(block[:end]))
+            full = Pipeline(config).process(
+                Injector([fault], pipeline.channel_names).apply(block[:end])
+            )
             first = end - len(found)
             assert block.stamp[first] == onset.block.stamp[onset.row] == found.stamp[0]
-            for name in ("stamp", "rate", "covariance", "statistic", "alarm", "state", "residual", "level"):
-                np.testing.assert_array_equal(getattr(found, name), getattr(full, name)[first:], err_msg=kind.words)
-            assert list(found.events) == [event for event in full.events if event.row >= first]
+            for name in (
+                "stamp",
+                "rate",
+                "covariance",
+                "statistic",
+                "alarm",
+                "state",
+                "residual",
+                "level",
+            ):
+                np.testing.assert_array_equal(
+                    getattr(found, name),
+                    getattr(full, name)[first:],
+                    err_msg=kind.words,
+                )
+            assert list(found.events) == [
+                event for event in full.events if event.row >= first
+            ]
             compared += bool(found.events)
     assert compared >= len(EVERY)
 
@@ -89,7 +120,9 @@ def test_outcome_of_a_fault(alone, among, words, named, found):
     for mask, told in zip(masks, (alone, among), strict=True):
         for channel, at in told.items():
             mask[since >= at - 1e-9, channel] = True
-    assert score(*masks, 0, since, 2.0) == Scored(OutcomeKind(words), pytest.approx(named), pytest.approx(found))
+    assert score(*masks, 0, since, 2.0) == Scored(
+        OutcomeKind(words), pytest.approx(named), pytest.approx(found)
+    )
 
 
 def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process():
@@ -102,13 +135,21 @@ def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_proc
     assert lines[2].named_after[0] < lines[1].named_after[0]
     assert smallest(lines, named=True) == {"bias": 0.02}
     # Signs and times are one fault's in all sizes; channels differ.
-    sizes = {(t.channel, t.fault.start): {np.sign(t.fault.size) for t in tried.trials} for t in tried.trials}
+    sizes = {
+        (t.channel, t.fault.start): {np.sign(t.fault.size) for t in tried.trials}
+        for t in tried.trials
+    }
     assert len(sizes) == 12
-    assert all(len({np.sign(t.fault.size) for t in tried.trials[k : k + 3]}) == 1 for k in range(0, 36, 3))
+    assert all(
+        len({np.sign(t.fault.size) for t in tried.trials[k : k + 3]}) == 1
+        for k in range(0, 36, 3)
+    )
     config = tried.config
     pipeline = Pipeline(config)
     onset = next(onsets_of(pipeline, flown(), tried.times, plan.within))
-    assert try_faults(*pickle.loads(pickle.dumps((config, onset, 0, plan)))) == list(tried.trials[:3])
+    assert try_faults(*pickle.loads(pickle.dumps((config, onset, 0, plan)))) == list(
+        tried.trials[:3]
+    )
 
 
 def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
@@ -133,7 +174,10 @@ def test_figures_of_a_vehicle_at_rest_are_called_that():
     at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
     text = sweep_text([at_rest], plan, "bag")
     # Of a dozen faults the share is not 95 %, whatever came of them.
-    assert "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%" in text
+    assert (
+        "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%"
+        in text
+    )
     assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in text
     moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
     assert "AT REST" not in sweep_page([moving], plan, "bag", {})
@@ -141,11 +185,16 @@ def test_figures_of_a_vehicle_at_rest_are_called_that():
 
 def test_a_monitor_that_judges_nothing_is_no_result():
     config = Config.from_file(FILE, {"bias.startup_bias_duration": 500.0})
-    slow, own = Subject("slow", config, flown()), Subject("own", Config.from_file(FILE), flown())
+    slow, own = (
+        Subject("slow", config, flown()),
+        Subject("own", Config.from_file(FILE), flown()),
+    )
     words = "it judges nothing of this recording: it ends after 6001 samples, before the biases"
     with pytest.raises(FaultError, match=words):
         sweep([slow], Plan(parse_swept("kind=stuck")))
-    with pytest.raises(FaultError, match="no fault can be tried: its topics have no time in common"):
+    with pytest.raises(
+        FaultError, match="no fault can be tried: its topics have no time in common"
+    ):
         swept(flown()[:0])
     with pytest.raises(FaultError, match="too short to watch a fault for 70 s"):
         swept(flown(), within=70.0)
@@ -157,17 +206,46 @@ def test_a_monitor_that_judges_nothing_is_no_result():
 
 
 def test_excluded_channels_are_not_tried(fdi, tmp_path):
-    words = ["sweep", BAG, "--config", FILE, "--times", 2, "--within", 2, "--fault", "kind=bias size=0.3"]
+    words = [
+        "sweep",
+        BAG,
+        "--config",
+        FILE,
+        "--times",
+        2,
+        "--within",
+        2,
+        "--fault",
+        "kind=bias size=0.3",
+    ]
     other = tmp_path / "other.yaml"
-    other.write_text(FILE.read_text().replace("body_frame:", "excluded_channels: [g2]\n    body_frame:"))
+    other.write_text(
+        FILE.read_text().replace(
+            "body_frame:", "excluded_channels: [g2]\n    body_frame:"
+        )
+    )
     outputs = [tmp_path / name for name in ("s.json", "s.csv", "s.html")]
-    words += ["--compare", other, "cusum", "--json", outputs[0], "--csv", outputs[1], "--report", outputs[2]]
+    words += [
+        "--compare",
+        other,
+        "cusum",
+        "--json",
+        outputs[0],
+        "--csv",
+        outputs[1],
+        "--report",
+        outputs[2],
+    ]
     code, out, _ = fdi(*words)
     assert code == 0
     assert "Side by side" in out
     assert "not tried, as excluded: g2" in out
     own, without, cusum = json.loads(outputs[0].read_text())["monitors"]
-    assert (own["name"], without["name"], cusum["detector"]) == ("two_triads.yaml", str(other), "cusum")
+    assert (own["name"], without["name"], cusum["detector"]) == (
+        "two_triads.yaml",
+        str(other),
+        "cusum",
+    )
     assert list(own["channels"]) == [f"g{k}" for k in range(1, 7)]
     assert list(without["channels"]) == ["g1", "g3", "g4", "g5", "g6"]
     assert own["times_s"] == without["times_s"]
@@ -181,13 +259,18 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
     assert {abs(float(row["size"])) for row in rows} == {0.3}
     delays = sorted(float(row["named_after_s"]) for row in rows[:12])
     assert delays[5] == pytest.approx(fault["named_after_s"]["median"], abs=1e-6)
-    assert outputs[2].read_text().index("nothing injected") < outputs[2].read_text().index("Side by side")
+    assert outputs[2].read_text().index("nothing injected") < outputs[
+        2
+    ].read_text().index("Side by side")
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--fault", "kind=bias size=-0.1"], "size is -0.1, expected more than 0: signs are drawn"),
+        (
+            ["--fault", "kind=bias size=-0.1"],
+            "size is -0.1, expected more than 0: signs are drawn",
+        ),
         (["--fault", "kind=bias size=0.1 start=3"], "start is chosen by the sweep"),
         (["--fault", "kind=triad_loss"], "strikes a whole unit"),
         (["--times", "0"], "--times is 0, expected 1 to 1000"),
@@ -195,7 +278,10 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
         (["--workers", "0"], "workers is 0, expected 1 to 256"),
         (["--seed", "-1"], "--seed is -1"),
         (["--compare", "nothing"], "no such file, and no detector"),
-        (["--compare", str(ROOT / "config" / "three_imus.yaml")], "its channels are not those of"),
+        (
+            ["--compare", str(ROOT / "config" / "three_imus.yaml")],
+            "its channels are not those of",
+        ),
     ],
 )
 def test_what_is_asked_wrongly_is_one_line(refused, words, said):

@@ -38,7 +38,9 @@ def test_white_noise_has_the_level_of_its_variance_however_the_stream_is_cut():
     values = noise(40_000)
     whole, cut = curves(spectrum(values)), curves(spectrum(*np.array_split(values, 37)))
     for one, other in zip(whole, cut, strict=True):
-        assert np.sqrt(np.mean(one**2)) == pytest.approx(STD * np.sqrt(2 / RATE), rel=0.02)
+        assert np.sqrt(np.mean(one**2)) == pytest.approx(
+            STD * np.sqrt(2 / RATE), rel=0.02
+        )
         assert one == pytest.approx(other, rel=0.5)
         assert np.mean(one) == pytest.approx(np.mean(other), rel=0.02)
 
@@ -73,13 +75,17 @@ def test_a_channel_that_gives_nothing_leaves_the_others():
     cuts=st.lists(st.integers(0, 400), max_size=8),
     seed=st.integers(0, 99),
 )
-def test_every_value_lies_within_its_span_and_every_extreme_is_reached(rows, most, cuts, seed):
+def test_every_value_lies_within_its_span_and_every_extreme_is_reached(
+    rows, most, cuts, seed
+):
     random = np.random.default_rng(seed)
     time = np.cumsum(random.uniform(0.1, 1, rows))
     values = random.normal(size=(rows, 3))
     values[random.random(rows) < 0.2, 1] = np.nan
     store = PageStore(dict.fromkeys("abc", FINE), most)
-    for first, last in itertools.pairwise(sorted({0, rows, *(min(cut, rows) for cut in cuts)})):
+    for first, last in itertools.pairwise(
+        sorted({0, rows, *(min(cut, rows) for cut in cuts)})
+    ):
         store.add(time[first:last], values[first:last])
     start, low, high = store.spans()
     assert len(start) <= most + 1

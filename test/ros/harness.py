@@ -52,10 +52,14 @@ GEOMETRY = Geometry.from_triads(np.array(TWO_IMUS.imus.mounts).reshape(-1, 3, 3)
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def healthy(count: int, seed=0, size=0.5, rate=RATE, start=0.0) -> tuple[np.ndarray, np.ndarray]:
+def healthy(
+    count: int, seed=0, size=0.5, rate=RATE, start=0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Body rate (N, 3) and healthy channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
     omega = body_rate(start + np.arange(count) / rate, size)
-    return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
+    return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(
+        seed
+    ).standard_normal((count, 6))
 
 
 def struck(count: int, start: int, **options: float) -> tuple[np.ndarray, np.ndarray]:
@@ -77,10 +81,15 @@ class Listener(Node):
         super().__init__("listener")
         self.speaker = "fdi_node"  # whose statuses are meant where none is named
         self.outputs = [self.create_publisher(kind, topic, DEEP) for topic in topics]
-        self.fused, self.integrity = self.hear("fused"), self.hear("fdi_node/integrity", Float64MultiArray)
+        self.fused, self.integrity = (
+            self.hear("fused"),
+            self.hear("fdi_node/integrity", Float64MultiArray),
+        )
         self.diagnostics: list[tuple[float, int, DiagnosticArray]] = []
         """With the time at which each was heard, s, and the number of samples heard before it."""
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_diagnostics, 100
+        )
         self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -102,7 +111,9 @@ class Listener(Node):
     def send_channels(self, values) -> None:
         self.outputs[0].publish(self._templates[1].fill(values))
 
-    def play(self, z: np.ndarray, triads=(0, 1), skew: int = 0, start: int | None = None) -> np.ndarray:
+    def play(
+        self, z: np.ndarray, triads=(0, 1), skew: int = 0, start: int | None = None
+    ) -> np.ndarray:
         """Publish samples of two IMUs at their pace, stamped with the time of now, or from a start on; the stamps."""
         begun, start = time.monotonic(), time.time_ns() if start is None else start
         stamps = start + (np.arange(len(z)) * 1e9 / RATE).astype(np.int64)
@@ -122,7 +133,11 @@ class Listener(Node):
             wait(lambda last=last: stamps_of(self.fused[-1:]) == [last], 1.0)
             if self.integrity and not self.states()[-1].any():
                 return True
-        print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
+        print(
+            "the monitor did not come to rest; it says:",
+            *self.diagnostics[-1:],
+            sep="\n",
+        )
         return False
 
     def calm(self) -> None:
@@ -163,18 +178,35 @@ class Listener(Node):
 
     def reports(self) -> list[dict[str, DiagnosticStatus]]:
         """All statuses of each report, by name."""
-        return [{s.name.removeprefix("fdi_node: "): s for s in m.status} for *_, m in list(self.diagnostics)]
+        return [
+            {s.name.removeprefix("fdi_node: "): s for s in m.status}
+            for *_, m in list(self.diagnostics)
+        ]
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         names = (name, f"{self.speaker}: {name}")
-        return [status for *_, array in list(self.diagnostics) for status in array.status if status.name in names]
+        return [
+            status
+            for *_, array in list(self.diagnostics)
+            for status in array.status
+            if status.name in names
+        ]
 
     def says(self, name: str, words: str) -> str:
         """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
         said: list[str] = []
-        if wait(lambda: said.extend(s.message for s in self._statuses(name) if words in s.message) or said):
+        if wait(
+            lambda: (
+                said.extend(
+                    s.message for s in self._statuses(name) if words in s.message
+                )
+                or said
+            )
+        ):
             return said[-1]
-        print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
+        print(
+            f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n"
+        )
         return ""
 
     def call(self, kind: type, service: str, **fields: object):
@@ -191,7 +223,9 @@ class Listener(Node):
 
     def change(self, transition: int) -> bool:
         """Ask the monitor for a transition of its life cycle; whether it was done."""
-        return self.call(ChangeState, "fdi_node/change_state", transition=Transition(id=transition)).success
+        return self.call(
+            ChangeState, "fdi_node/change_state", transition=Transition(id=transition)
+        ).success
 
     def state(self) -> str:
         """State of the life cycle of the monitor."""
@@ -199,13 +233,23 @@ class Listener(Node):
 
     def set(self, node: str = "fdi_node", **values: object):
         """Set parameters together; two underscores stand for a dot."""
-        changes = [Parameter(name.replace("__", "."), value=value).to_parameter_msg() for name, value in values.items()]
-        return self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", parameters=changes).result
+        changes = [
+            Parameter(name.replace("__", "."), value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        return self.call(
+            SetParametersAtomically,
+            f"{node}/set_parameters_atomically",
+            parameters=changes,
+        ).result
 
 
 TRANSITIONS = {
     "unconfigured": {Transition.TRANSITION_CONFIGURE: "inactive"},
-    "inactive": {Transition.TRANSITION_CLEANUP: "unconfigured", Transition.TRANSITION_ACTIVATE: "active"},
+    "inactive": {
+        Transition.TRANSITION_CLEANUP: "unconfigured",
+        Transition.TRANSITION_ACTIVATE: "active",
+    },
     "active": {Transition.TRANSITION_DEACTIVATE: "inactive"},
 }
 """Which transitions are possible in which state, but for those that end the node, and where they lead."""
@@ -243,11 +287,16 @@ def listening(topics=(), kind=Imu) -> Iterator[Listener]:
 
 
 @contextlib.contextmanager
-def monitoring(config: Config, folder: Path, prime=True, **parameters: object) -> Iterator[tuple]:
+def monitoring(
+    config: Config, folder: Path, prime=True, **parameters: object
+) -> Iterator[tuple]:
     """The monitor in its own process, connected to a listener: (listener, process)."""
     kind = Imu if config.input == "imus" else Float64MultiArray
     file = parameter_file(config, folder, **parameters)
-    with listening(config.topics, kind) as listener, running("fdi_node", file) as process:
+    with (
+        listening(config.topics, kind) as listener,
+        running("fdi_node", file) as process,
+    ):
         if parameters.get("autostart", True):
             connect(listener, process, prime)
         yield listener, process
@@ -259,9 +308,13 @@ def connect(listener: Listener, process: Process, prime: bool = True) -> None:
 
     def connected() -> bool:
         heard = all(output.get_subscription_count() for output in listener.outputs)
-        return ended() is not None or (heard and all(map(listener.count_publishers, topics)))
+        return ended() is not None or (
+            heard and all(map(listener.count_publishers, topics))
+        )
 
     assert wait(connected, 2 * PATIENCE), f"the node did not connect: {process.said()}"
     assert ended() is None, process.said()
     if prime:
-        assert wait(lambda: listener.prime() or (listener.fused and listener.integrity)), process.said()
+        assert wait(
+            lambda: listener.prime() or (listener.fused and listener.integrity)
+        ), process.said()

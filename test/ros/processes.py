@@ -41,7 +41,10 @@ def rest(count: Callable[[], int]) -> None:
 
 def parameter_file(config: Config, folder: Path, **more: object) -> Path:
     """Write all settings as a ROS 2 parameter file."""
-    flat = {name: list(value) if isinstance(value, tuple) else value for name, value in config.parameters().items()}
+    flat = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in config.parameters().items()
+    }
     flat = {name: value for name, value in flat.items() if value != []}
     path = folder / "parameters.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {**flat, **more}}}))
@@ -51,14 +54,30 @@ def parameter_file(config: Config, folder: Path, **more: object) -> Path:
 class Process:
     """A node of ours in a process of its own; in names of parameters two underscores stand for a dot."""
 
-    def __init__(self, name: str, file: Path, *remaps: str, **parameters: object) -> None:
-        self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1])
-        words = ["-m", "fdi_ros.ros.process", name, "--ros-args", "--params-file", str(file)]
+    def __init__(
+        self, name: str, file: Path, *remaps: str, **parameters: object
+    ) -> None:
+        self.output = Path(
+            tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1]
+        )
+        words = [
+            "-m",
+            "fdi_ros.ros.process",
+            name,
+            "--ros-args",
+            "--params-file",
+            str(file),
+        ]
         words += [word for remap in remaps for word in ("-r", remap)]
         for key, value in parameters.items():
             words += ["-p", f"{key.replace('__', '.')}:={value}"]
         with self.output.open("w") as output:
-            self.popen = subprocess.Popen([sys.executable, *words], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
+            self.popen = subprocess.Popen(
+                [sys.executable, *words],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                cwd=ROOT,
+            )
 
     def said(self) -> str:
         return self.output.read_text()
@@ -79,7 +98,9 @@ class Process:
 
 
 @contextlib.contextmanager
-def running(name: str, file: Path, *remaps: str, **parameters: object) -> Iterator[Process]:
+def running(
+    name: str, file: Path, *remaps: str, **parameters: object
+) -> Iterator[Process]:
     """A node of ours that must end well when it is asked to."""
     process = Process(name, file, *remaps, **parameters)
     try:
@@ -98,7 +119,13 @@ from fdi_ros.ros.process import run
 for arguments in {[[*first, *words.split()] for words in starts]!r}:
     print("=====", run({name!r}, arguments), file=sys.stderr)
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     # rcl itself has a line to say of a file that it cannot read.
     said = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
     assert said[1::2] == ["===== 2"] * len(starts), done.stderr

@@ -22,7 +22,13 @@ from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions
 from mavlink.autopilots import Autopilot, OverUdp, free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.parameter import Parameter as Given
 from ros.harness import DEEP, TRANSITIONS, Listener, monitoring
 from ros.processes import ROOT, Process, running, wait
@@ -39,17 +45,52 @@ CONFIG = Config.from_file(STACK)
 NODES = ("fdi_node", "mavlink_node")
 
 OUTSTANDING = 8  # requests that wait for their answers: DDS keeps ten of a service
-NAMES = [*CONFIG.parameters(), *MONITOR, *ALL_NODES, "url", "rate", "named_values", "use_sim_time"]
-WORDS = ["", "x", "\n\x1b[2J", "a" * 5000, "é\u202e", "sequential", "likelihood_ratio", "imu_1.z", "~/a//b", "%s%n"]
+NAMES = [
+    *CONFIG.parameters(),
+    *MONITOR,
+    *ALL_NODES,
+    "url",
+    "rate",
+    "named_values",
+    "use_sim_time",
+]
+WORDS = [
+    "",
+    "x",
+    "\n\x1b[2J",
+    "a" * 5000,
+    "é\u202e",
+    "sequential",
+    "likelihood_ratio",
+    "imu_1.z",
+    "~/a//b",
+    "%s%n",
+]
 REALS = (0.0, -1.0, 1e-300, 1e308, math.nan, math.inf, 0.01, 1e5)
 WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
 FITTING = [
-    *(Given("detector.false_alarms_per_hour", value=value) for value in (0.01, 0.1, 1.0)),
-    *(Given("detector.name", value=value) for value in ("sequential", "likelihood_ratio", "cusum")),
+    *(
+        Given("detector.false_alarms_per_hour", value=value)
+        for value in (0.01, 0.1, 1.0)
+    ),
+    *(
+        Given("detector.name", value=value)
+        for value in ("sequential", "likelihood_ratio", "cusum")
+    ),
     *(Given("publish_under_doubt", value=value) for value in (False, True)),
-    *(Given("excluded_channels", Given.Type.STRING_ARRAY, value) for value in ([], ["imu_1.z"])),
+    *(
+        Given("excluded_channels", Given.Type.STRING_ARRAY, value)
+        for value in ([], ["imu_1.z"])
+    ),
 ]
-PACKETS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
+PACKETS = (
+    "garbage",
+    "cut messages",
+    "any message of others",
+    "any message in its name",
+    "strangers",
+    "flood",
+)
 NUMBERS = sorted(number for number in dialect.mavlink_map if number >= 0)
 
 
@@ -58,7 +99,10 @@ class Storm:
 
     def __init__(self, listener: Listener, port: int, seed: int) -> None:
         self.listener, self.draw, self.port = listener, random.Random(seed), port
-        self.socket, self.codec = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), dialect.MAVLink(None)
+        self.socket, self.codec = (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM),
+            dialect.MAVLink(None),
+        )
         self.sent = self.answered = 0
         self._clients: dict[str, Any] = {}
         self._waiting: list[Any] = []
@@ -111,7 +155,9 @@ class Storm:
         if draw.random() < 0.2:
             return draw.choice(FITTING).to_parameter_msg()
         odd = (*WORDS, "detector.nmae", "b" * 100_000)
-        return Parameter(name=draw.choice(NAMES if draw.random() < 0.7 else odd), value=self.value())
+        return Parameter(
+            name=draw.choice(NAMES if draw.random() < 0.7 else odd), value=self.value()
+        )
 
     def send_parameters(self) -> None:
         choice = self.draw.choice
@@ -120,23 +166,50 @@ class Storm:
         kind, request = choice(
             (
                 *[(SetParameters, SetParameters.Request(parameters=changes))] * 2,
-                (SetParametersAtomically, SetParametersAtomically.Request(parameters=changes)),
+                (
+                    SetParametersAtomically,
+                    SetParametersAtomically.Request(parameters=changes),
+                ),
                 (GetParameters, GetParameters.Request(names=names)),
                 (DescribeParameters, DescribeParameters.Request(names=names)),
-                (ListParameters, ListParameters.Request(prefixes=names[:3], depth=choice((0, 1, 2**63)))),
+                (
+                    ListParameters,
+                    ListParameters.Request(
+                        prefixes=names[:3], depth=choice((0, 1, 2**63))
+                    ),
+                ),
             )
         )
-        self.ask(kind, re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower(), request, choice(NODES))
+        self.ask(
+            kind,
+            re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower(),
+            request,
+            choice(NODES),
+        )
 
     def send_services(self) -> None:
-        self.ask(Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request())
+        self.ask(
+            Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request()
+        )
 
     def send_lifecycle(self) -> None:
-        wanted = self.draw.choice((*(n for paths in TRANSITIONS.values() for n in paths), 0, 9, 60, 99, 255))
-        label = self.draw.choice(("", "", "", "configure", "activate", "c" * 5000, "\n"))
-        self.ask(ChangeState, "change_state", ChangeState.Request(transition=Transition(id=wanted, label=label)))
+        wanted = self.draw.choice(
+            (*(n for paths in TRANSITIONS.values() for n in paths), 0, 9, 60, 99, 255)
+        )
+        label = self.draw.choice(
+            ("", "", "", "configure", "activate", "c" * 5000, "\n")
+        )
+        self.ask(
+            ChangeState,
+            "change_state",
+            ChangeState.Request(transition=Transition(id=wanted, label=label)),
+        )
         if self.draw.random() < 0.1:
-            self.ask(GetAvailableTransitions, "get_available_transitions", GetAvailableTransitions.Request())
+            self.ask(
+                GetAvailableTransitions,
+                "get_available_transitions",
+                GetAvailableTransitions.Request(),
+            )
 
     def send_links(self) -> None:
         """Publishers that come, say what is true, false, damaged or nothing, and go."""
@@ -144,10 +217,22 @@ class Storm:
         output = self.listener.create_publisher(Imu, draw.choice(CONFIG.topics), DEEP)
         kind = draw.choice(("true", "true", "noise", "damaged", "late", "flood"))
         for _ in range(draw.choice((0, 3, 100)) if kind != "flood" else 5000):
-            stamp = time.time_ns() - (draw.choice((10**9, 10**12, -(10**15))) if kind == "late" else 0)
-            rate = tuple(draw.choice((*REALS, 1e-3)) for _ in range(3)) if kind == "noise" else (0.0, 0.0, 0.0)
-            data = bytes(template.fill(max(stamp, 0) % (2**31 * 10**9), rate, (0.0,) * 9))
-            output.publish(data[: draw.choice((0, 3, 20, len(data)))] if kind == "damaged" else data)
+            stamp = time.time_ns() - (
+                draw.choice((10**9, 10**12, -(10**15))) if kind == "late" else 0
+            )
+            rate = (
+                tuple(draw.choice((*REALS, 1e-3)) for _ in range(3))
+                if kind == "noise"
+                else (0.0, 0.0, 0.0)
+            )
+            data = bytes(
+                template.fill(max(stamp, 0) % (2**31 * 10**9), rate, (0.0,) * 9)
+            )
+            output.publish(
+                data[: draw.choice((0, 3, 20, len(data)))]
+                if kind == "damaged"
+                else data
+            )
             self.sent += 1
             if kind != "flood":
                 time.sleep(0.002)
@@ -158,7 +243,10 @@ class Storm:
         """Packets of a kind to the link; each stranger has an address of its own."""
         kind = self.draw.choice(PACKETS)
         for _ in range(self.draw.choice((1, 50)) if kind != "flood" else 1):
-            made = [self.packet(kind) for _ in range({"strangers": 1, "flood": 200}.get(kind, 20))]
+            made = [
+                self.packet(kind)
+                for _ in range({"strangers": 1, "flood": 200}.get(kind, 20))
+            ]
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
                 source = stranger if kind == "strangers" else self.socket
                 for packet in made * (10 if kind == "flood" else 1):
@@ -176,9 +264,20 @@ class Storm:
         message = dialect.mavlink_map[draw.choice(NUMBERS)]
         size = message.unpacker.size
         payload = draw.randbytes(size) if draw.random() < 0.7 else bytes(size)
-        codec.srcSystem = 1 if kind in ("any message in its name", "strangers") else draw.randrange(2, 256)
-        codec.srcComponent, codec.seq = draw.choice((1, 1, 1, draw.randrange(256))), draw.randrange(256)
-        data = bytes(dialect.MAVLink_message(message.id, message.msgname)._pack(codec, message.crc_extra, payload))
+        codec.srcSystem = (
+            1
+            if kind in ("any message in its name", "strangers")
+            else draw.randrange(2, 256)
+        )
+        codec.srcComponent, codec.seq = (
+            draw.choice((1, 1, 1, draw.randrange(256))),
+            draw.randrange(256),
+        )
+        data = bytes(
+            dialect.MAVLink_message(message.id, message.msgname)._pack(
+                codec, message.crc_extra, payload
+            )
+        )
         return data[: draw.randrange(1, len(data))] if kind == "cut messages" else data
 
 
@@ -206,15 +305,27 @@ def vehicle(folder: Path) -> Iterator[Vehicle]:
 
 def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
     """Let one storm loose; what it cost."""
-    nodes = {"monitor": ("fdi_node: ", over.monitor), "link": ("mavlink_node: ", over.link)}
+    nodes = {
+        "monitor": ("fdi_node: ", over.monitor),
+        "link": ("mavlink_node: ", over.link),
+    }
     lines = {name: process.said().count("\n") for name, (_, process) in nodes.items()}
     begun, storm = time.monotonic(), Storm(over.listener, over.port, seed)
     storm.rage(kind, seconds)
-    end, heard = time.monotonic(), [(at, array.status[0].name) for at, _, array in [*over.listener.diagnostics]]
+    end, heard = (
+        time.monotonic(),
+        [(at, array.status[0].name) for at, _, array in [*over.listener.diagnostics]],
+    )
     told: dict[str, float] = {"sent": storm.sent, "answered": storm.answered}
     for name, (prefix, process) in nodes.items():
-        times = [at for at, status in heard if status.startswith(prefix) and begun - 2 <= at]
-        told[f"{name}: longest gap of the diagnostics, s"] = max(np.diff([*times, end]), default=math.inf)
-        told[f"{name}: lines of the log a second"] = (process.said().count("\n") - lines[name]) / (end - begun)
+        times = [
+            at for at, status in heard if status.startswith(prefix) and begun - 2 <= at
+        ]
+        told[f"{name}: longest gap of the diagnostics, s"] = max(
+            np.diff([*times, end]), default=math.inf
+        )
+        told[f"{name}: lines of the log a second"] = (
+            process.said().count("\n") - lines[name]
+        ) / (end - begun)
         told[f"{name}: memory, MB"] = process.memory()
     return told

@@ -52,13 +52,21 @@ def load(monkeypatch):
     if not NAMES.is_file():
         pytest.skip(f"{NAMES.name} is not here: what launch and launch_ros hold")
     names = json.loads(NAMES.read_text())
-    constructors = {name: words for held in names.values() for name, words in held.items() if words}
+    constructors = {
+        name: words for held in names.values() for name, words in held.items() if words
+    }
 
     def stand_in(name: str) -> type:
         own = constructors.get(name, ())
-        further = [word for base in FORWARD for word in constructors[base]] if "kwargs" in own else []
+        further = (
+            [word for base in FORWARD for word in constructors[base]]
+            if "kwargs" in own
+            else []
+        )
         words = [word for word in dict.fromkeys([*own, *further]) if word != "kwargs"]
-        signature = Signature([Parameter(word, Parameter.POSITIONAL_OR_KEYWORD) for word in words])
+        signature = Signature(
+            [Parameter(word, Parameter.POSITIONAL_OR_KEYWORD) for word in words]
+        )
         return type(name, (Given,), {"signature": signature})
 
     for module, held in names.items():
@@ -68,14 +76,23 @@ def load(monkeypatch):
     monkeypatch.delitem(sys.modules, "fdi_ros.ros.launching", raising=False)
 
     def run(name: str, **given: str) -> dict[str, dict]:
-        described = runpy.run_path(str(ROOT / "launch" / f"{name}.launch.py"))["generate_launch_description"]()
+        described = runpy.run_path(str(ROOT / "launch" / f"{name}.launch.py"))[
+            "generate_launch_description"
+        ]()
         (*declared, function) = described.given["initial_entities"]
         values = {one.given["name"]: one.given.get("default_value") for one in declared}
         assert given.keys() <= values.keys()
         values |= given
-        assert all(values[one.given["name"]] in one.given["choices"] for one in declared if "choices" in one.given)
+        assert all(
+            values[one.given["name"]] in one.given["choices"]
+            for one in declared
+            if "choices" in one.given
+        )
         context = SimpleNamespace(values=values, is_shutdown=False)
-        return {node.given["name"]: node.given for node in function.given["function"](context)}
+        return {
+            node.given["name"]: node.given
+            for node in function.given["function"](context)
+        }
 
     yield run
     sys.modules.pop("fdi_ros.ros.launching", None)
@@ -83,13 +100,24 @@ def load(monkeypatch):
 
 def parameters(node: dict) -> dict:
     """Values that a node is given beside its file."""
-    return {key: value for given in node["parameters"][1:] for key, value in given.items()}
+    return {
+        key: value for given in node["parameters"][1:] for key, value in given.items()
+    }
 
 
-def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(load, flight: Path) -> None:
-    nodes = load("replay", bag=str(flight), config="three_imus.yaml", faults="channel=imu_1.x kind=bias size=1")
+def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(
+    load, flight: Path
+) -> None:
+    nodes = load(
+        "replay",
+        bag=str(flight),
+        config="three_imus.yaml",
+        faults="channel=imu_1.x kind=bias size=1",
+    )
     assert list(nodes) == ["injector_node", "fdi_node", "player_node"]
-    assert ("/imu_3/data_raw", "/imu_3/data_raw_faulty") in nodes["fdi_node"]["remappings"]
+    assert ("/imu_3/data_raw", "/imu_3/data_raw_faulty") in nodes["fdi_node"][
+        "remappings"
+    ]
     # With a namespace its clock is not that of others.
     assert all(("/clock", "clock") in node["remappings"] for node in nodes.values())
     assert parameters(nodes["injector_node"])["enabled"]
@@ -98,7 +126,13 @@ def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(load, flight
     nodes |= load("mavlink") | load("fdi")
     assert all(Path(node["parameters"][0]).is_file() for node in nodes.values())
     assert nodes["mavlink_node"]["on_exit"].__name__ == "end"
-    assert {"url", "system_id", "signing_key", "named_values", "failover"} == parameters(nodes["mavlink_node"]).keys()
+    assert {
+        "url",
+        "system_id",
+        "signing_key",
+        "named_values",
+        "failover",
+    } == parameters(nodes["mavlink_node"]).keys()
     for name, bag in (("fdi", {}), ("mavlink", {}), ("replay", {"bag": str(flight)})):
         with pytest.raises(RuntimeError, match=r"cannot read config /nowhere\.yaml"):
             load(name, config="/nowhere.yaml", **bag)
@@ -112,14 +146,28 @@ def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(load, flight
 def test_a_node_that_ends_ends_the_launch_and_one_that_fails_fails_it(load) -> None:
     end = load("mavlink")["mavlink_node"]["on_exit"]
     with pytest.raises(RuntimeError, match="mavlink_node has failed: exit code 2"):
-        end(SimpleNamespace(process_name="mavlink_node", returncode=2), SimpleNamespace(is_shutdown=False))
-    (shutdown,) = end(SimpleNamespace(process_name="player_node", returncode=0), SimpleNamespace(is_shutdown=False))
+        end(
+            SimpleNamespace(process_name="mavlink_node", returncode=2),
+            SimpleNamespace(is_shutdown=False),
+        )
+    (shutdown,) = end(
+        SimpleNamespace(process_name="player_node", returncode=0),
+        SimpleNamespace(is_shutdown=False),
+    )
     assert shutdown.given == {"reason": "player_node has ended"}
-    assert end(SimpleNamespace(process_name="fdi_node", returncode=2), SimpleNamespace(is_shutdown=True)) == []
+    assert (
+        end(
+            SimpleNamespace(process_name="fdi_node", returncode=2),
+            SimpleNamespace(is_shutdown=True),
+        )
+        == []
+    )
 
 
 @pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("launch_ros", "ros2launch")),
+    any(
+        importlib.util.find_spec(name) is None for name in ("launch_ros", "ros2launch")
+    ),
     reason="launch_ros and ros2launch are not here: they come with a full ROS 2, not from PyPI",
 )
 @pytest.mark.parametrize(
@@ -127,16 +175,38 @@ def test_a_node_that_ends_ends_the_launch_and_one_that_fails_fails_it(load) -> N
     [
         ("fdi", "config:=/nowhere.yaml", "cannot read config /nowhere.yaml"),
         ("mavlink", "config:=/nowhere.yaml", "cannot read config /nowhere.yaml"),
-        ("replay", "bag:=BAG|config:=/nowhere.yaml", "cannot read config /nowhere.yaml"),
+        (
+            "replay",
+            "bag:=BAG|config:=/nowhere.yaml",
+            "cannot read config /nowhere.yaml",
+        ),
         ("mavlink", "url:=nonsense", "url is 'nonsense'"),
-        ("replay", "bag:=BAG|faults:=channel=nobody kind=bias size=1", "unknown channel 'nobody'"),
+        (
+            "replay",
+            "bag:=BAG|faults:=channel=nobody kind=bias size=1",
+            "unknown channel 'nobody'",
+        ),
         ("replay", "bag:=BAG|rate:=20.0", "process has finished cleanly"),
     ],
 )
-def test_as_ros2_launch_runs_it(flight: Path, name: str, arguments: str, words: str) -> None:
-    code, file = "from ros2cli.cli import main; raise SystemExit(main())", ROOT / "launch" / f"{name}.launch.py"
-    command = [sys.executable, "-c", code, "launch", str(file), *arguments.replace("BAG", str(flight)).split("|")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+def test_as_ros2_launch_runs_it(
+    flight: Path, name: str, arguments: str, words: str
+) -> None:
+    code, file = (
+        "from ros2cli.cli import main; raise SystemExit(main())",
+        ROOT / "launch" / f"{name}.launch.py",
+    )
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "launch",
+        str(file),
+        *arguments.replace("BAG", str(flight)).split("|"),
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False
+    )
     said = done.stdout + done.stderr
     assert words in said
     assert (done.returncode == 0) == ("finished" in words)
@@ -154,16 +224,22 @@ def test_as_ros2_launch_runs_it(flight: Path, name: str, arguments: str, words: 
         (("/a/fdi_node", "/b/left"), ("/a/fdi_node", "/b/left")),
     ],
 )
-def test_each_status_has_one_place_in_the_aggregator_and_what_is_missing_is_no_health(given, names) -> None:
+def test_each_status_has_one_place_in_the_aggregator_and_what_is_missing_is_no_health(
+    given, names
+) -> None:
     """By the rules of diagnostic_aggregator's GenericAnalyzer, of what config/diagnostics.yaml uses.
 
     A status not heard of for ``timeout`` is stale, and forgotten with ``discard_stale``. An analyzer without statuses
     is stale, with ``num_items`` 0 well; with more any other number is an error. A monitor reports once a second.
     """
     text = (ROOT / "config" / "diagnostics.yaml").read_text()
-    group = yaml.safe_load(made_for(given, text) if given else text)["analyzers"]["ros__parameters"]["gyros"]
+    group = yaml.safe_load(made_for(given, text) if given else text)["analyzers"][
+        "ros__parameters"
+    ]["gyros"]
     places = group["analyzers"]
-    assert {one["type"] for one in places.values()} == {"diagnostic_aggregator/GenericAnalyzer"}
+    assert {one["type"] for one in places.values()} == {
+        "diagnostic_aggregator/GenericAnalyzer"
+    }
 
     def takers(name: str) -> list[str]:
         return [
@@ -174,10 +250,21 @@ def test_each_status_has_one_place_in_the_aggregator_and_what_is_missing_is_no_h
         ]
 
     config = Config.from_file(ROOT / "config" / "two_imus.yaml")
-    inputs = [InputStatus(name, f"/{name}", 300, 100.0, 0.01, True) for name in config.imu_names]
+    inputs = [
+        InputStatus(name, f"/{name}", 300, 100.0, 0.01, True)
+        for name in config.imu_names
+    ]
     for name in names:
-        lines = describe(Pipeline.from_config(config).status(), prefix=f"{name.lstrip('/')}: ", inputs=inputs)
-        assert [takers(line.name) for line in lines] == [["monitor"], *[["channels"]] * 6, *[["inputs"]] * 2]
+        lines = describe(
+            Pipeline.from_config(config).status(),
+            prefix=f"{name.lstrip('/')}: ",
+            inputs=inputs,
+        )
+        assert [takers(line.name) for line in lines] == [
+            ["monitor"],
+            *[["channels"]] * 6,
+            *[["inputs"]] * 2,
+        ]
     assert takers("mavlink_node: unit imu_1") == ["link"]
     assert takers("drone/injector_node: injector") == ["injector"]
     # Another node of a similar name is none of those that were named.
@@ -185,8 +272,12 @@ def test_each_status_has_one_place_in_the_aggregator_and_what_is_missing_is_no_h
     assert all(2.0 < one["timeout"] <= 3.0 for one in places.values())
     # Who names its monitors is told of one that never came; there may be no link and no injector, which may end.
     counts = {"link": 0, "injector": 0} | ({"monitor": len(given)} if given else {})
-    assert {place: one["num_items"] for place, one in places.items() if "num_items" in one} == counts
-    assert [place for place, one in places.items() if "discard_stale" in one] == ["injector"]
+    assert {
+        place: one["num_items"] for place, one in places.items() if "num_items" in one
+    } == counts
+    assert [place for place, one in places.items() if "discard_stale" in one] == [
+        "injector"
+    ]
 
 
 def test_names_of_nodes_are_checked() -> None:
@@ -222,8 +313,14 @@ for name in NODES:
 rclpy.shutdown()
 print(said)
 """
-ROLES = {"publisher": "topics[@publish='ALLOW']/topic", "subscriber": "topics[@subscribe='ALLOW']/topic"}
-ROLES |= {"service": "services[@reply='ALLOW']/service", "client": "services[@request='ALLOW']/service"}
+ROLES = {
+    "publisher": "topics[@publish='ALLOW']/topic",
+    "subscriber": "topics[@subscribe='ALLOW']/topic",
+}
+ROLES |= {
+    "service": "services[@reply='ALLOW']/service",
+    "client": "services[@request='ALLOW']/service",
+}
 
 
 def full(name: str, node: str) -> str:
@@ -231,25 +328,46 @@ def full(name: str, node: str) -> str:
     return name if name.startswith("/") else f"/{name.replace('~', node)}"
 
 
-def test_the_policy_names_what_each_node_has_and_nothing_else(flight: Path, quiet_domain: None, tmp_path: Path) -> None:
+def test_the_policy_names_what_each_node_has_and_nothing_else(
+    flight: Path, quiet_domain: None, tmp_path: Path
+) -> None:
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     config = ROOT / "config" / "two_imus.yaml"
     command = [sys.executable, "-c", GRAPH, str(config), str(flight), str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False
+    )
     assert done.returncode == 0, done.stderr
     has = ast.literal_eval(done.stdout.strip().splitlines()[-1])
     # The injector subscribes to a topic once somebody listens behind it, which nobody does here.
     heard = has["injector_node"]["subscriber"]
-    heard[:] = sorted([*heard, *(f"/{topic}" for topic in Config.from_file(config).topics)])
+    heard[:] = sorted(
+        [*heard, *(f"/{topic}" for topic in Config.from_file(config).topics)]
+    )
     policy = ElementTree.parse(ROOT / "config" / "sros2_policy.xml")
     profiles = {profile.attrib["node"]: profile for profile in policy.iter("profile")}
     assert has == {
-        node: {role: sorted(full(str(one.text), node) for one in profile.findall(path)) for role, path in ROLES.items()}
+        node: {
+            role: sorted(full(str(one.text), node) for one in profile.findall(path))
+            for role, path in ROLES.items()
+        }
         for node, profile in profiles.items()
     }
-    assert not [rule for profile in profiles.values() for rule in profile if {*rule.attrib.values()} != {"ALLOW"}]
+    assert not [
+        rule
+        for profile in profiles.values()
+        for rule in profile
+        if {*rule.attrib.values()} != {"ALLOW"}
+    ]
     # What a vehicle's keystore is made of can inject nothing.
     enclaves = policy.getroot()[0]
-    inside = {place.attrib["path"]: [one.attrib["node"] for one in place.iter("profile")] for place in enclaves}
+    inside = {
+        place.attrib["path"]: [one.attrib["node"] for one in place.iter("profile")]
+        for place in enclaves
+    }
     bench = ["injector_node", "player_node"]
-    assert inside == {"/fdi": ["fdi_node"], "/fdi_link": ["mavlink_node"], "/fdi_bench": bench}
+    assert inside == {
+        "/fdi": ["fdi_node"],
+        "/fdi_link": ["mavlink_node"],
+        "/fdi_bench": bench,
+    }

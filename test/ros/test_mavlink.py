@@ -22,10 +22,15 @@ TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
 
 
 @contextlib.contextmanager
-def linked(stack: str, url: str, *remaps: str, **parameters: object) -> Iterator[tuple[Listener, Process]]:
+def linked(
+    stack: str, url: str, *remaps: str, **parameters: object
+) -> Iterator[tuple[Listener, Process]]:
     """The node of a link, and what hears it."""
     file = ROOT / "config" / f"{stack}.yaml"
-    with listening() as ears, running("mavlink_node", file, *remaps, url=url, **parameters) as process:
+    with (
+        listening() as ears,
+        running("mavlink_node", file, *remaps, url=url, **parameters) as process,
+    ):
         ears.speaker, ears.imu = "mavlink_node", [ears.hear(topic) for topic in TOPICS]
         yield ears, process
 
@@ -35,7 +40,10 @@ def linked_over_udp(
     *autopilots: Autopilot, remaps: tuple[str, ...] = (), **parameters: object
 ) -> Iterator[tuple[Listener, Process]]:
     port, stack = free_port(), autopilots[0].stack
-    with OverUdp(port, *autopilots), linked(stack, f"udpin:127.0.0.1:{port}", *remaps, **parameters) as pair:
+    with (
+        OverUdp(port, *autopilots),
+        linked(stack, f"udpin:127.0.0.1:{port}", *remaps, **parameters) as pair,
+    ):
         yield pair
 
 
@@ -52,18 +60,29 @@ def struck(autopilot: Autopilot, unit: int, axis: int) -> Callable[[], None]:
     return lambda: strikes.append(True)
 
 
-def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compiled) -> None:
+def test_px4_over_udp_is_chosen_among_two_monitored_and_told(
+    quiet_domain, compiled
+) -> None:
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
-    autopilot, other = (Autopilot("px4", system=system, seed=system) for system in (2, 1))
+    autopilot, other = (
+        Autopilot("px4", system=system, seed=system) for system in (2, 1)
+    )
     strike = struck(autopilot, 1, 1)
     with (
         running("fdi_node", ROOT / "config" / "px4.yaml") as monitor,
-        linked_over_udp(autopilot, other, named_values=True, system_id=2) as (ears, process),
+        linked_over_udp(autopilot, other, named_values=True, system_id=2) as (
+            ears,
+            process,
+        ),
     ):
-        assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
+        assert ears.says(
+            "link", "PX4, system 2; other autopilots on the link, left aside: 1"
+        )
         assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
         assert not other.intervals
-        assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), process.said()
+        assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), (
+            process.said()
+        )
         assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
         # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
         now = time.time_ns()
@@ -79,48 +98,77 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
         assert {command[0] for command in autopilot.commands} == {511}
 
 
-def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain, compiled, tmp_path) -> None:
+def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(
+    quiet_domain, compiled, tmp_path
+) -> None:
     """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
     autopilot = Autopilot("ardupilot", armed=True)
     strike = struck(autopilot, 0, 1)
-    remaps, failover = ("/fdi_node/integrity:=/verdict",), {"failover": "ardupilot", "failover_file": tmp_path / "out"}
+    remaps, failover = (
+        ("/fdi_node/integrity:=/verdict",),
+        {"failover": "ardupilot", "failover_file": tmp_path / "out"},
+    )
     with (
-        running("fdi_node", ROOT / "config" / "ardupilot.yaml", "~/integrity:=/verdict") as monitor,
+        running(
+            "fdi_node", ROOT / "config" / "ardupilot.yaml", "~/integrity:=/verdict"
+        ) as monitor,
         linked_over_udp(autopilot, remaps=remaps, **failover) as (ears, process),
     ):
         assert ears.says("failover", "ready"), process.said()
         assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
         stranger = ears.create_publisher(Imu, "imu_1/data_raw", 1)
-        assert ears.says("failover", "the monitor is in doubt"), "rates of another source"
+        assert ears.says("failover", "the monitor is in doubt"), (
+            "rates of another source"
+        )
         ears.destroy_publisher(stranger)
         ears.clear()
         assert ears.says("failover", "ready")
         strike()
-        assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
+        assert wait(lambda: autopilot.flies_with == 1), (
+            autopilot.sets,
+            process.said(),
+            monitor.said(),
+        )
         told = "FDI: IMU 1 (imu_1) out of use (gyro y"
         assert wait(lambda: any(text.startswith(told) for _, text in autopilot.texts))
         assert ears.says("failover", "out of use: IMU 1 (imu_1) of system 1")
-        assert ears.call(Trigger, "/mavlink_node/restore").message == "IMU 1 (imu_1) is put back"
+        assert (
+            ears.call(Trigger, "/mavlink_node/restore").message
+            == "IMU 1 (imu_1) is put back"
+        )
         assert wait(lambda: autopilot.flies_with == 0)
-        assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
+        assert {(name, value) for _, name, value in autopilot.sets} == {
+            ("INS_USE", 0.0),
+            ("INS_USE", 1.0),
+        }
         assert "failover over an unsigned link" in process.said()
 
 
-def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tmp_path) -> None:
+def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(
+    quiet_domain, tmp_path
+) -> None:
     autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
     file.write_text('{"system_id": 1, "out_of_use": [2]}')
-    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (ears, _):
+    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (
+        ears,
+        _,
+    ):
         assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
     assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
     autopilot.armed = False
-    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (ears, _):
+    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (
+        ears,
+        _,
+    ):
         assert ears.says("link", "ArduPilot, system 1")
     assert autopilot.parameters["INS_USE2"] == 1.0
     assert '"out_of_use": []' in file.read_text()
 
 
-def test_ardupilot_over_a_serial_line_that_comes_late_and_is_cut_while_it_restarts(quiet_domain, tmp_path) -> None:
+def test_ardupilot_over_a_serial_line_that_comes_late_and_is_cut_while_it_restarts(
+    quiet_domain, tmp_path
+) -> None:
     pytest.importorskip("serial", reason="serial lines need pyserial")
     device, autopilot = tmp_path / "device", Autopilot("ardupilot", loss=0.02)
     with linked("ardupilot", f"serial:{device}:57600") as (ears, process):

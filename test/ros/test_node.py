@@ -15,7 +15,12 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue, SetParametersResult
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, healthy, monitoring, struck
 from ros.processes import wait
 from sensor_msgs.msg import Imu
@@ -46,12 +51,16 @@ def listener(node) -> Listener:
     return listener
 
 
-def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(listener) -> None:
+def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(
+    listener,
+) -> None:
     # Long enough for a name, whatever other tests have taught the node.
     omega, z = struck(900, 200, seed=1)
     begin = time.monotonic()
     stamps = listener.play(z)
-    assert wait(lambda: len(listener.fused) == len(listener.integrity) == 900), len(listener.fused)
+    assert wait(lambda: len(listener.fused) == len(listener.integrity) == 900), len(
+        listener.fused
+    )
     took = time.monotonic() - begin
     assert listener.stamps() == stamps.tolist()
     # GDOP 1.4 with one channel lost.
@@ -63,16 +72,26 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(lis
     assert 0 <= declared - 200 < 8
     # The change is told at once, as one of a set or by name, and the rest once a second: by the samples that have been
     # heard, and not by a watch, as the machine may be busy.
-    known = [(at, s.level) for _, at, m in listener.diagnostics for s in m.status if s.name == "fdi_node: imu_2.y"]
+    known = [
+        (at, s.level)
+        for _, at, m in listener.diagnostics
+        for s in m.status
+        if s.name == "fdi_node: imu_2.y"
+    ]
     first = next(at for at, level in known if level == DiagnosticStatus.ERROR)
     assert declared - 20 < first < declared + 75
     assert 2 <= sum(not first - 25 < at < first + 25 for at, _ in known) <= took + 2
     assert listener.says("imu_2.y", "isolated")
     # The last report with it: by now the silence may be told.
-    report = [one for one in listener.reports() if "isolated" in one["imu_2.y"].message][-1]
+    report = [
+        one for one in listener.reports() if "isolated" in one["imu_2.y"].message
+    ][-1]
     status, whole = report["imu_2.y"], report["monitor"]
     assert (status.level, status.hardware_id) == (DiagnosticStatus.ERROR, "two_imus")
-    assert (whole.level, whole.message[:23]) == (DiagnosticStatus.WARN, "5 of 6 channels healthy")
+    assert (whole.level, whole.message[:23]) == (
+        DiagnosticStatus.WARN,
+        "5 of 6 channels healthy",
+    )
     assert report["imu_1.x"].level == DiagnosticStatus.OK
     assert "imu_2.y" in listener.trigger("reset").message
     assert listener.settle()
@@ -85,7 +104,13 @@ def test_no_message_stops_it_and_no_bad_value_reaches_the_output(listener) -> No
     stamps = listener.play(z)
     for stamp in (int(stamps[-1]), int(stamps[-5]), int(stamps[-1]) - 10**9):
         listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
-    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
+    for sec, nanosec in (
+        (2**31 - 1, 10**9 - 1),
+        (2**31 - 1, 2**32 - 1),
+        (-1, 0),
+        (-(2**31), 2**32 - 1),
+        (0, 10**9),
+    ):
         message = bytearray(ImuTemplate("imu").fill(0, (9.0, 9.0, 9.0), (0.0,) * 9))
         struct.pack_into("<iI", message, 4, sec, nanosec)
         for output in listener.outputs:
@@ -103,34 +128,56 @@ def test_no_message_stops_it_and_no_bad_value_reaches_the_output(listener) -> No
         ("input imu_1", "ahead", 1),
         ("input imu_2", "malformed", 4),
     ):
-        assert wait(lambda name=name, kind=kind, least=least: int(listener.value(name, kind)) >= least), kind
+        assert wait(
+            lambda name=name, kind=kind, least=least: (
+                int(listener.value(name, kind)) >= least
+            )
+        ), kind
     assert listener.says("input imu_1", "stamps going back")
     assert listener.says("input imu_2", "malformed")
 
 
-def test_the_rate_reaches_subscribers_of_either_kind_and_those_that_come_and_go(listener) -> None:
+def test_the_rate_reaches_subscribers_of_either_kind_and_those_that_come_and_go(
+    listener,
+) -> None:
     """The default of rclpy is reliable, sensor data are best effort."""
     reliable: list[bytes] = []
-    subscription = listener.create_subscription(Imu, "fused", reliable.append, 100, raw=True)
+    subscription = listener.create_subscription(
+        Imu, "fused", reliable.append, 100, raw=True
+    )
     assert wait(lambda: listener.play(healthy(5)[1]) is not None and reliable)
     time.sleep(0.1)
     reliable.clear()
     listener.clear()
     for _ in range(5):
-        passing = listener.create_subscription(Imu, "fused", lambda _: None, DEEP, raw=True)
+        passing = listener.create_subscription(
+            Imu, "fused", lambda _: None, DEEP, raw=True
+        )
         listener.play(healthy(20)[1])
         listener.destroy_subscription(passing)
-    assert wait(lambda: len(reliable) == len(listener.fused) == 100), (len(reliable), len(listener.fused))
+    assert wait(lambda: len(reliable) == len(listener.fused) == 100), (
+        len(reliable),
+        len(listener.fused),
+    )
     listener.destroy_subscription(subscription)
 
 
-def test_one_dead_topic_does_not_silence_the_rest_and_when_all_is_silent_all_is_stale(listener) -> None:
+def test_one_dead_topic_does_not_silence_the_rest_and_when_all_is_silent_all_is_stale(
+    listener,
+) -> None:
     z = healthy(250)[1]
     listener.play(z[:50])
     listener.play(z, triads=[0])
-    told = [report for report in listener.reports() if "no data" in report["imu_2.x"].message]
+    told = [
+        report
+        for report in listener.reports()
+        if "no data" in report["imu_2.x"].message
+    ]
     assert told
-    assert all(r["imu_2.x"].level == r["input imu_2"].level == DiagnosticStatus.STALE for r in told)
+    assert all(
+        r["imu_2.x"].level == r["input imu_2"].level == DiagnosticStatus.STALE
+        for r in told
+    )
     assert all(r["imu_1.x"].level != DiagnosticStatus.STALE for r in told)
     assert "silent for" in told[-1]["input imu_2"].message
     assert wait(lambda: len(listener.fused) >= 299)
@@ -138,7 +185,9 @@ def test_one_dead_topic_does_not_silence_the_rest_and_when_all_is_silent_all_is_
     assert wait(lambda: listener.status("input imu_2").level != DiagnosticStatus.STALE)
     listener.clear()
     assert listener.says("monitor", "no sample for")
-    assert {s.level for s in listener.diagnostics[-1][-1].status} == {DiagnosticStatus.STALE}
+    assert {s.level for s in listener.diagnostics[-1][-1].status} == {
+        DiagnosticStatus.STALE
+    }
 
 
 def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
@@ -152,9 +201,14 @@ def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
     assert wait(lambda: listener.value("monitor", "bias") == "learned")
 
 
-def test_a_second_publisher_on_an_input_is_named_and_forgotten_when_it_is_gone(node, listener) -> None:
+def test_a_second_publisher_on_an_input_is_named_and_forgotten_when_it_is_gone(
+    node, listener
+) -> None:
     second = listener.create_publisher(Imu, listener.outputs[0].topic_name, DEEP)
-    assert listener.says("input imu_1", "2 publishers on /imu_1/data_raw, expected one: /listener, /listener")
+    assert listener.says(
+        "input imu_1",
+        "2 publishers on /imu_1/data_raw, expected one: /listener, /listener",
+    )
     assert "2 publishers on /imu_1/data_raw" in node[1].said()
     listener.destroy_publisher(second)
     listener.clear()
@@ -182,8 +236,15 @@ def test_in_a_flood_inputs_are_polled_and_all_else_goes_on(node, listener) -> No
 
 
 def test_each_parameter_has_a_description_a_unit_and_a_range(listener) -> None:
-    names = ["detector.false_alarms_per_hour", "imus.timeout", "detector.name", "decision.confirm_alarms"]
-    answer = listener.call(DescribeParameters, "fdi_node/describe_parameters", names=names)
+    names = [
+        "detector.false_alarms_per_hour",
+        "imus.timeout",
+        "detector.name",
+        "decision.confirm_alarms",
+    ]
+    answer = listener.call(
+        DescribeParameters, "fdi_node/describe_parameters", names=names
+    )
     rate, timeout, detector, alarms = answer.descriptors
     assert "[1/h]" in rate.description
     assert rate.floating_point_range[0].to_value == 3.6e6
@@ -192,9 +253,14 @@ def test_each_parameter_has_a_description_a_unit_and_a_range(listener) -> None:
     assert alarms.integer_range[0].from_value == 1
 
 
-def test_what_changes_together_is_taken_over_whole_or_not_at_all(node, listener) -> None:
+def test_what_changes_together_is_taken_over_whole_or_not_at_all(
+    node, listener
+) -> None:
     def taken(detector: str, per_hour: float, probability: float) -> bool:
-        rate = {"detector__false_alarms_per_hour": per_hour, "detector__false_alarm_probability": probability}
+        rate = {
+            "detector__false_alarms_per_hour": per_hour,
+            "detector__false_alarm_probability": probability,
+        }
         return listener.set(detector__name=detector, **rate).successful
 
     assert taken("max_residual", 0.0, 1e-7)
@@ -203,7 +269,10 @@ def test_what_changes_together_is_taken_over_whole_or_not_at_all(node, listener)
     assert listener.value("monitor", "detector") == "max_residual"
     assert taken("likelihood_ratio", 0.001, 0.0)
     for values, words in (
-        ({"detector__name": "projector", "detector__false_alarms_per_hour": -5.0}, "-5"),
+        (
+            {"detector__name": "projector", "detector__false_alarms_per_hour": -5.0},
+            "-5",
+        ),
         ({"detector__name": "nonsense"}, "nonsense"),
         ({"excluded_channels": ["imu_9.x"]}, "imu_9.x"),
         ({"detector__false_alarms_per_hour": 0.0}, "both 0"),
@@ -215,8 +284,14 @@ def test_what_changes_together_is_taken_over_whole_or_not_at_all(node, listener)
         assert words in result.reason
         line = f"parameters refused: {result.reason}"
         # So many lines a second are logged; what was left out comes when it is asked for again.
-        assert wait(lambda line=line, values=values: line in node[1].said() or not listener.set(**values))
-    (name,) = listener.call(GetParameters, "fdi_node/get_parameters", names=["detector.name"]).values
+        assert wait(
+            lambda line=line, values=values: (
+                line in node[1].said() or not listener.set(**values)
+            )
+        )
+    (name,) = listener.call(
+        GetParameters, "fdi_node/get_parameters", names=["detector.name"]
+    ).values
     assert name.string_value == "likelihood_ratio"
 
 
@@ -230,25 +305,41 @@ def test_an_operator_takes_a_channel_out_and_back(listener) -> None:
 
 def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(node, listener) -> None:
     def value(kind: int) -> ParameterValue:
-        return ParameterValue(type=kind, double_value=0.5, integer_value=1, string_value="x")
+        return ParameterValue(
+            type=kind, double_value=0.5, integer_value=1, string_value="x"
+        )
 
     def ask(changes: list[ParameterMessage]) -> list[SetParametersResult]:
-        return listener.call(SetParameters, "fdi_node/set_parameters", parameters=changes).results
+        return listener.call(
+            SetParameters, "fdi_node/set_parameters", parameters=changes
+        ).results
 
-    changes = [ParameterMessage(name="detector.false_alarms_per_hour", value=value(kind)) for kind in range(256)]
-    odd = [ParameterMessage(name="", value=value(3)), ParameterMessage(name="x" * 10**6, value=value(4))]
+    changes = [
+        ParameterMessage(name="detector.false_alarms_per_hour", value=value(kind))
+        for kind in range(256)
+    ]
+    odd = [
+        ParameterMessage(name="", value=value(3)),
+        ParameterMessage(name="x" * 10**6, value=value(4)),
+    ]
     results = ask(changes[:MOST_PARAMETERS])
     # 3 is PARAMETER_DOUBLE; 2, a whole number, does for it.
     assert [k for k, result in enumerate(results) if result.successful] == [2, 3]
     assert "has type 200, expected a name and a type of 1 to 9" in results[200].reason
-    assert all(not result.successful and len(result.reason) < 5000 for result in ask(odd))
+    assert all(
+        not result.successful and len(result.reason) < 5000 for result in ask(odd)
+    )
     results = ask(changes + odd)
     assert len(results) == 258
     assert f"expected at most {MOST_PARAMETERS}" in results[-1].reason
     mixed = {"parameters": [changes[3], changes[200]]}
-    result = listener.call(SetParametersAtomically, "fdi_node/set_parameters_atomically", **mixed).result
+    result = listener.call(
+        SetParametersAtomically, "fdi_node/set_parameters_atomically", **mixed
+    ).result
     assert not result.successful
     assert "has type 200" in result.reason
     assert wait(lambda: "more lines, left out" in node[1].said(), 10.0)
     assert max(map(len, node[1].said().splitlines())) < 5000
-    assert listener.set(detector__false_alarms_per_hour=TWO_IMUS.detector.false_alarms_per_hour).successful
+    assert listener.set(
+        detector__false_alarms_per_hour=TWO_IMUS.detector.false_alarms_per_hour
+    ).successful

@@ -20,8 +20,26 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from ros.harness import GEOMETRY, RATE, TRANSITIONS, TWO_IMUS, connect, healthy, listening, monitoring, struck
-from ros.processes import ROOT, Process, assert_refused, parameter_file, rest, running, wait
+from ros.harness import (
+    GEOMETRY,
+    RATE,
+    TRANSITIONS,
+    TWO_IMUS,
+    connect,
+    healthy,
+    listening,
+    monitoring,
+    struck,
+)
+from ros.processes import (
+    ROOT,
+    Process,
+    assert_refused,
+    parameter_file,
+    rest,
+    running,
+    wait,
+)
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
@@ -31,7 +49,13 @@ from fdi_ros.monitor.pipeline import Pipeline
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 REFUSED = {
@@ -60,7 +84,10 @@ REFUSED = {
 def test_what_would_be_left_aside_refuses_the_start_in_one_line(tmp_path) -> None:
     other, held = tmp_path / "other.yaml", "{ros__parameters: {sample_rate: 5.0}}"
     other.write_text(f"{{another_node: {held}, a: {{fdi_node: {held}}}}}")
-    assert_refused("fdi_node", {start.replace("OTHER", str(other)): words for start, words in REFUSED.items()})
+    assert_refused(
+        "fdi_node",
+        {start.replace("OTHER", str(other)): words for start, words in REFUSED.items()},
+    )
 
 
 def test_without_ros_it_says_so_in_one_line() -> None:
@@ -68,7 +95,9 @@ def test_without_ros_it_says_so_in_one_line() -> None:
     for words in (("fdi_ros.ros.process", "fdi_node"), ("fdi_ros.cli", "watch")):
         done = python("-S", "-m", *words)
         assert done.returncode == 2
-        assert re.fullmatch(r"(fdi_node:|fdi: watch) needs ROS 2 Jazzy: .*\n", done.stderr), done.stderr
+        assert re.fullmatch(
+            r"(fdi_node:|fdi: watch) needs ROS 2 Jazzy: .*\n", done.stderr
+        ), done.stderr
 
 
 def test_names_of_statuses_carry_the_namespace_and_a_dump_loads_back(tmp_path) -> None:
@@ -110,7 +139,10 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
     with monitoring(TWO_IMUS, tmp_path, autostart=False) as (listener, process):
         change, state = listener.change, listener.state
         assert state() == "unconfigured"
-        assert "waiting for a lifecycle manager, or ros2 lifecycle set /fdi_node configure" in process.said()
+        assert (
+            "waiting for a lifecycle manager, or ros2 lifecycle set /fdi_node configure"
+            in process.said()
+        )
         # What would fail at the next transition is refused now, and the log says so too.
         refused = listener.set(excluded_channels=["imu_9.x"])
         assert not refused.successful
@@ -118,25 +150,39 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         assert wait(lambda: f"parameters refused: {refused.reason}" in process.said())
         # As often one that is possible as one that mostly is not, or that does not exist; until it is where it was.
         while refusals < 10 or now != "unconfigured":
-            wanted = int(random.choice(list(TRANSITIONS[now]) if random.random() < 0.5 else [1, 2, 3, 4, 9, 60, 255]))
+            wanted = int(
+                random.choice(
+                    list(TRANSITIONS[now])
+                    if random.random() < 0.5
+                    else [1, 2, 3, 4, 9, 60, 255]
+                )
+            )
             goal = TRANSITIONS[now].get(wanted)
             assert change(wanted) == (goal is not None), (now, wanted)
             refusals += goal is None
             now = goal or now
             assert state() == now
         # Not more lines a second than the log is bounded to; how many there were is said.
-        assert wait(lambda: " refused: not possible while " in process.said()), process.said()
+        assert wait(lambda: " refused: not possible while " in process.said()), (
+            process.said()
+        )
         left_out = sum(map(int, re.findall(r"and ([0-9]+) more lines", process.said())))
-        assert process.said().count(" refused: not possible while ") + left_out >= refusals
+        assert (
+            process.said().count(" refused: not possible while ") + left_out >= refusals
+        )
         assert "No transition matching" not in process.said()
         assert listener.count_publishers("fused") == 0
         assert change(Transition.TRANSITION_CONFIGURE)
         assert listener.says("monitor", "inactive")
         fresh = len(process.said())
         assert change(Transition.TRANSITION_ACTIVATE)
-        assert wait(lambda: "imu_1: no message yet on /imu_1/data_raw" in process.said()[fresh:])
+        assert wait(
+            lambda: "imu_1: no message yet on /imu_1/data_raw" in process.said()[fresh:]
+        )
         connect(listener, process)
-        assert wait(lambda: "imu_1: messages on /imu_1/data_raw\n" in process.said()[fresh:])
+        assert wait(
+            lambda: "imu_1: messages on /imu_1/data_raw\n" in process.said()[fresh:]
+        )
         assert listener.settle()
         assert change(Transition.TRANSITION_DEACTIVATE)
         listener.clear()
@@ -161,7 +207,10 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
 
 def test_simulated_time_rules_silence(tmp_path) -> None:
     """Ten times real time: what is silent for 0.03 s by the wall is silent for 0.3 s by the clock."""
-    with monitoring(TWO_IMUS, tmp_path, prime=False, use_sim_time=True) as (listener, process):
+    with monitoring(TWO_IMUS, tmp_path, prime=False, use_sim_time=True) as (
+        listener,
+        process,
+    ):
         clock = listener.create_publisher(Clock, "/clock", 10)
         assert wait(lambda: clock.get_subscription_count() == 1)
         origin = 1000 * 10**9
@@ -170,7 +219,9 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
             """Samples every 20 ms of simulated time, some 2 ms of the wall; each when the one before has passed."""
             for row in samples:
                 known = len(listener.fused)
-                clock.publish(Clock(clock=Time(sec=stamp // 10**9, nanosec=stamp % 10**9)))
+                clock.publish(
+                    Clock(clock=Time(sec=stamp // 10**9, nanosec=stamp % 10**9))
+                )
                 for j in triads:
                     listener.send_imu(j, stamp, row[3 * j : 3 * j + 3])
                 wait(lambda known=known: len(listener.fused) > known, 0.01)
@@ -187,7 +238,13 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
             first, second = (levels.get(f"fdi_node: input imu_{k}") for k in (1, 2))
             return second == DiagnosticStatus.STALE != first
 
-        end = play(takewhile(lambda _: not only_the_second_is_silent(), islice(cycle(z), 50_000)), end, triads=[0])
+        end = play(
+            takewhile(
+                lambda _: not only_the_second_is_silent(), islice(cycle(z), 50_000)
+            ),
+            end,
+            triads=[0],
+        )
         assert only_the_second_is_silent()
         assert listener.says("input imu_2", "silent for")
         end = play(z, end)
@@ -207,10 +264,15 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
 
 def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) -> None:
     """Here by the SingleThreadedExecutor, elsewhere by the EventsExecutor."""
-    axes = {"geometry.preset": "axes", "geometry.axes": GEOMETRY.axes.reshape(-1).tolist()}
+    axes = {
+        "geometry.preset": "axes",
+        "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
+    }
     # The default learns of noise and delays, each node its own.
     detector = {"detector.name": "likelihood_ratio"}
-    config = TWO_IMUS.replaced({"input": "channels", "channels.topic": "gyros", **axes, **detector})
+    config = TWO_IMUS.replaced(
+        {"input": "channels", "channels.topic": "gyros", **axes, **detector}
+    )
     with monitoring(config, tmp_path, executor="single") as (listener, process):
         # The first samples are not checked yet.
         assert wait(lambda: listener.prime() or not listener.states()[-1].any())
@@ -226,13 +288,18 @@ def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) 
         assert wait(lambda: len(listener.fused) >= 450), len(listener.fused)
         # A busy machine may have kept one of those before.
         rest(lambda: len(listener.fused) + len(listener.integrity))
-        stamps, states, rates = (told[-450:] for told in (listener.stamps(), listener.states(), listener.rates()))
+        stamps, states, rates = (
+            told[-450:]
+            for told in (listener.stamps(), listener.states(), listener.rates())
+        )
         assert stamps == sorted(set(stamps))
         assert listener.says("g5", "isolated")
         assert wait(lambda: listener.value("input gyros", "malformed") == "4")
         pipeline = Pipeline.from_config(config)
         # As the node's, it has seen healthy samples.
-        pipeline.process(Block(stamps[0] - 4_000_000 * np.arange(50, 0, -1), healthy(50, seed=99)[1]))
+        pipeline.process(
+            Block(stamps[0] - 4_000_000 * np.arange(50, 0, -1), healthy(50, seed=99)[1])
+        )
         output = pipeline.process(Block(np.array(stamps), z))
         np.testing.assert_array_equal(states, output.state)
         np.testing.assert_array_equal(rates, output.rate)
@@ -240,13 +307,25 @@ def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) 
         process.popen.send_signal(signal.SIGTERM)
 
 
-def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(tmp_path, compiled) -> None:
+def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(
+    tmp_path, compiled
+) -> None:
     file, remap = parameter_file(TWO_IMUS, tmp_path), "imu_2/data_raw:=imu_1/data_raw"
-    with listening(TWO_IMUS.topics) as listener, running("fdi_node", file, remap) as process:
-        assert wait(lambda: listener.outputs[0].get_subscription_count() > 1), process.said()
+    with (
+        listening(TWO_IMUS.topics) as listener,
+        running("fdi_node", file, remap) as process,
+    ):
+        assert wait(lambda: listener.outputs[0].get_subscription_count() > 1), (
+            process.said()
+        )
         listener.play(healthy(1250)[1], triads=(0,))
-        assert listener.says("monitor", "(imu_1/data_raw) and imu_2 (imu_2/data_raw) give the same values")
-        assert listener.says("input imu_2", "imu_2 and imu_1 read the same topic /imu_1/data_raw")
+        assert listener.says(
+            "monitor",
+            "(imu_1/data_raw) and imu_2 (imu_2/data_raw) give the same values",
+        )
+        assert listener.says(
+            "input imu_2", "imu_2 and imu_1 read the same topic /imu_1/data_raw"
+        )
         assert listener.says("imu_2.x", "one sensor, no redundancy")
         assert wait(lambda: (listener.states()[-1][3:] == ChannelState.UNCHECKED).all())
 
@@ -258,7 +337,9 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
                 listener.send_imu(j, 0, [0.0, 0.0, 0.0])
             time.sleep(1 / RATE)
         assert listener.says("input imu_1", "stamps are not set")
-        warned = [line for line in process.said().splitlines() if "stamps are not set" in line]
+        warned = [
+            line for line in process.said().splitlines() if "stamps are not set" in line
+        ]
         assert ["[WARN]" in line for line in warned] == [True, True]
         assert "/imu_1/data_raw: stamps are not set" in warned[0]
 
@@ -276,7 +357,9 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         listener.calm()
         listener.play(healthy(500)[1])
         for name in ("imu_1", "imu_2"):
-            assert wait(lambda name=name: listener.status(f"input {name}").message == "delivers")
+            assert wait(
+                lambda name=name: listener.status(f"input {name}").message == "delivers"
+            )
 
         # Both far from now: the time begins anew when both units agree on it.
         listener.clear()

@@ -27,14 +27,25 @@ from fdi_ros.ros.watch import REMEMBERED, LineReport, Picture, Watcher, draw
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
 
-def channel(name: str, state: str, level: Level = Level.OK, words: str = "", **values: float) -> StatusLine:
-    keys = {"residual": "residual (rad/s)", "bias": "bias (rad/s)", "std": "bias known to (rad/s)"}
+def channel(
+    name: str, state: str, level: Level = Level.OK, words: str = "", **values: float
+) -> StatusLine:
+    keys = {
+        "residual": "residual (rad/s)",
+        "bias": "bias (rad/s)",
+        "std": "bias known to (rad/s)",
+    }
     pairs = tuple((keys[key], str(value)) for key, value in values.items())
     return StatusLine(level, name, words, values=(("state", state), *pairs))
 
 
 def whole(message: str, **more: str) -> StatusLine:
-    figures = {"statistic": "3.1", "threshold": "19.7", "protection level (rad/s)": "0.01 0.02 0.03", **more}
+    figures = {
+        "statistic": "3.1",
+        "threshold": "19.7",
+        "protection level (rad/s)": "0.01 0.02 0.03",
+        **more,
+    }
     return StatusLine(Level.WARN, "monitor", message, values=tuple(figures.items()))
 
 
@@ -43,9 +54,19 @@ def picture() -> Picture:
     """Twelve channels, one of them faulty."""
     names = [f"imu_{unit}.{axis}" for unit in (1, 2, 3, 4) for axis in "xyz"]
     seen = Picture("/drone/fdi_node", "", "", rate=(0.5, -1.25, 0.0))
-    healthy = {name: channel(name, "OK", words="agrees", residual=0.001) for name in names}
+    healthy = {
+        name: channel(name, "OK", words="agrees", residual=0.001) for name in names
+    }
     seen.update_channels(healthy)
-    faulty = channel("imu_2.y", "FAULTY", Level.ERROR, WORDS, residual=-0.149, bias=0.0021, std=0.0003)
+    faulty = channel(
+        "imu_2.y",
+        "FAULTY",
+        Level.ERROR,
+        WORDS,
+        residual=-0.149,
+        bias=0.0021,
+        std=0.0003,
+    )
     seen.update_channels(healthy | {"imu_2.y": faulty})
     seen.whole = whole("11 of 12 channels healthy; a further fault would be isolated")
     seen.inputs = [StatusLine(Level.STALE, "imu_3", "silent for 1.2 s")]
@@ -56,14 +77,18 @@ def picture() -> Picture:
 
 def drawn(picture: Picture, width: int) -> list[str]:
     """Lines that are shown in a terminal."""
-    console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
+    console = pytest.importorskip(
+        "rich.console", reason="the extra 'watch' is not installed"
+    )
     out = io.StringIO()
     console.Console(file=out, width=width).print(draw(picture, width))
     return out.getvalue().splitlines()
 
 
 @pytest.mark.parametrize("width", [40, 80, 120])
-def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture, width: int) -> None:
+def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(
+    picture: Picture, width: int
+) -> None:
     lines = drawn(picture, width)
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
@@ -72,7 +97,9 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture,
     assert "input imu_3: silent for 1.2 s" in text
     (row,) = [line for line in lines if line.startswith("imu_2.y")]
     assert "FAULTY" in row
-    assert row.split("-0.1490")[1].split() == (["+0.0021", "+-", "0.0003"] if width > 90 else [])
+    assert row.split("-0.1490")[1].split() == (
+        ["+0.0021", "+-", "0.0003"] if width > 90 else []
+    )
     (evidence,) = [line for line in lines if line.startswith("evidence")]
     assert "3.1 of 19.7" in evidence
     # The bar ends at 0.2 rad/s, and where the names of states and the figures begin.
@@ -90,7 +117,9 @@ def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> Non
     assert all(row.split()[1:] == ["?", "none"] for row in rows)
 
 
-def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Picture) -> None:
+def test_each_change_is_reported_once_and_the_whole_when_it_is_new(
+    picture: Picture,
+) -> None:
     report = LineReport(picture)
     said = [line.split("  ", 1)[1] for line in report.lines()]
     assert said[:2] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
@@ -98,11 +127,15 @@ def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Pict
     assert report.lines() == []
     # Alike with the same words: in one line.
     doubtful = channel("imu_1.x", "SUSPECT", Level.WARN, "disagrees", residual=0.1)
-    picture.update_channels({**picture.channels, "imu_1.x": doubtful, "imu_1.y": doubtful})
+    picture.update_channels(
+        {**picture.channels, "imu_1.x": doubtful, "imu_1.y": doubtful}
+    )
     picture.whole = whole("9 of 12")
     said = [line.split("  ", 1)[1] for line in report.lines()]
     assert said[0] == "imu_1.x, imu_1.y  OK -> SUSPECT: disagrees"
-    assert said[1].startswith("9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7")
+    assert said[1].startswith(
+        "9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7"
+    )
     # More than is remembered: those that are.
     for _ in range(2 * REMEMBERED):
         before = {**picture.channels}
@@ -117,7 +150,13 @@ EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
 def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
     evil = channel(EVIL, "SUSPECT", Level.WARN, EVIL, residual=0.1, bias=0.0, std=0.0)
     picture.update_channels({EVIL: evil} | {**picture.channels})
-    keys = ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector", "protection level (rad/s)")
+    keys = (
+        "sample rate (Hz)",
+        "latency p50 (ms)",
+        "latency p99 (ms)",
+        "detector",
+        "protection level (rad/s)",
+    )
     picture.whole = whole(EVIL, **dict.fromkeys(keys, EVIL))
     picture.waiting = picture.monitor = picture.caption = EVIL
     report = LineReport(picture)
@@ -127,30 +166,53 @@ def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
     for level in (Level.OK, Level.WARN):
         picture.inputs = [StatusLine(level, EVIL, EVIL, values=(("rate (Hz)", EVIL),))]
         said += drawn(picture, 500)
-    assert all(line.isprintable() for line in said), [line for line in said if not line.isprintable()]
+    assert all(line.isprintable() for line in said), [
+        line for line in said if not line.isprintable()
+    ]
     assert len([line for line in said if "[/red][bold]" in line]) >= 12
 
 
 def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> None:
     path, file = tmp_path / "said", parameter_file(TWO_IMUS, tmp_path)
-    with path.open("w") as out, listening(tuple(f"/drone/{topic}" for topic in TWO_IMUS.topics)) as listener:
+    with (
+        path.open("w") as out,
+        listening(tuple(f"/drone/{topic}" for topic in TWO_IMUS.topics)) as listener,
+    ):
         command = [sys.executable, "-m", "fdi_ros.cli", "watch"]
         # A suite in the background may have been told to ignore the signal that ends this.
         obeys = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-        watch = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=ROOT, preexec_fn=obeys)
-        assert wait(lambda: "waiting for a monitor (fdi_node) on ROS_DOMAIN_ID" in path.read_text()), path.read_text()
+        watch = subprocess.Popen(
+            command, stdout=out, stderr=subprocess.STDOUT, cwd=ROOT, preexec_fn=obeys
+        )
+        assert wait(
+            lambda: (
+                "waiting for a monitor (fdi_node) on ROS_DOMAIN_ID" in path.read_text()
+            )
+        ), path.read_text()
         with running("fdi_node", file, "__ns:=/drone", "fused:=rate") as monitor:
             z = healthy(50)[1]
             # The node starts within this time, too.
-            assert wait(lambda: listener.play(z) is not None and "6 of 6 channels healthy" in path.read_text(), 240)
+            assert wait(
+                lambda: (
+                    listener.play(z) is not None
+                    and "6 of 6 channels healthy" in path.read_text()
+                ),
+                240,
+            )
             assert "| fused rate +" in path.read_text()
             z[:, 4] += 0.3
             named = re.compile("  imu_2.y  .*-> FAULTY: disagrees")
-            assert wait(lambda: listener.play(z) is not None and named.search(path.read_text()))
+            assert wait(
+                lambda: listener.play(z) is not None and named.search(path.read_text())
+            )
             # Another one: which is meant must be said.
-            listener.create_service(Trigger, "/other/relearn_bias", lambda _, answer: answer)
+            listener.create_service(
+                Trigger, "/other/relearn_bias", lambda _, answer: answer
+            )
             watcher = Watcher()
-            with pytest.raises(FdiError, match=r"2 monitors are running.*/drone/fdi_node, /other"):
+            with pytest.raises(
+                FdiError, match=r"2 monitors are running.*/drone/fdi_node, /other"
+            ):
                 wait(watcher.look)
             watcher.destroy_node()
             # What no monitor says is left aside.
@@ -158,16 +220,33 @@ def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> Non
             assert wait(lambda: odd.get_subscription_count() > 1)
             for state, level in (("WELL", 0), ("OK", 9)):
                 values = [KeyValue(key="state", value=state)]
-                status = DiagnosticStatus(level=bytes([level]), name="drone/fdi_node: imu_1.x", values=values)
+                status = DiagnosticStatus(
+                    level=bytes([level]), name="drone/fdi_node: imu_1.x", values=values
+                )
                 odd.publish(DiagnosticArray(status=[status]))
             # One that hangs is missed as one that was killed: DDS keeps both.
             monitor.popen.send_signal(signal.SIGSTOP)
-            assert wait(lambda: "/drone/fdi_node is silent: it was killed or hangs" in path.read_text())
+            assert wait(
+                lambda: (
+                    "/drone/fdi_node is silent: it was killed or hangs"
+                    in path.read_text()
+                )
+            )
             monitor.popen.send_signal(signal.SIGCONT)
-        assert wait(lambda: "/drone/fdi_node is gone: waiting for it to come back" in path.read_text())
+        assert wait(
+            lambda: (
+                "/drone/fdi_node is gone: waiting for it to come back"
+                in path.read_text()
+            )
+        )
         known, z = len(path.read_text()), healthy(50)[1]
         with running("fdi_node", file, "__ns:=/drone", "/diagnostics:=/x/diagnostics"):
-            assert wait(lambda: listener.play(z) is not None and "6 of 6 channels" in path.read_text()[known:])
+            assert wait(
+                lambda: (
+                    listener.play(z) is not None
+                    and "6 of 6 channels" in path.read_text()[known:]
+                )
+            )
         watch.send_signal(signal.SIGINT)
         assert watch.wait(60) == 0
     assert "Traceback" not in path.read_text()

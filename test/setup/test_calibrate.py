@@ -76,14 +76,23 @@ def armed_thrice(block):
     return Block(block.stamp[kept], block.z[kept])
 
 
-@pytest.mark.parametrize(("rate", "change"), [(10.0, None), (25.0, None), (100.0, slow_units), (100.0, armed_thrice)])
+@pytest.mark.parametrize(
+    ("rate", "change"),
+    [(10.0, None), (25.0, None), (100.0, slow_units), (100.0, armed_thrice)],
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_recording_gives_settings_with_errors_as_stated(kind, rate, change):
     one = vehicle(7, kind, 3, rate)
     result = calibrate(one.block if change is None else change(one.block), one.config)
     assert np.abs((result.axes - one.axes) / result.axes_std).max() < 4.0
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 4.0
-    assert np.abs((result.estimate.delay[::3] - one.late)[1:] / result.estimate.delay_std[3::3]).max() < 4.0
+    assert (
+        np.abs(
+            (result.estimate.delay[::3] - one.late)[1:]
+            / result.estimate.delay_std[3::3]
+        ).max()
+        < 4.0
+    )
     assert result.estimate.delay_std.max() < (1e-3 if rate > 10.0 else 2e-3)
     assert result.scale[0] < (2e-3 if rate > 10.0 else 3e-3)
     assert not result.faults
@@ -104,7 +113,11 @@ def test_an_axis_never_turned_is_named_and_stays_as_configured():
     rate = (one.block.z - bias) @ np.linalg.pinv(one.axes).T
     still = Block(one.block.stamp, one.block.z - np.outer(rate[:, 2], one.axes[:, 2]))
     result = calibrate(still, one.config)
-    (line,) = (line for line in said(result, Role.UNKNOWN) if "rotation" in line or "turns" in line)
+    (line,) = (
+        line
+        for line in said(result, Role.UNKNOWN)
+        if "rotation" in line or "turns" in line
+    )
     assert line.startswith("scale factors along z: not measured (no turns about z")
     assert not result.measured.all()
     assert np.abs(result.axes - one.nominal.axes)[:, 2].max() < 0.015
@@ -117,11 +130,21 @@ def test_vibration_that_units_see_differently_teaches_no_scale_factor(response):
     t = seconds(one.block)
     z = NOISE * rng.standard_normal((len(t), 9))
     for frequency in (3.0, 7.7, 12.7, 43.0):
-        gain = one.nominal.axes @ rng.uniform(0.02, 0.06, 3) * (1.0 + response * rng.uniform(-1.0, 1.0, 9))
+        gain = (
+            one.nominal.axes
+            @ rng.uniform(0.02, 0.06, 3)
+            * (1.0 + response * rng.uniform(-1.0, 1.0, 9))
+        )
         phase = rng.uniform(0.0, 6.0) + response * rng.uniform(-1.0, 1.0, 9)
-        z += np.where(t[:, None] > 20.0, gain * np.sin(2.0 * np.pi * frequency * t[:, None] + phase), 0.0)
+        z += np.where(
+            t[:, None] > 20.0,
+            gain * np.sin(2.0 * np.pi * frequency * t[:, None] + phase),
+            0.0,
+        )
     result = calibrate(Block(one.block.stamp, z), one.config)
-    assert "scale factors: not measured (no turns" in " ".join(said(result, Role.UNKNOWN))
+    assert "scale factors: not measured (no turns" in " ".join(
+        said(result, Role.UNKNOWN)
+    )
     assert (np.abs(result.factor - 1.0) < 3.0 * result.factor_error).all()
     assert np.abs(result.factor - 1.0).max() < 0.02
 
@@ -164,8 +187,16 @@ def test_contradictions_are_refused_and_named():
         with pytest.raises(CalibrationError, match=words):
             calibrate(Block(stamp, change), config)
 
-    refused(r"imu_2 shows 5\d.\d times the rotation that imu_1 and imu_3 show", np.s_[3:6], 57.3 * z[:, 3:6])
-    refused(r"imu_2 shows a roll to the right as one to the left, against imu_1 and imu_3: mend", 3, -z[:, 3])
+    refused(
+        r"imu_2 shows 5\d.\d times the rotation that imu_1 and imu_3 show",
+        np.s_[3:6],
+        57.3 * z[:, 3:6],
+    )
+    refused(
+        r"imu_2 shows a roll to the right as one to the left, against imu_1 and imu_3: mend",
+        3,
+        -z[:, 3],
+    )
     swapped = "imu_3 has swapped axes: its channels x, y, z are y, z, x of its mount as configured, against imu_1 and"
     refused(swapped, [6, 7, 8], z[:, [7, 8, 6]])
     noise = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(z))
@@ -174,8 +205,14 @@ def test_contradictions_are_refused_and_named():
     late = np.s_[len(z) // 4 :]
     refused(off, 4, z[late, 4] + 0.1, rows=late)
     for words, block in (
-        (r"1\.0 s long, a calibration needs at least 10 s", Block(stamp[:100], z[:100])),
-        (r"^the recording has \d\d samples, a calibration needs at least 100$", Block(stamp[::100], z[::100])),
+        (
+            r"1\.0 s long, a calibration needs at least 10 s",
+            Block(stamp[:100], z[:100]),
+        ),
+        (
+            r"^the recording has \d\d samples, a calibration needs at least 100$",
+            Block(stamp[::100], z[::100]),
+        ),
         (
             r"^the recording has a sample every 10 s, a calibration needs one every 1 s$",
             Block(stamp[0] + 100 * (stamp[::10] - stamp[0]), z[::10]),
@@ -185,7 +222,9 @@ def test_contradictions_are_refused_and_named():
             calibrate(block, wide)
     dead = z.copy()
     dead[:, 5] = noise
-    result = calibrate(Block(stamp, dead), one.config.replaced({"excluded_channels": ["imu_2.z"]}))
+    result = calibrate(
+        Block(stamp, dead), one.config.replaced({"excluded_channels": ["imu_2.z"]})
+    )
     assert len(result.names) == 8
     assert len(result.settings["geometry.axes"]) == 27
 
@@ -194,11 +233,18 @@ def test_the_monitor_waits_for_units_that_are_late():
     one, late = hand(), hand().block.z.copy()
     late[:, 3:6] = np.roll(late[:, 3:6], 9, axis=0)
     result = calibrate(Block(one.block.stamp, late)[20:], one.config)
-    assert result.settings["imus.timeout"] > 2 * np.ptp(result.settings["imus.delays"]) > 0.15
+    assert (
+        result.settings["imus.timeout"]
+        > 2 * np.ptp(result.settings["imus.delays"])
+        > 0.15
+    )
 
 
 def test_a_noisy_channel_hides_no_rest():
-    one, z = made(0, "flight with rest")[0], made(0, "flight with rest")[0].block.z.copy()
+    one, z = (
+        made(0, "flight with rest")[0],
+        made(0, "flight with rest")[0].block.z.copy(),
+    )
     z[:, 8] += 0.05 * np.random.default_rng(8).standard_normal(len(z))
     result = calibrate(Block(one.block.stamp, z), one.config)
     np.testing.assert_allclose(result.estimate.floor.std[:8], NOISE, rtol=0.15)
@@ -212,8 +258,13 @@ def test_a_reference_is_believed():
 
 
 def test_axes_of_an_array_are_found_from_those_of_its_first_three():
-    one, array = hand(), {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "cone"}
-    config = Config.from_parameters({**array, "geometry.cone_channels": 6, "sample_rate": one.config.sample_rate})
+    one, array = (
+        hand(),
+        {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "cone"},
+    )
+    config = Config.from_parameters(
+        {**array, "geometry.cone_channels": 6, "sample_rate": one.config.sample_rate}
+    )
     result = calibrate(Block(one.block.stamp, one.block.z[:, :6]), config)
     np.testing.assert_allclose(result.axes[:3], result.nominal[:3], atol=1e-5)
     true = one.axes[:6] @ np.linalg.solve(one.axes[:3], result.nominal[:3])
@@ -222,13 +273,20 @@ def test_axes_of_an_array_are_found_from_those_of_its_first_three():
 
 
 def test_exact_repeats_are_not_data():
-    stamp, z, coarse = hand().block.stamp, hand().block.z.copy(), np.round(hand().block.z, 2)
+    stamp, z, coarse = (
+        hand().block.stamp,
+        hand().block.z.copy(),
+        np.round(hand().block.z, 2),
+    )
     z[-600:] = 0.0
     # So coarse that at rest hardly any value changes: that is rest.
     coarse[:1000] = coarse[0]
     coarse[np.arange(0, 1000, 60), 2] += 0.01
     for values, repeated in ((z, 600), (coarse, 0)):
-        assert (prepare(Block(stamp, values), np.full(9, 35.0)).unusable["repeated"] == repeated).all()
+        assert (
+            prepare(Block(stamp, values), np.full(9, 35.0)).unusable["repeated"]
+            == repeated
+        ).all()
 
 
 def test_units_20_to_40_ms_apart_in_a_real_flight(root):
@@ -236,17 +294,31 @@ def test_units_20_to_40_ms_apart_in_a_real_flight(root):
     if not folder.exists():
         pytest.skip(f"the recordings of a real flight are not here: {folder}")
     config = Config.from_parameters(
-        {"input": "imus", "imus.topics": [f"/imu_{k}/data_raw" for k in (1, 2, 3, 4)], "sample_rate": 120.0}
+        {
+            "input": "imus",
+            "imus.topics": [f"/imu_{k}/data_raw" for k in (1, 2, 3, 4)],
+            "sample_rate": 120.0,
+        }
     )
     result = calibrate(read_block(folder / "h20", config), config)
-    assert result.settings["imus.delays"] == [0.0, *(pytest.approx(d, abs=0.006) for d in (-0.026, -0.030, 0.014))]
+    assert result.settings["imus.delays"] == [
+        0.0,
+        *(pytest.approx(d, abs=0.006) for d in (-0.026, -0.030, 0.014)),
+    ]
     assert result.scale[0] < 0.005
     assert not result.faults
 
 
 def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     output, report = tmp_path / "new.yaml", tmp_path / "report.html"
-    words = ("calibrate", recording, "--config", CONFIG / "three_imus.yaml", "--end", 180)
+    words = (
+        "calibrate",
+        recording,
+        "--config",
+        CONFIG / "three_imus.yaml",
+        "--end",
+        180,
+    )
     code, out, _ = fdi(*words, "--output", output, "--report", report)
     assert code == 0
     assert "kept aside" in out
@@ -258,7 +330,11 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     assert "exists already" in refused(*words, "--output", output)
     # A former result is replaced where it is asked for, a file that a person wrote never is.
     mine = tmp_path / "mine.yaml"
-    mine.write_text("# Calibrated: last week\n" + (CONFIG / "three_imus.yaml").read_text())
-    assert "mine.yaml is no result of fdi" in refused(*words, "--output", mine, "--force")
+    mine.write_text(
+        "# Calibrated: last week\n" + (CONFIG / "three_imus.yaml").read_text()
+    )
+    assert "mine.yaml is no result of fdi" in refused(
+        *words, "--output", mine, "--force"
+    )
     check_target(output, Kind.PARAMETERS, force=True)
     check_target(report, Kind.PAGE, force=True)

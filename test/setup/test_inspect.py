@@ -7,13 +7,28 @@ import json
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_messages, write_mcap
+from bag.recordings import (
+    ARRAY,
+    START,
+    STEP,
+    TOPICS,
+    array,
+    flight,
+    imu,
+    imu_messages,
+    write_mcap,
+)
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.inspect import inspect, recording_text, topics_text
-from fdi_ros.setup.starting_config import NEEDED, candidates, starting_config, starting_config_of
+from fdi_ros.setup.starting_config import (
+    NEEDED,
+    candidates,
+    starting_config,
+    starting_config_of,
+)
 
 
 def test_rates_gaps_and_noise_are_found(tmp_path):
@@ -23,10 +38,17 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", kept))
     first, second = reports
     assert damage == ()
-    assert (first.received, first.gaps, second.received, second.gaps) == (2000, 0, 1960, 1)
+    assert (first.received, first.gaps, second.received, second.gaps) == (
+        2000,
+        0,
+        1960,
+        1,
+    )
     assert first.rate == pytest.approx(100)
     assert second.longest == pytest.approx(0.41, abs=1e-6)
-    np.testing.assert_allclose([one.segments.noise().quiet for one in reports], 0.002, rtol=0.15)
+    np.testing.assert_allclose(
+        [one.segments.noise().quiet for one in reports], 0.002, rtol=0.15
+    )
     assert first.largest == pytest.approx(1.4, abs=0.2)
 
 
@@ -35,15 +57,24 @@ def test_what_could_be_gyros_and_what_could_not(tmp_path):
     messages = []
     for k in range(200):
         at = START + k * STEP
-        messages += [("/six", at, array(list(random.normal(0, 0.01, 6)))), ("/three", at, array([1.0, 2.0, 3.0]))]
+        messages += [
+            ("/six", at, array(list(random.normal(0, 0.01, 6)))),
+            ("/three", at, array([1.0, 2.0, 3.0])),
+        ]
         messages += [("/imu", at, imu(at, random.normal(0, 0.01, 3)))]
     types = {"/six": ARRAY, "/three": ARRAY}
     reports, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages, types=types))
-    assert {report.topic.name for report in reports if report.could_be_gyros} == {"/six", "/imu"}
+    assert {report.topic.name for report in reports if report.could_be_gyros} == {
+        "/six",
+        "/imu",
+    }
     (chosen,) = candidates(reports)
     assert chosen.topic.name == "/six"
     settings = starting_config([chosen], tmp_path).parameters
-    assert (settings["channels.topic"], settings["geometry.cone_channels"]) == ("/six", 6)
+    assert (settings["channels.topic"], settings["geometry.cone_channels"]) == (
+        "/six",
+        6,
+    )
     assert settings["noise.noise_std"][0] == pytest.approx(0.01, rel=0.3)
 
 
@@ -54,9 +85,14 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
     # One value again and again, on the one topic for long: in chunks that end anywhere.
     for k in range(200):
         rate = (0.5, 0.01 * k, 0.5) if k < 150 else (0.01 * k, 0.01 * k, 0.5)
-        messages += [(TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))]
+        messages += [
+            (TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))
+        ]
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
-    assert [report.repeats.count.tolist() for report in reports] == [[150, 0, 200], [0, 0, 0]]
+    assert [report.repeats.count.tolist() for report in reports] == [
+        [150, 0, 200],
+        [0, 0, 0],
+    ]
     text = topics_text(reports, damage)
     assert "frozen: 150 of x and 200 of z" in text
     assert "1 malformed" in text
@@ -64,7 +100,9 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
 
 
 @pytest.mark.parametrize("which", ["flight", "recording"])
-def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, request, tmp_path):
+def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(
+    which, request, tmp_path
+):
     path = request.getfixturevalue(which)
     chosen = candidates(inspect(path)[0])
     (tmp_path / "start.yaml").write_text(starting_config(chosen, path).text)
@@ -76,13 +114,25 @@ def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, re
 
 
 def test_after_a_fault_of_a_flight_log_the_next_one_can_be_named(root):
-    assert starting_config_of(root / "bags" / "copter_crash.tlog", "refused").parameters["decision.latch"] is False
+    assert (
+        starting_config_of(root / "bags" / "copter_crash.tlog", "refused").parameters[
+            "decision.latch"
+        ]
+        is False
+    )
 
 
-def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_written_where_it_mostly_moves(tmp_path):
+def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_written_where_it_mostly_moves(
+    tmp_path,
+):
     k = np.arange(3000)[:, None]
     # Vibration just below half the rate, twice as large on y; and turns that are no noise.
-    shake = 0.05 * np.sqrt(2) * np.cos(2 * np.pi * 47 * k * 0.01 + np.array([0, 1, 2])) * [1, 2, 1]
+    shake = (
+        0.05
+        * np.sqrt(2)
+        * np.cos(2 * np.pi * 47 * k * 0.01 + np.array([0, 1, 2]))
+        * [1, 2, 1]
+    )
     turn = np.array([1.0, 0.5, 0.3]) * np.sin(2 * np.pi * 0.4 * k * 0.01)
     z = np.tile((k >= 800) * (shake + turn), 2)
     z += np.random.default_rng(1).normal(0, [0.002] * 3 + [0.004] * 3, (3000, 6))
@@ -91,22 +141,32 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_writte
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     for report, quiet in zip(reports, (0.002, 0.004), strict=True):
         np.testing.assert_allclose(report.segments.noise().quiet, quiet, rtol=0.2)
-        np.testing.assert_allclose(report.segments.noise().moving, [0.05, 0.1, 0.05], rtol=0.1)
+        np.testing.assert_allclose(
+            report.segments.noise().moving, [0.05, 0.1, 0.05], rtol=0.1
+        )
         assert report.segments.noise().share == pytest.approx(22 / 30, abs=0.04)
     assert "not finite: 1 of x" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
-    assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
+    assert recording_text(reports, tmp_path / "bag.mcap").startswith(
+        "bag.mcap: 30.0 s from "
+    )
     settings = starting_config(candidates(reports), tmp_path).parameters
-    np.testing.assert_allclose(settings["noise.noise_std"], [0.05, 0.1, 0.05] * 2, rtol=0.15)
+    np.testing.assert_allclose(
+        settings["noise.noise_std"], [0.05, 0.1, 0.05] * 2, rtol=0.15
+    )
     assert settings["bias.startup_bias_duration"] == 3
     assert "imus.timeout" not in settings
 
 
 @pytest.mark.parametrize("second", [np.s_[:0], np.s_[1000:]])
-def test_units_that_repeat_their_values_for_a_while_keep_their_noise(second, tmp_path, fdi, recwarn):
+def test_units_that_repeat_their_values_for_a_while_keep_their_noise(
+    second, tmp_path, fdi, recwarn
+):
     z = np.random.default_rng(4).normal(0, 0.002, (2000, 6))
     z[:1000, :3], z[second, 3:] = 0.123, 0.05
-    write_mcap(bag := tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(2000), z))
+    write_mcap(
+        bag := tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(2000), z)
+    )
     parameters = starting_config_of(bag, "refused").parameters
     np.testing.assert_allclose(parameters["noise.noise_std"], 0.002, rtol=0.15)
     for topic in inspect(bag)[0]:
@@ -137,14 +197,26 @@ def test_slow_units_get_a_timeout_that_lets_them_be_aligned(tmp_path):
 def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     values = {"/nan": np.nan, "/huge": 1e308, "/a b": 0.0, "/good": 0.0, "/fused": 0.0}
     messages = [
-        (name, START + k * STEP, imu(START + k * STEP, (x,) * 3)) for k in range(20) for name, x in values.items()
+        (name, START + k * STEP, imu(START + k * STEP, (x,) * 3))
+        for k in range(20)
+        for name, x in values.items()
     ]
-    messages += [("/equal", START, imu(START, (0.0,) * 3))] * 3 + [("/one", START, imu(START, (0.0,) * 3))]
+    messages += [("/equal", START, imu(START, (0.0,) * 3))] * 3 + [
+        ("/one", START, imu(START, (0.0,) * 3))
+    ]
     messages += [("/cut", START + k, b"") for k in range(3)]
-    path = write_mcap(tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[1]))
+    path = write_mcap(
+        tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[1])
+    )
     shown = fdi("inspect", path).out
-    assert "3 values, none of them a rate, not finite: 20 of x and 20 of y and 20 of z\n" in shown
-    assert "3 values, none of them a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n" in shown
+    assert (
+        "3 values, none of them a rate, not finite: 20 of x and 20 of y and 20 of z\n"
+        in shown
+    )
+    assert (
+        "3 values, none of them a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n"
+        in shown
+    )
     made = tmp_path / "c.yaml"
     code, _, said = fdi("inspect", path, "--write", made, "--json", tmp_path / "j")
     assert (code, said.count("\n")) == (2, 1)
@@ -163,7 +235,10 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     written = json.loads((tmp_path / "j").read_text())
     assert written["verdict"]["words"] == f"NEEDS {written['findings'][0]['words']}"
     figures = {topic["name"]: topic for topic in written["topics"]}
-    assert (figures["/huge"]["not_finite"], figures["/huge"]["beyond_all_rates"]) == ([0] * 3, [20] * 3)
+    assert (figures["/huge"]["not_finite"], figures["/huge"]["beyond_all_rates"]) == (
+        [0] * 3,
+        [20] * 3,
+    )
     assert figures["/nan"]["largest"] is None
     error = refused("setup", path, "--output", made)
     assert f"has no gyros for a monitor: needs {NEEDED}" in error

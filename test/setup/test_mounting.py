@@ -15,15 +15,32 @@ from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel, assumption_words, coincidences, smallest_detectable, summary_line
-from fdi_ros.setup.mounting import VIBRATION, WAITS, assess, loss, mounting_text, pair_lines
+from fdi_ros.model.noise import (
+    NoiseModel,
+    assumption_words,
+    coincidences,
+    smallest_detectable,
+    summary_line,
+)
+from fdi_ros.setup.mounting import (
+    VIBRATION,
+    WAITS,
+    assess,
+    loss,
+    mounting_text,
+    pair_lines,
+)
 
 CONFIG = Path(__file__).parents[2] / "config"
 
 
 def two_imus(second):
     return Config.from_parameters(
-        {"input": "imus", "imus.topics": ["a", "b"], "imus.mounts": [*np.eye(3).ravel(), *second.ravel()]}
+        {
+            "input": "imus",
+            "imus.topics": ["a", "b"],
+            "imus.mounts": [*np.eye(3).ravel(), *second.ravel()],
+        }
     )
 
 
@@ -40,12 +57,16 @@ def test_two_lost_against_plain_least_squares():
     assert (none.gdop, none.detectable) == (math.inf, ())
 
 
-@pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone()])
+@pytest.mark.parametrize(
+    "geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone()]
+)
 def test_smallest_error_is_seen_99_times_in_100(geometry):
     probability = 1e-3
     noise = NoiseModel(np.linspace(0.8, 1.3, 6))
     smallest = smallest_detectable(geometry, noise, probability)
-    detector = create_detector("likelihood_ratio", geometry, noise, false_alarm_probability=probability)
+    detector = create_detector(
+        "likelihood_ratio", geometry, noise, false_alarm_probability=probability
+    )
     rng = np.random.default_rng(4)
     for channel in (0, 5):
         z = noise.noise_std * rng.standard_normal((20000, 6))
@@ -55,36 +76,63 @@ def test_smallest_error_is_seen_99_times_in_100(geometry):
 
 
 def test_an_error_as_large_as_stated_is_found_in_the_time_stated():
-    config = two_imus(Rotation.from_euler("xyz", [40, 30, 20], degrees=True).as_matrix())
-    config = config.replaced({"noise.noise_std": [0.001 * (i + 1) for i in range(6)], "noise.scale_std": [0.01]})
+    config = two_imus(
+        Rotation.from_euler("xyz", [40, 30, 20], degrees=True).as_matrix()
+    )
+    config = config.replaced(
+        {
+            "noise.noise_std": [0.001 * (i + 1) for i in range(6)],
+            "noise.scale_std": [0.01],
+        }
+    )
     result = assess(config)
     rest, turning, vibration = result.waiting.values()
     assert (np.diff(rest, axis=0) < 0).all()
     assert (turning > rest).all()
     np.testing.assert_allclose(vibration, VIBRATION * rest)
     # Of a wait shorter than two samples nothing is said.
-    assert np.isnan(assess(config.replaced({"sample_rate": 25.0})).waiting["at rest"][WAITS.index(0.02)]).all()
+    assert np.isnan(
+        assess(config.replaced({"sample_rate": 25.0})).waiting["at rest"][
+            WAITS.index(0.02)
+        ]
+    ).all()
     # A stream with that error, whitened: the CUSUM of the channel's own direction.
     V, R = result.geometry.parity, np.diag(result.noise.noise_std**2)
     inverse = np.linalg.inv(V @ R @ V.T)
     own = float(V[:, 2] @ inverse @ V[:, 2])
     shift = rest[WAITS.index(0.5), 2] * math.sqrt(own)
-    assert moustakides_delay(shift, 1 / result.false_alarm_probability) == pytest.approx(50, rel=0.03)
+    assert moustakides_delay(
+        shift, 1 / result.false_alarm_probability
+    ) == pytest.approx(50, rel=0.03)
 
 
 def test_what_names_rest_on_is_said():
     rng = np.random.default_rng(0)
     three = Geometry(np.tile(np.eye(3), (3, 1)) + 0.003 * rng.standard_normal((9, 3)))
     assert coincidences(three) == ((0, 3, 6), (1, 4, 7), (2, 5, 8))
-    config = {"input": "imus", "imus.topics": ["a", "b", "c"], "imus.mounts": [*np.tile(np.eye(3).ravel(), 3)]}
+    config = {
+        "input": "imus",
+        "imus.topics": ["a", "b", "c"],
+        "imus.mounts": [*np.tile(np.eye(3).ravel(), 3)],
+    }
     text = mounting_text(assess(Config.from_parameters(config)))
-    assert "names rest on no two failing alike of imu_1.x/imu_2.x/imu_3.x, imu_1.y/" in text
+    assert (
+        "names rest on no two failing alike of imu_1.x/imu_2.x/imu_3.x, imu_1.y/"
+        in text
+    )
     # Two that fail as the third would look give its parity: so it is for every set that is listed, and no other.
-    for geometry in (three, Geometry.cone(6), Geometry.cone(5), Geometry(np.tile(np.eye(3), (4, 1)))):
+    for geometry in (
+        three,
+        Geometry.cone(6),
+        Geometry.cone(5),
+        Geometry(np.tile(np.eye(3), (4, 1))),
+    ):
         directions = geometry.parity / np.linalg.norm(geometry.parity, axis=0)
         listed = [set(found) for found in coincidences(geometry)]
         for i, j, k in combinations(range(geometry.n), 3):
-            left = np.linalg.lstsq(directions[:, [j, k]], directions[:, i], rcond=None)[0]
+            left = np.linalg.lstsq(directions[:, [j, k]], directions[:, i], rcond=None)[
+                0
+            ]
             rest = np.linalg.norm(directions[:, i] - directions[:, [j, k]] @ left)
             assert (rest < 0.05) == any({i, j, k} <= found for found in listed)
     assert assumption_words(Geometry(np.tile(np.eye(3), (4, 1)))) == ""

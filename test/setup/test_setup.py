@@ -10,7 +10,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_messages, write_config, write_mcap
+from bag.recordings import (
+    ARRAY,
+    START,
+    STEP,
+    TOPICS,
+    array,
+    flight,
+    imu,
+    imu_messages,
+    write_config,
+    write_mcap,
+)
 from scipy.spatial.transform import Rotation
 from vehicles import vehicle
 
@@ -79,7 +90,9 @@ def test_a_mount_that_is_not_shown_is_not_known():
 
 def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     file = tmp_path / "cone.yaml"
-    code, out, _ = fdi("setup", CONE, "--output", file, "--json", tmp_path / "cone.json", "--degrees")
+    code, out, _ = fdi(
+        "setup", CONE, "--output", file, "--json", tmp_path / "cone.json", "--degrees"
+    )
     assert code == 0
     assert "mounts: 1 of 1 against imu_1" in out
     assert re.search(r"^new +nothing", out, re.MULTILINE)
@@ -90,25 +103,40 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     true = build_geometry(Config.from_file(ROOT / "config" / "two_imus.yaml")).axes
     relative = true @ np.linalg.inv(true[:3])
     found = build_geometry(config).axes
-    np.testing.assert_allclose(found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.02)
+    np.testing.assert_allclose(
+        found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.02
+    )
     assert config.imus.delays[1] == pytest.approx(0.0002, abs=2e-4)
     page = (tmp_path / "cone.html").read_text()
     assert f"<li class=good>{out.splitlines()[0]}</li>" in page
     assert "<h2>Proof</h2>" in page
     assert "geometry:" in page
-    assert re.match(r"USABLE: .* biases of 1.72 to 17.2 deg/s isolated on the last 15 s, kept aside", out)
+    assert re.match(
+        r"USABLE: .* biases of 1.72 to 17.2 deg/s isolated on the last 15 s, kept aside",
+        out,
+    )
     assert "noise, deg/s" in page
     figures = json.loads((tmp_path / "cone.json").read_text())
     assert Config.from_parameters(figures["parameters"]) == config
     assert [mount["known"] for mount in figures["mounts"]] == [True, True]
     # Lines, for people, are those of the table.
     for role in ("found", "not_found", "warnings"):
-        assert figures[role] == [one["words"] for one in figures["findings"] if one["role"] == role]
-    said = refused("setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
+        assert figures[role] == [
+            one["words"] for one in figures["findings"] if one["role"] == role
+        ]
+    said = refused(
+        "setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3"
+    )
     assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
     # Nothing that exists is overwritten, and nothing is left half done.
-    assert "exists already; --force overwrites it" in refused("setup", CONE, "--output", file)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
+    assert "exists already; --force overwrites it" in refused(
+        "setup", CONE, "--output", file
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "cone.html",
+        "cone.json",
+        "cone.yaml",
+    ]
 
 
 def at_rest_then_turning(size):
@@ -134,13 +162,22 @@ def test_degrees_are_refused(in_degrees, size, words, tmp_path, fdi, refused):
     for unit in in_degrees:
         z[:, 3 * unit : 3 * unit + 3] *= np.degrees(1.0)
     write_mcap(bag := tmp_path / "bag.mcap", imu_messages(stamp, z))
-    config = write_config(tmp_path / "c.yaml", {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)})
+    config = write_config(
+        tmp_path / "c.yaml",
+        {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)},
+    )
     made = tmp_path / "made.yaml"
     code, out, _ = fdi("inspect", bag)
-    verbs = (("setup", bag, "--output", made), ("calibrate", bag, "--config", config, "--output", made))
+    verbs = (
+        ("setup", bag, "--output", made),
+        ("calibrate", bag, "--config", config, "--output", made),
+    )
     if not words:
         assert (code, out.partition(":")[0]) == (0, "READY")
-        assert [fdi(*verb, "--force").code for verb in (*verbs, ("replay", bag, "--config", config))] != [2, 2, 2]
+        assert [
+            fdi(*verb, "--force").code
+            for verb in (*verbs, ("replay", bag, "--config", config))
+        ] != [2, 2, 2]
         return
     assert (code, out.partition(":")[0]) == (3, "NEEDS rad/s")
     assert words in out.splitlines()[0]
@@ -154,9 +191,18 @@ def test_degrees_are_refused(in_degrees, size, words, tmp_path, fdi, refused):
 def test_half_a_second_of_a_long_flight_shows_degrees(tmp_path, fdi):
     t = 0.01 * np.arange(9000)
     turn = np.where((t > 50.0) & (t < 51.0), 0.7, 0.3 * np.sin(t))
-    z = np.random.default_rng(2).normal(0.0, 0.005, (len(t), 6)) + np.tile([0.2, 0.5, 1.0], 2) * turn[:, None]
-    for factor, verdict in ((1.0, "READY"), (np.degrees(1.0), "NEEDS rad/s: /imu_1/data_raw and")):
-        bag = write_mcap(tmp_path / f"{factor}.mcap", imu_messages(START + STEP * np.arange(len(t)), factor * z))
+    z = (
+        np.random.default_rng(2).normal(0.0, 0.005, (len(t), 6))
+        + np.tile([0.2, 0.5, 1.0], 2) * turn[:, None]
+    )
+    for factor, verdict in (
+        (1.0, "READY"),
+        (np.degrees(1.0), "NEEDS rad/s: /imu_1/data_raw and"),
+    ):
+        bag = write_mcap(
+            tmp_path / f"{factor}.mcap",
+            imu_messages(START + STEP * np.arange(len(t)), factor * z),
+        )
         assert fdi("inspect", bag).out.startswith(verdict)
 
 
@@ -165,7 +211,9 @@ def test_shocks_and_noise_are_no_degrees(of_one, tmp_path, fdi):
     """Values beyond every range for a moment, and idling motors, are no other unit of measure."""
     stamp, z = at_rest_then_turning(0.3)
     z[1000:1004] = 90.0
-    z[:, : 3 if of_one else 6] += np.random.default_rng(1).normal(0.0, 0.1, (1600, 3 if of_one else 6))
+    z[:, : 3 if of_one else 6] += np.random.default_rng(1).normal(
+        0.0, 0.1, (1600, 3 if of_one else 6)
+    )
     write_mcap(bag := tmp_path / "bag.mcap", imu_messages(stamp, z))
     assert fdi("inspect", bag).out.startswith("READY")
 
@@ -176,7 +224,11 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
     steps = [START + i * STEP for i in range(1500)]
     rng = np.random.default_rng(4)
     messages = [
-        (topic, at, imu(at + off[topic], rng.normal(0.0, 0.002, 3) + 0.5 * np.sin(at * 1e-9)))
+        (
+            topic,
+            at,
+            imu(at + off[topic], rng.normal(0.0, 0.002, 3) + 0.5 * np.sin(at * 1e-9)),
+        )
         for at in steps
         for topic in TOPICS
     ]
@@ -188,7 +240,9 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
         assert fdi("setup", *made)[::2] == (0, "")
         return
     assert words in refused("setup", *made)
-    config = write_config(tmp_path / "two.yaml", {"input": "imus", "imus.topics": list(TOPICS)})
+    config = write_config(
+        tmp_path / "two.yaml", {"input": "imus", "imus.topics": list(TOPICS)}
+    )
     said = refused("calibrate", *made, "--config", config)
     assert "fdi inspect says whether its topic is silent or of another clock" in said
 
@@ -198,15 +252,23 @@ def test_a_mirrored_unit_is_named_whatever_its_mount(odd, tmp_path, fdi):
     one = vehicle(0, "rest and turns", 3)
     z = one.block.z.copy()
     z[:, 3 * odd] *= -1.0
-    write_mcap(tmp_path / "bag.mcap", imu_messages(one.block.stamp, z, (*TOPICS, "/third")))
-    code, out, _ = fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
+    write_mcap(
+        tmp_path / "bag.mcap", imu_messages(one.block.stamp, z, (*TOPICS, "/third"))
+    )
+    code, out, _ = fdi(
+        "setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml"
+    )
     assert code == 3
-    assert out.startswith(f"DO NOT USE: imu_{odd + 1} is mirrored: one axis is reversed (a left turn reads as a right")
+    assert out.startswith(
+        f"DO NOT USE: imu_{odd + 1} is mirrored: one axis is reversed (a left turn reads as a right"
+    )
 
 
 def test_settings_are_never_worse_than_those_before():
     all_of_it = SimpleNamespace(judged=1.0, declared=[])
-    before, fewer, chance = (Tried(all_of_it, "", {0.1: (isolated, 36)}) for isolated in (30, 28, 29))
+    before, fewer, chance = (
+        Tried(all_of_it, "", {0.1: (isolated, 36)}) for isolated in (30, 28, 29)
+    )
     nothing = Tried(None, "only three channels", {})
     for old, new, worse in (
         (before, fewer, "28 of 36 biases are isolated instead of 30"),
@@ -221,13 +283,27 @@ def test_settings_are_never_worse_than_those_before():
 def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
     config = ROOT / "config" / "two_imus.yaml"
     monkeypatch.setattr(Proof, "worse", "28 of 54 biases are isolated instead of 30")
-    verb = ("calibrate", CONE, "--config", config, "--output", tmp_path / "made.yaml", "--json", tmp_path / "j")
+    verb = (
+        "calibrate",
+        CONE,
+        "--config",
+        config,
+        "--output",
+        tmp_path / "made.yaml",
+        "--json",
+        tmp_path / "j",
+    )
     code, out, _ = fdi(*verb)
     assert code == 4
-    assert out.startswith("NO BETTER THAN BEFORE: on the last 15 s, kept aside, 28 of 54 biases are isolated")
+    assert out.startswith(
+        "NO BETTER THAN BEFORE: on the last 15 s, kept aside, 28 of 54 biases are isolated"
+    )
     assert "set: nothing" in out
     assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
-    assert json.loads((tmp_path / "j").read_text())["no_better"] == "28 of 54 biases are isolated instead of 30"
+    assert (
+        json.loads((tmp_path / "j").read_text())["no_better"]
+        == "28 of 54 biases are isolated instead of 30"
+    )
 
 
 def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi, tmp_path):
@@ -237,8 +313,14 @@ def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi, tmp_path):
     rest = one.block.z[t < 10.0]
     moving = one.block.z[t > 20.0]
     z = np.vstack([moving, rest, rest])
-    write_mcap(tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(len(z)), z, (*TOPICS, "/third")))
-    assert fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml").code == 0
+    write_mcap(
+        tmp_path / "bag.mcap",
+        imu_messages(START + STEP * np.arange(len(z)), z, (*TOPICS, "/third")),
+    )
+    assert (
+        fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml").code
+        == 0
+    )
     found = Config.from_file(tmp_path / "made.yaml").bias.fixed
     np.testing.assert_allclose(found, rest.mean(axis=0), atol=5e-4)
 
@@ -266,16 +348,23 @@ UNSHOWN = {
 def test_what_cannot_be_found_is_said_and_the_config_loads(fdi, tmp_path, shown):
     topics = None
     still = np.random.default_rng(5).normal([0.01, -0.01, 0.0] * 2, 0.002, (1200, 6))
-    z = {"factor": flight(2000)[1] * [1, 1, 1, 10, 10, 10], "still": still}.get(shown, flight()[1])
+    z = {"factor": flight(2000)[1] * [1, 1, 1, 10, 10, 10], "still": still}.get(
+        shown, flight()[1]
+    )
     stamp = START + STEP * np.arange(len(z))
     messages = imu_messages(stamp, z)
     if shown == "array":
         # A name that would write a line of its own into the config, or clear the screen.
         topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
         messages = [
-            (name, at, array(values.tolist())) for at, values in zip(stamp.tolist(), z, strict=True) for name in topics
+            (name, at, array(values.tolist()))
+            for at, values in zip(stamp.tolist(), z, strict=True)
+            for name in topics
         ]
-    bag, file = write_mcap(tmp_path / "bag.mcap", messages, types=topics), tmp_path / "own.yaml"
+    bag, file = (
+        write_mcap(tmp_path / "bag.mcap", messages, types=topics),
+        tmp_path / "own.yaml",
+    )
     code, out, _ = fdi("setup", bag, "--output", file)
     assert code == {"still": 0, "short": 4}.get(shown, 3)
     assert ("on the vehicle" in out) == (code != 3)
@@ -295,21 +384,41 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi, tmp_path, shown)
 def test_one_sensor_on_two_topics_is_no_redundancy(how, fdi, refused, tmp_path):
     z = flight(800)[1]
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
-    copy = {"identical": z[:, :3], "turned": z[:, :3] @ turn.T, "scaled": 1.01 * z[:, :3], "later": z[:, :3]}[how]
+    copy = {
+        "identical": z[:, :3],
+        "turned": z[:, :3] @ turn.T,
+        "scaled": 1.01 * z[:, :3],
+        "later": z[:, :3],
+    }[how]
     copy = np.roll(copy, 4, axis=0) if how == "later" else copy
     stamp = START + STEP * np.arange(800)
-    bag = write_mcap(tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], copy])))
+    bag = write_mcap(
+        tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], copy]))
+    )
     words = f"it gives the values of {TOPICS[0]}"
     # Of two topics nothing is left that checks: no settings.
     code, out, _ = fdi("inspect", bag)
     assert (code, out.startswith("NEEDS two Imu topics")) == (3, True)
     assert words in out.splitlines()[0]
-    assert f"{TOPICS[1]}: {words}: one sensor on two topics" in refused("setup", bag, "--output", tmp_path / "own.yaml")
-    config = write_config(tmp_path / "c.yaml", {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)})
-    said = refused("calibrate", bag, "--config", config, "--output", tmp_path / "own.yaml")
-    assert f"{TOPICS[1]} gives the values of {TOPICS[0]}: one sensor on two topics is no redundancy" in said
+    assert f"{TOPICS[1]}: {words}: one sensor on two topics" in refused(
+        "setup", bag, "--output", tmp_path / "own.yaml"
+    )
+    config = write_config(
+        tmp_path / "c.yaml",
+        {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)},
+    )
+    said = refused(
+        "calibrate", bag, "--config", config, "--output", tmp_path / "own.yaml"
+    )
+    assert (
+        f"{TOPICS[1]} gives the values of {TOPICS[0]}: one sensor on two topics is no redundancy"
+        in said
+    )
     # Of three the copy is left out.
-    bag = write_mcap(tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, copy]), (*TOPICS, "/third")))
+    bag = write_mcap(
+        tmp_path / "three.mcap",
+        imu_messages(stamp, np.hstack([z, copy]), (*TOPICS, "/third")),
+    )
     code, out, _ = fdi("inspect", bag, "--output", tmp_path / "start.yaml")
     assert (code, out.partition(":")[0]) == (3, "NEEDS A LOOK")
     assert f"/third gives the values of {TOPICS[0]}" in out.splitlines()[0]

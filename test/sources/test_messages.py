@@ -23,16 +23,29 @@ from fdi_ros.core.sources import ChannelsSource, ImuSource
 finite = st.floats(allow_nan=False)
 vectors = st.tuples(finite, finite, finite)
 stamps = st.integers(0, 2**31 * 10**9 - 1)
-frames = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=40)
+frames = st.text(
+    st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=40
+)
 orders = st.sampled_from("<>")
 gaps = st.binary(max_size=9)
 numbers = st.floats(width=64)
-imus = st.lists(st.tuples(stamps, st.tuples(numbers, numbers, numbers), frames, orders, gaps), min_size=1, max_size=12)
+imus = st.lists(
+    st.tuples(stamps, st.tuples(numbers, numbers, numbers), frames, orders, gaps),
+    min_size=1,
+    max_size=12,
+)
 labelled = st.lists(st.text("abcdef", max_size=9), max_size=4)
-arrays = st.lists(st.tuples(st.lists(numbers, max_size=8), labelled, orders, gaps), min_size=1, max_size=12)
+arrays = st.lists(
+    st.tuples(st.lists(numbers, max_size=8), labelled, orders, gaps),
+    min_size=1,
+    max_size=12,
+)
 triangles = st.lists(finite, min_size=6, max_size=6)
 
-parse_imu, decode_imu = partial(ImuSource.parse, count=3), partial(ImuSource.decode, count=3)
+parse_imu, decode_imu = (
+    partial(ImuSource.parse, count=3),
+    partial(ImuSource.decode, count=3),
+)
 patch_imu, patch_channels = ImuSource.patch, ChannelsSource.patch
 decode_array, array_count = ChannelsSource.decode, ChannelsSource.announced
 
@@ -54,7 +67,10 @@ def packed(messages, gaps=None):
 
 def same(values, expected) -> bool:
     """Equal bit for bit, NaN and the sign of zero included."""
-    return np.asarray(values, dtype="<f8").tobytes() == np.asarray(expected, dtype="<f8").tobytes()
+    return (
+        np.asarray(values, dtype="<f8").tobytes()
+        == np.asarray(expected, dtype="<f8").tobytes()
+    )
 
 
 def full(triangle) -> list[float]:
@@ -79,8 +95,16 @@ def refusal(read, data) -> str:
 class TestOneMessage:
     """Read, patched and refused from Python."""
 
-    @given(stamps, vectors, st.lists(finite, min_size=3, max_size=12), st.lists(frames, min_size=1, max_size=3), orders)
-    def test_patched_messages_differ_in_the_values_alone(self, stamp, rate, values, names, order) -> None:
+    @given(
+        stamps,
+        vectors,
+        st.lists(finite, min_size=3, max_size=12),
+        st.lists(frames, min_size=1, max_size=3),
+        orders,
+    )
+    def test_patched_messages_differ_in_the_values_alone(
+        self, stamp, rate, values, names, order
+    ) -> None:
         imus = [imu_bytes(stamp, one, names[0], order) for one in (rate, values[:3])]
         arrays = [array_bytes(one, names, order) for one in (values, values[::-1])]
         assert patch_imu(imus[0], values[:3]) == imus[1]
@@ -88,33 +112,61 @@ class TestOneMessage:
 
     @given(st.binary(max_size=400))
     def test_any_bytes_are_patched_in_place_or_refused(self, data) -> None:
-        for patch, values in ((patch_imu, (1.0, 2.0, 3.0)), (patch_channels, [1.0] * 6)):
+        for patch, values in (
+            (patch_imu, (1.0, 2.0, 3.0)),
+            (patch_channels, [1.0] * 6),
+        ):
             with contextlib.suppress(MessageError):
                 assert len(patch(data, values)) == len(data)
 
-    def test_what_is_wrong_is_told_in_one_line_with_its_figures_and_never_followed(self) -> None:
+    def test_what_is_wrong_is_told_in_one_line_with_its_figures_and_never_followed(
+        self,
+    ) -> None:
         imu, array = imu_bytes(1, (1.0, 2.0, 3.0)), array_bytes([1.0] * 6)
-        read_5, read_6 = partial(parse_channels, count=5), partial(parse_channels, count=6)
+        read_5, read_6 = (
+            partial(parse_channels, count=5),
+            partial(parse_channels, count=6),
+        )
         patch_1 = partial(patch_channels, values=[1.0])
         for read, data, words in (
             (parse_imu, b"", "0 bytes with encapsulation none are no plain CDR"),
-            (parse_imu, b"\0\2\0\0" + imu[4:], f"{len(imu)} bytes with encapsulation 0002 are no plain CDR"),
+            (
+                parse_imu,
+                b"\0\2\0\0" + imu[4:],
+                f"{len(imu)} bytes with encapsulation 0002 are no plain CDR",
+            ),
             (parse_imu, imu[:9], "9 bytes are too few for an Imu"),
-            (parse_imu, imu[:99], "99 bytes are too few for an Imu whose frame_id has 4 bytes"),
-            (parse_imu, overwritten(imu, 12, "<I", 2**32 - 1), "an Imu whose frame_id has 4294967295 bytes"),
+            (
+                parse_imu,
+                imu[:99],
+                "99 bytes are too few for an Imu whose frame_id has 4 bytes",
+            ),
+            (
+                parse_imu,
+                overwritten(imu, 12, "<I", 2**32 - 1),
+                "an Imu whose frame_id has 4294967295 bytes",
+            ),
             (read_6, array[:9], "9 bytes are too few for the array they announce"),
             (read_6, array[:60], "60 bytes are too few for 6 values (little endian)"),
             (read_6, overwritten(array, 4, "<I", 2**32 - 1), "4294967295 dimensions"),
-            (read_6, array_bytes([0.0] * 1_000_000), "array has 1000000 values, expected 6"),
+            (
+                read_6,
+                array_bytes([0.0] * 1_000_000),
+                "array has 1000000 values, expected 6",
+            ),
             (read_5, array, "array has 6 values, expected 5"),
             (patch_1, array, "array has 6 values, expected 1"),
         ):
             assert words in refusal(read, data)
 
     @pytest.mark.parametrize("order", "<>")
-    @pytest.mark.parametrize(("sec", "nanosec"), [(-1, 0), (-(2**31), 5), (0, 10**9), (2**31 - 1, 2**32 - 1)])
+    @pytest.mark.parametrize(
+        ("sec", "nanosec"), [(-1, 0), (-(2**31), 5), (0, 10**9), (2**31 - 1, 2**32 - 1)]
+    )
     def test_a_stamp_that_is_no_time_is_refused(self, sec, nanosec, order) -> None:
-        data = overwritten(imu_bytes(0, (1.0, 2.0, 3.0), order=order), 4, order + "iI", sec, nanosec)
+        data = overwritten(
+            imu_bytes(0, (1.0, 2.0, 3.0), order=order), 4, order + "iI", sec, nanosec
+        )
         assert f"{sec} s and {nanosec} ns" in refusal(parse_imu, data)
 
 
@@ -124,19 +176,27 @@ class TestManyMessages:
     @settings(max_examples=150)
     @given(drawn=imus)
     def test_imus_equal_what_others_deserialise(self, drawn) -> None:
-        messages = [imu_bytes(stamp, rate, frame, order) for stamp, rate, frame, order, _ in drawn]
+        messages = [
+            imu_bytes(stamp, rate, frame, order)
+            for stamp, rate, frame, order, _ in drawn
+        ]
         decoded = decode_imu(*packed(messages, [gap for *_, gap in drawn]))
         assert decoded.good.all()
         for k, message in enumerate(messages):
             true = STORE.deserialize_cdr(message, IMU)
-            assert decoded.stamp[k] == true.header.stamp.sec * 10**9 + true.header.stamp.nanosec
+            assert (
+                decoded.stamp[k]
+                == true.header.stamp.sec * 10**9 + true.header.stamp.nanosec
+            )
             rate = true.angular_velocity
             assert same(decoded.values[k], [rate.x, rate.y, rate.z])
 
     @settings(max_examples=150)
     @given(drawn=arrays)
     def test_arrays_equal_what_others_deserialise(self, drawn) -> None:
-        messages = [array_bytes(values, labels, order) for values, labels, order, _ in drawn]
+        messages = [
+            array_bytes(values, labels, order) for values, labels, order, _ in drawn
+        ]
         buffer, offset, length = packed(messages, [gap for *_, gap in drawn])
         assert array_count(buffer, offset, length) == len(drawn[0][0])
         for channels in {len(values) for values, *_ in drawn} - {0}:
@@ -147,12 +207,27 @@ class TestManyMessages:
                 assert not decoded.good[k] or same(decoded.values[k], true)
 
     @settings(max_examples=150)
-    @given(st.lists(st.tuples(st.binary(max_size=400) | st.none(), st.integers(0, 400)), min_size=1, max_size=8))
-    def test_what_is_malformed_leaves_zeros_and_the_others_as_they_are(self, drawn) -> None:
-        imu, array = imu_bytes(5, (1.0, 2.0, 3.0), "frame"), array_bytes([1.0, 2.0, 3.0], ["a", "bc"])
+    @given(
+        st.lists(
+            st.tuples(st.binary(max_size=400) | st.none(), st.integers(0, 400)),
+            min_size=1,
+            max_size=8,
+        )
+    )
+    def test_what_is_malformed_leaves_zeros_and_the_others_as_they_are(
+        self, drawn
+    ) -> None:
+        imu, array = (
+            imu_bytes(5, (1.0, 2.0, 3.0), "frame"),
+            array_bytes([1.0, 2.0, 3.0], ["a", "bc"]),
+        )
         for sound, bulk, single in (
             (imu, decode_imu, parse_imu),
-            (array, lambda b, o, k: decode_array(b, o, k, 3), lambda m: (0, parse_channels(m, 3))),
+            (
+                array,
+                lambda b, o, k: decode_array(b, o, k, 3),
+                lambda m: (0, parse_channels(m, 3)),
+            ),
         ):
             messages = [sound[:cut] if data is None else data for data, cut in drawn]
             decoded = bulk(*packed(messages))
@@ -169,7 +244,9 @@ class TestManyMessages:
 
     @settings(max_examples=200)
     @given(st.integers(0, 400), st.integers(0, 7), orders)
-    def test_a_flipped_bit_never_reads_outside_the_message(self, byte, bit, order) -> None:
+    def test_a_flipped_bit_never_reads_outside_the_message(
+        self, byte, bit, order
+    ) -> None:
         data = bytearray(imu_bytes(5, (1.0, 2.0, 3.0), "frame", order))
         data[byte % len(data)] ^= 1 << bit
         # What lies around the message are numbers of which none may be read.
@@ -180,18 +257,43 @@ class TestManyMessages:
             assert same(decoded.values[1], [0, 0, 0])
 
     def test_the_first_readable_array_says_how_many_values(self) -> None:
-        assert array_count(*packed([b"", array_bytes([1.0] * 7, ["a"], ">")[:-30], array_bytes([1.0])])) == 7
+        assert (
+            array_count(
+                *packed(
+                    [b"", array_bytes([1.0] * 7, ["a"], ">")[:-30], array_bytes([1.0])]
+                )
+            )
+            == 7
+        )
         assert array_count(*packed([b"", b"\0\1"])) == 0
 
 
-@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1), vectors, triangles, frames, st.lists(finite, min_size=1))
-def test_what_is_written_equals_what_others_deserialise(stamp, rate, triangle, frame, values) -> None:
+@given(
+    st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1),
+    vectors,
+    triangles,
+    frames,
+    st.lists(finite, min_size=1),
+)
+def test_what_is_written_equals_what_others_deserialise(
+    stamp, rate, triangle, frame, values
+) -> None:
     """From templates, filled in compiled code; stamps before 1970 as ROS has them."""
-    true = STORE.deserialize_cdr(ImuTemplate(frame).fill(stamp, rate, full(triangle)), IMU)
+    true = STORE.deserialize_cdr(
+        ImuTemplate(frame).fill(stamp, rate, full(triangle)), IMU
+    )
     assert (true.header.stamp.sec, true.header.stamp.nanosec) == divmod(stamp, 10**9)
     assert true.header.frame_id == frame
-    assert same([true.angular_velocity.x, true.angular_velocity.y, true.angular_velocity.z], rate)
+    assert same(
+        [true.angular_velocity.x, true.angular_velocity.y, true.angular_velocity.z],
+        rate,
+    )
     assert same(true.angular_velocity_covariance, full(triangle))
     # No orientation, no acceleration.
-    assert true.orientation_covariance[0] == true.linear_acceleration_covariance[0] == -1.0
-    assert same(STORE.deserialize_cdr(ChannelsTemplate(len(values)).fill(values), ARRAY).data, values)
+    assert (
+        true.orientation_covariance[0] == true.linear_acceleration_covariance[0] == -1.0
+    )
+    assert same(
+        STORE.deserialize_cdr(ChannelsTemplate(len(values)).fill(values), ARRAY).data,
+        values,
+    )

@@ -12,7 +12,16 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_CHANNELS, Channels, Real, Square, Whole, callback, compiled, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    Channels,
+    Real,
+    Square,
+    Whole,
+    callback,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
@@ -76,14 +85,18 @@ def threshold_for(run_length: float, reference: float, correlation: Array) -> fl
         shared = float(erfc(np.sqrt(apart * reference * b)).sum()) / count
         effective = count * max(1 - shared / 2, 1 / (1 + shared))
         # A crossing takes b / k samples; of several sums, that time passes only once.
-        single = max(effective * (run_length - b / reference) + b / reference, run_length)
+        single = max(
+            effective * (run_length - b / reference) + b / reference, run_length
+        )
     return threshold
 
 
 def _single_threshold(run_length: float, reference: float) -> float:
     shortest = siegmund_run_length(0.0, reference)
     if run_length <= shortest:
-        raise ConfigError(f"run length is {run_length:.4g} samples per sum, expected above {shortest:.3g}")
+        raise ConfigError(
+            f"run length is {run_length:.4g} samples per sum, expected above {shortest:.3g}"
+        )
     # ln(1 + x + 2 k^2 L) is close from below; expm1(x) - x is convex, so Newton converges from there.
     target = 2 * reference**2 * run_length
     x = math.log1p(target)
@@ -131,7 +144,9 @@ class Side:
 class State:
     """Running sums, two per channel."""
 
-    sides: Annotated[list[Side], 2 * MAX_CHANNELS]  # downward of each channel, then upward
+    sides: Annotated[
+        list[Side], 2 * MAX_CHANNELS
+    ]  # downward of each channel, then upward
     room: Scratch
     resting: Channels  # of this sample: residuals over noise_std
     variance: Channels  # of this sample: variance of each w0 by all errors; by noise_std alone it is 1
@@ -139,7 +154,12 @@ class State:
 
 @compiled
 def advance(
-    side: Side, params: Constants, step: float, factor: float, systematic: float, residual: NDArray[np.float64]
+    side: Side,
+    params: Constants,
+    step: float,
+    factor: float,
+    systematic: float,
+    residual: NDArray[np.float64],
 ) -> None:
     """Take one sample into a running sum; it stays between 0 and 1.5 thresholds."""
     side.total = min(max(side.total + step, 0.0), 1.5 * params.threshold)
@@ -157,7 +177,13 @@ def advance(
 
 
 @compiled
-def name(params: Constants, side: Side, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def name(
+    params: Constants,
+    side: Side,
+    state: State,
+    sample: SampleInput,
+    verdict: SampleVerdict,
+) -> None:
     """Name the channels that explain the average since the onset."""
     mean_part = side.systematic / side.count
     # The variance of the average is at most 1 / count + mean_part^2: over its root, that of a sample.
@@ -170,7 +196,9 @@ def name(params: Constants, side: Side, state: State, sample: SampleInput, verdi
 
 
 @compiled
-def name_largest(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def name_largest(
+    params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Name the channels by the largest sum, the downward ones first where several are as large."""
     for k in range(2 * MAX_CHANNELS):
         if state.sides[k].total == verdict.statistic:
@@ -179,7 +207,9 @@ def name_largest(params: Constants, state: State, sample: SampleInput, verdict: 
 
 
 @callback(Constants, State, SampleInput, SampleVerdict)
-def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(
+    params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Advance all sums by one sample; on alarm, name the channels by the largest."""
     sensors, room = params.sensors, state.room
     n = sensors.n
@@ -194,7 +224,11 @@ def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleV
     for i in range(n):
         w0 = state.resting[i] * params.scale[i]
         # The scores hold w until the sums are advanced.
-        verdict.scores[i] = w0 if sensors.constant else whitened(params.hypotheses, sensors, sample, room, i)
+        verdict.scores[i] = (
+            w0
+            if sensors.constant
+            else whitened(params.hypotheses, sensors, sample, room, i)
+        )
         largest, size = max(largest, abs(w0)), max(size, abs(verdict.scores[i]))
         spread = max(spread, state.variance[i])
         systematic = max(systematic, state.variance[i] - 1.0 + params.bias[i])
@@ -204,7 +238,11 @@ def judge(params: Constants, state: State, sample: SampleInput, verdict: SampleV
     verdict.statistic, verdict.threshold = 0.0, params.threshold
     for i in range(n):
         w, variance = verdict.scores[i] * shrink, state.variance[i]
-        less = min(params.half_shift + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance), LARGEST)
+        less = min(
+            params.half_shift
+            + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance),
+            LARGEST,
+        )
         down, up = state.sides[i], state.sides[MAX_CHANNELS + i]
         advance(down, params, -w - less, factor, lasting, state.resting)
         advance(up, params, w - less, factor, lasting, state.resting)
@@ -227,7 +265,9 @@ def plain_variances(params: Constants, sample: SampleInput, state: State) -> Non
         for i in range(n):
             rate[a] += sensors.gain[i, a] * sample.z[i]
     for j in range(n):
-        state.room.variance[j] = variance_of(sensors, j, along(sensors.axes[j], rate), sample.acceleration)
+        state.room.variance[j] = variance_of(
+            sensors, j, along(sensors.axes[j], rate), sample.acceleration
+        )
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -280,25 +320,49 @@ class Cusum(Detector):
         confidence: float = 0.999,
     ) -> None:
         if not 0.05 <= shift <= 3.0:
-            raise ConfigError(f"shift is {shift:g} standard deviations, expected 0.05 to 3")
-        self.run_length = FalseAlarmRate(run_length, None, false_alarms_per_hour, sample_rate).mean_run_length()
-        super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
+            raise ConfigError(
+                f"shift is {shift:g} standard deviations, expected 0.05 to 3"
+            )
+        self.run_length = FalseAlarmRate(
+            run_length, None, false_alarms_per_hour, sample_rate
+        ).mean_run_length()
+        super().__init__(
+            geometry,
+            noise,
+            {"shift": shift, "run_length": self.run_length, "confidence": confidence},
+        )
         params, n = self.constants[0], geometry.n
-        prepare_hypotheses(params["resting"], geometry, self.noise, confidence, fixed=True)
-        prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
+        prepare_hypotheses(
+            params["resting"], geometry, self.noise, confidence, fixed=True
+        )
+        prepare_hypotheses(
+            params["hypotheses"],
+            geometry,
+            self.noise,
+            confidence,
+            fixed=self.noise.constant,
+        )
         residual = params["resting"]["residual"][:n, :n]
         share = np.where(geometry.detectable, np.diag(residual), np.inf)
         params["scale"][:n] = 1 / np.sqrt(share)
-        params["squares"][:n, :n] = residual**2 / share[:, None] / self.noise.noise_std**2
+        params["squares"][:n, :n] = (
+            residual**2 / share[:, None] / self.noise.noise_std**2
+        )
         params["bias"][:n] = params["squares"][:n, :n] @ self.noise.bias_std**2
         seen = np.flatnonzero(geometry.detectable).tolist()
         first = [seen.index(group[0]) for group in geometry.groups if group[0] in seen]
         directions = whitened_directions(geometry, self.noise)[first]
         rho = directions @ directions.T
-        self.threshold = threshold_for(self.run_length, shift / 2, np.block([[rho, -rho], [-rho, rho]]))
+        self.threshold = threshold_for(
+            self.run_length, shift / 2, np.block([[rho, -rho], [-rho, rho]])
+        )
         self.window = math.ceil(16 * self.threshold / shift) + 1
         """Samples after the onset, at most, that the naming of the channel rests on."""
-        params["half_shift"], params["threshold"], params["window"] = shift / 2, self.threshold, self.window
+        params["half_shift"], params["threshold"], params["window"] = (
+            shift / 2,
+            self.threshold,
+            self.window,
+        )
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).

@@ -17,7 +17,15 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import Channels, Real, Whole, allocate, callback, compiled, record
+from fdi_ros.compiling.compiled import (
+    Channels,
+    Real,
+    Whole,
+    allocate,
+    callback,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError, DetectorError
@@ -52,18 +60,30 @@ def _triples(unit: Array) -> Array:
     a, b, c = unit[index.T]
     dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < ROUNDING
     # In a plane with unit normal N: (b x c . N) a + (c x a . N) b + (a x b . N) c = 0.
-    products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)[dependent]
+    products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)[
+        dependent
+    ]
     longest = np.linalg.norm(products, axis=2).argmax(axis=1)
     normal = products[np.arange(len(products)), longest]
     values = (products * normal[:, None, :]).sum(axis=2)
     length = np.linalg.norm(values, axis=1)
-    spans = length > ROUNDING  # else all three are parallel: every pair of them is a circuit already
-    return _scatter(index[dependent][spans], values[spans] / length[spans, None], len(unit))
+    spans = (
+        length > ROUNDING
+    )  # else all three are parallel: every pair of them is a circuit already
+    return _scatter(
+        index[dependent][spans], values[spans] / length[spans, None], len(unit)
+    )
 
 
 def _quadruples(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 4)))
-    values = np.stack([(-1) ** k * np.linalg.det(unit[np.delete(index, k, axis=1)]) for k in range(4)], axis=1)
+    values = np.stack(
+        [
+            (-1) ** k * np.linalg.det(unit[np.delete(index, k, axis=1)])
+            for k in range(4)
+        ],
+        axis=1,
+    )
     whole = (np.abs(values) >= ROUNDING).all(axis=1)
     return _scatter(index[whole], values[whole], len(unit))
 
@@ -88,7 +108,9 @@ MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
 """None contains another: no family of such sets of at most four channels is larger (Sperner)."""
 MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)  # circuits through one channel, likewise
 ABSENT = MOST_CHANNELS  # instead of a channel: its weight is zero
-WITHIN = 1 + ROUNDING  # a check this many times its bound still counts as within it: rounding is no fault
+WITHIN = (
+    1 + ROUNDING
+)  # a check this many times its bound still counts as within it: rounding is no fault
 
 
 # The method ----------------------------------------------------------------------------------------------------------
@@ -104,27 +126,49 @@ class Circuits:
     limit: Real  # of the statistic
     faults: Whole  # channels that may be faulty, at most
     circuits: Whole  # number of checks
-    checks: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_CIRCUITS)]  # s/rad; one per column
-    weight: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS, MOST_CHANNELS + 1)]  # bound |check|; rows add to 1
-    rules_out: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]  # bits of the sets that a violation rules out
+    checks: Annotated[
+        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_CIRCUITS)
+    ]  # s/rad; one per column
+    weight: Annotated[
+        NDArray[np.float64], "f8", (MOST_CIRCUITS, MOST_CHANNELS + 1)
+    ]  # bound |check|; rows add to 1
+    rules_out: Annotated[
+        NDArray[np.int64], "i8", (MOST_CIRCUITS,)
+    ]  # bits of the sets that a violation rules out
     sets: Whole  # number of the largest sets: they explain all that their subsets do
     first: Whole  # bit of the first of them
-    members: Annotated[NDArray[np.int64], "i8", (MOST_SETS, MOST_FAULTS)]  # their channels; ABSENT where there is none
-    circuit: Annotated[NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)]  # [i]: those through channel i
-    slope: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # check to the channel's error, rad/s
-    half: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # half-width of its interval, rad/s
+    members: Annotated[
+        NDArray[np.int64], "i8", (MOST_SETS, MOST_FAULTS)
+    ]  # their channels; ABSENT where there is none
+    circuit: Annotated[
+        NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)
+    ]  # [i]: those through channel i
+    slope: Annotated[
+        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)
+    ]  # check to the channel's error, rad/s
+    half: Annotated[
+        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)
+    ]  # half-width of its interval, rad/s
     # A circuit limits the error of channel i only if all its other members are healthy.
-    usable: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)]  # [i, f]: so many when set f is faulty
-    which: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)]  # their places in circuit[i]
+    usable: Annotated[
+        NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)
+    ]  # [i, f]: so many when set f is faulty
+    which: Annotated[
+        NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)
+    ]  # their places in circuit[i]
 
 
 @record
 class Findings:
     """What is found of one sample on the way to its verdict; nothing is remembered."""
 
-    value: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS,)]  # of each check; size 1: all that bounds allow
+    value: Annotated[
+        NDArray[np.float64], "f8", (MOST_CIRCUITS,)
+    ]  # of each check; size 1: all that bounds allow
     violations: Whole  # number of checks violated
-    violated: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]  # which; the worst first
+    violated: Annotated[
+        NDArray[np.int64], "i8", (MOST_CIRCUITS,)
+    ]  # which; the worst first
     explanations: Whole  # number of the largest sets that explain the sample
     explains: Annotated[NDArray[np.int64], "i8", (MOST_SETS,)]  # which
     lower: Channels  # guaranteed interval of each channel's error, rad/s
@@ -201,7 +245,10 @@ def intervals(params: Circuits, found: Findings) -> None:
                     if low >= lower and high <= upper:
                         break
                     c = params.which[i, f, u]
-                    centre, half = found.value[params.circuit[i, c]] * params.slope[i, c], params.half[i, c]
+                    centre, half = (
+                        found.value[params.circuit[i, c]] * params.slope[i, c],
+                        params.half[i, c],
+                    )
                     low, high = max(low, centre - half), min(high, centre + half)
                 lower, upper = min(lower, low), max(upper, high)
         found.lower[i] = lower if found.explanations else math.nan
@@ -214,14 +261,20 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
     n, any_found = params.sensors.n, False
     for i in range(n):
         beyond = params.threshold * params.bound[i]
-        if params.sensors.detectable[i] and (found.upper[i] >= beyond or found.lower[i] <= -beyond):
+        if params.sensors.detectable[i] and (
+            found.upper[i] >= beyond or found.lower[i] <= -beyond
+        ):
             any_found = True
             for j in range(n):
                 if params.sensors.alike[i, j]:
                     verdict.suspects[j] = params.sensors.detectable[j]
     verdict.isolated = True
     for i in range(n):
-        lower, upper, beyond = found.lower[i], found.upper[i], params.threshold * params.bound[i]
+        lower, upper, beyond = (
+            found.lower[i],
+            found.upper[i],
+            params.threshold * params.bound[i],
+        )
         # No explanation, or only channels whose faults the geometry hides could have failed: nothing to choose by.
         if not any_found:
             verdict.suspects[i] = params.sensors.detectable[i]
@@ -233,7 +286,9 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
 
 
 @callback(Circuits, Findings, SampleInput, SampleVerdict)
-def judge(params: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(
+    params: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Judge one sample by its checks, and if these need a fault by what all explanations have in common."""
     verdict.statistic, verdict.threshold = check(params, sample.z, found), params.limit
     if verdict.statistic < min(WITHIN, params.limit):
@@ -253,7 +308,12 @@ def judge(params: Circuits, found: Findings, sample: SampleInput, verdict: Sampl
 
 @compiled
 def explain_rows(
-    params: NDArray[Any], found: NDArray[Any], z: Array, ruled_out: NDArray[np.int64], lower: Array, upper: Array
+    params: NDArray[Any],
+    found: NDArray[Any],
+    z: Array,
+    ruled_out: NDArray[np.int64],
+    lower: Array,
+    upper: Array,
 ) -> None:
     """Fill in the bits of the sets that samples z (N, n) rule out, (N,), and the intervals of the errors, (N, n)."""
     for k in range(len(z)):
@@ -312,15 +372,27 @@ class Guaranteed(Detector):
         reduce_max_faults: bool = False,
     ) -> None:
         if not 0 < threshold < np.inf:
-            raise ConfigError(f"threshold is {threshold:g} bounds, expected finite and > 0")
+            raise ConfigError(
+                f"threshold is {threshold:g} bounds, expected finite and > 0"
+            )
         self.max_faults = _allowed_faults(geometry.n, max_faults, reduce_max_faults)
-        options = {"max_faults": self.max_faults, "threshold": threshold, "reduce_max_faults": True}
+        options = {
+            "max_faults": self.max_faults,
+            "threshold": threshold,
+            "reduce_max_faults": True,
+        }
         super().__init__(geometry, noise, options)
         if self.noise.bound is None:
-            raise DetectorError("guaranteed needs noise.bound (rad/s, > 0): the limit of a healthy channel's error")
+            raise DetectorError(
+                "guaranteed needs noise.bound (rad/s, > 0): the limit of a healthy channel's error"
+            )
         self.bound: Array = self.noise.bound
         self.threshold = threshold
-        self.sets = tuple(f for size in range(self.max_faults + 1) for f in combinations(range(geometry.n), size))
+        self.sets = tuple(
+            f
+            for size in range(self.max_faults + 1)
+            for f in combinations(range(geometry.n), size)
+        )
         """Sets of channels that may be the faulty ones, smallest first; columns of `culprits`."""
         params = self.constants[0]
         params["bound"][: geometry.n], params["threshold"] = self.bound, threshold
@@ -333,7 +405,11 @@ class Guaranteed(Detector):
     @classmethod
     def refuses(cls, n: int) -> str:
         """Why the method cannot run on n channels that span space; empty if it can."""
-        return "" if n <= MOST_CHANNELS else f"guaranteed runs on 4 to {MOST_CHANNELS} channels, got {n}"
+        return (
+            ""
+            if n <= MOST_CHANNELS
+            else f"guaranteed runs on 4 to {MOST_CHANNELS} channels, got {n}"
+        )
 
     def _prepare_checks(self, checks: Array) -> None:
         """Fill in checks (C, n), and for each the sets of channels that leave all its members healthy."""
@@ -343,8 +419,14 @@ class Guaranteed(Detector):
         struck = np.array([[i in channels for i in range(n)] for channels in self.sets])
         untouched = (struck @ (checks != 0).T) == 0
         params["rules_out"][:count] = (1 << np.arange(len(self.sets))) @ untouched
-        largest = [channels for channels in self.sets if len(channels) == self.max_faults]
-        params["faults"], params["sets"], params["first"] = self.max_faults, len(largest), len(self.sets) - len(largest)
+        largest = [
+            channels for channels in self.sets if len(channels) == self.max_faults
+        ]
+        params["faults"], params["sets"], params["first"] = (
+            self.max_faults,
+            len(largest),
+            len(self.sets) - len(largest),
+        )
         params["members"] = ABSENT
         params["members"][: len(largest), : self.max_faults] = largest
 
@@ -357,13 +439,19 @@ class Guaranteed(Detector):
             # The narrowest first: they leave least to tighten.
             order = np.argsort(half, kind="stable")
             through, count = through[order], len(through)
-            params["circuit"][i, :count], params["half"][i, :count] = through, half[order]
+            params["circuit"][i, :count], params["half"][i, :count] = (
+                through,
+                half[order],
+            )
             params["slope"][i, :count] = 1 / checks[through, i]
             others = np.delete(checks[through] != 0, i, axis=1)
             for f, channels in enumerate(self.sets[params["first"] :]):
                 struck = [j in channels for j in range(self.geometry.n) if j != i]
                 usable = np.flatnonzero(~others[:, struck].any(axis=1))
-                params["usable"][i, f], params["which"][i, f, : len(usable)] = len(usable), usable
+                params["usable"][i, f], params["which"][i, f, : len(usable)] = (
+                    len(usable),
+                    usable,
+                )
 
     @property
     def isolable(self) -> Mask:
@@ -407,7 +495,11 @@ class Guaranteed(Detector):
 
     def _explain(self, z: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Bits of the sets that samples z (N, n), all finite, rule out, and lower and upper ends of the intervals."""
-        ruled_out, lower, upper = np.empty(len(z), dtype=np.int64), np.empty(z.shape), np.empty(z.shape)
+        ruled_out, lower, upper = (
+            np.empty(len(z), dtype=np.int64),
+            np.empty(z.shape),
+            np.empty(z.shape),
+        )
         explain_rows(self.constants, allocate(Findings), z, ruled_out, lower, upper)
         return ruled_out, lower, upper
 
@@ -416,8 +508,14 @@ def _allowed_faults(n: int, asked: int | None, reduce: bool) -> int:
     allowed = min(MOST_FAULTS, n - 4)
     if asked is None:
         return allowed
-    if not isinstance(asked, int) or isinstance(asked, bool) or not 0 <= asked <= MOST_FAULTS:
+    if (
+        not isinstance(asked, int)
+        or isinstance(asked, bool)
+        or not 0 <= asked <= MOST_FAULTS
+    ):
         raise ConfigError(f"max_faults is {asked}, expected 0, 1 or 2")
     if asked > allowed and not reduce:
-        raise DetectorError(f"max_faults is {asked} with {n} channels, expected at most {allowed} (n - 4)")
+        raise DetectorError(
+            f"max_faults is {asked} with {n} channels, expected at most {allowed} (n - 4)"
+        )
     return min(asked, allowed)

@@ -17,7 +17,14 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_CHANNELS, Flag, Whole, callback, compiled, record
+from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
+    Flag,
+    Whole,
+    callback,
+    compiled,
+    record,
+)
 from fdi_ros.core.records import SampleInput, SampleVerdict
 from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
@@ -53,12 +60,18 @@ class OneNorm(SingleFault):
     """For the norm `l1`: every set of n - 3 channels whose errors alone can explain a sample."""
 
     sets: Whole  # how many
-    channels: Annotated[NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)]  # [b, k]: channel k of set b
-    solutions: Annotated[NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)]  # its error as a form of z
+    channels: Annotated[
+        NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)
+    ]  # [b, k]: channel k of set b
+    solutions: Annotated[
+        NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)
+    ]  # its error as a form of z
 
 
 @callback(OneNorm, NoState, SampleInput, SampleVerdict)
-def judge_one_norm(params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_one_norm(
+    params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Judge one sample by the error of least 1-norm that explains it."""
     n, z = params.sensors.n, sample.z
     best, least = 0, np.inf
@@ -72,7 +85,9 @@ def judge_one_norm(params: OneNorm, state: NoState, sample: SampleInput, verdict
             best, least = b, norm
     # The scores of all other channels are zero as they come.
     for k in range(n - 3):
-        verdict.scores[params.channels[best, k]] = abs(value_of(params.solutions[best, k], z, n))
+        verdict.scores[params.channels[best, k]] = abs(
+            value_of(params.solutions[best, k], z, n)
+        )
     conclude_by_error(params, sample, verdict)
 
 
@@ -127,10 +142,18 @@ class Projector(SingleFaultDetector):
         if one:
             sets, solutions = _basic_solutions(self.basis, geometry.detectable)
             count, m, n = solutions.shape
-            params["sets"], params["channels"][:count, :m], params["solutions"][:count, :m, :n] = count, sets, solutions
+            (
+                params["sets"],
+                params["channels"][:count, :m],
+                params["solutions"][:count, :m, :n],
+            ) = count, sets, solutions
         else:
-            set_forms(params, _unexplained(self.basis, geometry.detectable), squares=True)
-        params["limit"] = largest_form_threshold(errors, geometry, self.noise, self.probability)
+            set_forms(
+                params, _unexplained(self.basis, geometry.detectable), squares=True
+            )
+        params["limit"] = largest_form_threshold(
+            errors, geometry, self.noise, self.probability
+        )
         self._try_faults()
 
 
@@ -164,7 +187,9 @@ def _unexplained(basis: Array, seen: NDArray[np.bool_]) -> Array:
     return forms
 
 
-def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Array]:
+def _basic_solutions(
+    basis: Array, seen: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], Array]:
     """Every set of n - 3 channels (b, n - 3) that spans parity space, and the forms (b, n - 3, n) of their errors.
 
     Channels whose faults are not seen are in no set.
@@ -173,7 +198,9 @@ def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.
     sets = np.array(list(combinations(np.flatnonzero(seen), m)))
     directions = basis[sets].transpose(0, 2, 1)
     spans = np.abs(np.linalg.det(directions)) > ROUNDING
-    solutions = np.linalg.solve(directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n)))
+    solutions = np.linalg.solve(
+        directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n))
+    )
     return sets[spans], solutions
 
 
@@ -185,7 +212,9 @@ NOTHING = 1e-20  # k_s of an innovation of 1e-10 standard deviations: rounding. 
 
 
 @callback(WithForms, NoState, SampleInput, SampleVerdict)
-def judge_innovations(params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_innovations(
+    params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Judge one sample by the largest k_s of all equations and permutations; form [k, i] as `innovations` has it."""
     n, largest = params.sensors.n, 0.0
     fill_variances(params, sample, verdict)
@@ -193,7 +222,9 @@ def judge_innovations(params: WithForms, state: NoState, sample: SampleInput, ve
         before, last = 0.0, 0.0
         for k in range(n - 3):
             form = params.forms[k, i]
-            innovation = value_of(form, sample.z, n) / std_of(params, form, 1.0, verdict)
+            innovation = value_of(form, sample.z, n) / std_of(
+                params, form, 1.0, verdict
+            )
             before, last = last, innovation * innovation
             largest = max(largest, last)
         verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
@@ -227,9 +258,17 @@ class Recursive(SingleFaultDetector):
     def __init__(self, geometry: Geometry, noise: NoiseModel, **rate: Any) -> None:
         n = geometry.n
         super().__init__(geometry, noise, {}, largest=True, scored=n > 4, **rate)
-        params, forms = self.constants[0], innovations(geometry.axes, self.noise.noise_std)
+        params, forms = (
+            self.constants[0],
+            innovations(geometry.axes, self.noise.noise_std),
+        )
         set_forms(params, forms)
-        params["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
+        params["limit"] = (
+            largest_form_threshold(
+                forms.reshape(-1, n), geometry, self.noise, self.probability
+            )
+            ** 2
+        )
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:
@@ -241,7 +280,9 @@ def innovations(axes: Array, noise_std: Array) -> Array:
     forms = np.zeros((n - 3, n, n))
     for last in range(n):
         order = (np.arange(n) + last + 1) % n
-        found = (_innovation(axes, noise_std, order[:k], int(order[k])) for k in range(1, n))
+        found = (
+            _innovation(axes, noise_std, order[:k], int(order[k])) for k in range(1, n)
+        )
         forms[:, last] = [form for form in found if form is not None]
     return forms
 
@@ -274,14 +315,22 @@ infinite."""
 class Struck(WithForms):
     """Constants of the comparison: [j] is [H z] without row j, its determinant the one form of score j."""
 
-    determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]  # their standard deviations at rest, rad/s
+    determinants_resting: Annotated[
+        NDArray[np.float64], "f8", (CHANNELS,)
+    ]  # their standard deviations at rest, rad/s
     by_condition: Flag  # the criterion is the condition number
-    complement: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]  # U' of H, as forms of z
-    singular: Annotated[NDArray[np.float64], "f8", (CHANNELS, 3)]  # singular values of H
+    complement: Annotated[
+        NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)
+    ]  # U' of H, as forms of z
+    singular: Annotated[
+        NDArray[np.float64], "f8", (CHANNELS, 3)
+    ]  # singular values of H
 
 
 @callback(Struck, NoState, SampleInput, SampleVerdict)
-def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_determinants(
+    params: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Judge one sample by the largest determinant over its standard deviation."""
     statistic = 0.0
     fill_variances(params, sample, verdict)
@@ -289,9 +338,13 @@ def judge_determinants(params: Struck, state: NoState, sample: SampleInput, verd
         size = abs(value_of(params.forms[0, j], sample.z, CHANNELS))
         # A determinant that is always zero has no deviation.
         if size > 0:
-            std = std_of(params, params.forms[0, j], params.determinants_resting[j], verdict)
+            std = std_of(
+                params, params.forms[0, j], params.determinants_resting[j], verdict
+            )
             statistic = max(statistic, size / std)
-        verdict.scores[j] = condition_without(params, j, sample) if params.by_condition else size
+        verdict.scores[j] = (
+            condition_without(params, j, sample) if params.by_condition else size
+        )
     conclude(params, worst(params, verdict), statistic, params.limit, sample, verdict)
 
 
@@ -307,9 +360,15 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     """
     u, z = params.complement[j], sample.z
     s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
-    a, b, c = value_of(u[0], z, CHANNELS), value_of(u[1], z, CHANNELS), value_of(u[2], z, CHANNELS)
+    a, b, c = (
+        value_of(u[0], z, CHANNELS),
+        value_of(u[1], z, CHANNELS),
+        value_of(u[2], z, CHANNELS),
+    )
     delta = abs(value_of(u[3], z, CHANNELS))
-    largest = largest_root((a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0))
+    largest = largest_root(
+        (a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0)
+    )
     a, b, c = a / s, b / t, c / v
     s, t, v = delta / s, delta / t, delta / v
     inverse = largest_root((a * a, b * b, c * c, 1.0), (s * s, t * t, v * v, 0.0))
@@ -368,15 +427,26 @@ class Determinant(SingleFaultDetector):
     Constants = Struck
     judge = judge_determinants
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel, *, criterion: str = "determinant", **rate: Any) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        criterion: str = "determinant",
+        **rate: Any,
+    ) -> None:
         by_condition = chosen("criterion", criterion, CRITERIA) == "condition_number"
-        super().__init__(geometry, noise, {"criterion": criterion}, largest=by_condition, **rate)
+        super().__init__(
+            geometry, noise, {"criterion": criterion}, largest=by_condition, **rate
+        )
         forms = determinant_forms(geometry.axes)
         params = self.constants[0]
         set_forms(params, forms[None])
         params["determinants_resting"] = resting_std(forms, self.noise)
         params["by_condition"] = by_condition
-        params["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
+        params["limit"] = largest_form_threshold(
+            forms, geometry, self.noise, self.probability
+        )
         for j in range(CHANNELS):
             others = np.delete(np.arange(CHANNELS), j)
             complement, params["singular"][j], _ = np.linalg.svd(geometry.axes[others])
@@ -395,5 +465,7 @@ def determinant_forms(axes: Array) -> Array:
     for j in range(CHANNELS):
         others = np.delete(np.arange(CHANNELS), j)
         for place, k in enumerate(others):
-            forms[j, k] = (-1.0) ** (place + 1) * np.linalg.det(axes[np.delete(others, place)])
+            forms[j, k] = (-1.0) ** (place + 1) * np.linalg.det(
+                axes[np.delete(others, place)]
+            )
     return forms

@@ -35,7 +35,12 @@ from fdi_ros.core.subsets import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, chi2_isf, max_normal_threshold
+from fdi_ros.model.noise import (
+    FalseAlarmRate,
+    NoiseModel,
+    chi2_isf,
+    max_normal_threshold,
+)
 from fdi_ros.model.samples import Array
 
 MAX_RATIO = 1e6
@@ -75,17 +80,23 @@ class Scratch:
     misfit: Channels  # chi-square of the best pair of each channel; of a unit, its three errors, rad/s
 
 
-def prepare_hypotheses(params: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:
+def prepare_hypotheses(
+    params: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool
+) -> None:
     """Fill a record of `Hypotheses`, noise with one value per channel.
 
     ``confidence``: with which rivals are rejected, above 0.5 and below 1 (else `ConfigError`). ``fixed``: the weights
     are those of noise_std in every sample.
     """
     if not 0.5 < confidence < 1:
-        raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
+        raise ConfigError(
+            f"confidence is {confidence:g}, expected above 0.5 and below 1"
+        )
     n, m, rest = geometry.n, geometry.n - 3, 1 - confidence
     params["fixed"] = fixed
-    params["residual"][:n, :n] = whitened_residuals(geometry, noise) if fixed else geometry.S
+    params["residual"][:n, :n] = (
+        whitened_residuals(geometry, noise) if fixed else geometry.S
+    )
     params["single_limit"] = chi2_isf(rest, m - 1) if m > 1 else math.inf
     params["pair_limit"] = chi2_isf(rest, m - 2) if m > 2 else math.inf
     params["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
@@ -113,17 +124,26 @@ def whitened_directions(geometry: Geometry, noise: NoiseModel) -> Array:
 def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
     """Whether a common fault of three channels, one chip or one cable, leaves at least one check."""
     rest = np.delete(geometry.axes, unit, axis=0)
-    return len(unit) == 3 and bool(geometry.detectable[list(unit)].all()) and len(rest) > 3 and spans_space(rest)
+    return (
+        len(unit) == 3
+        and bool(geometry.detectable[list(unit)].all())
+        and len(rest) > 3
+        and spans_space(rest)
+    )
 
 
 @compiled
-def fill_scratch(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
+def fill_scratch(
+    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch
+) -> None:
     """Work out what all hypotheses on one sample share."""
     n = sensors.n
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += params.residual[i, j] * (sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j])
+            total += params.residual[i, j] * (
+                sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j]
+            )
         room.residual[i] = total
     if not params.fixed:
         for i in range(n):
@@ -131,7 +151,9 @@ def fill_scratch(params: Hypotheses, sensors: Sensors, sample: SampleInput, room
 
 
 @compiled
-def leave_out(params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int) -> None:
+def leave_out(
+    params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int
+) -> None:
     """Residuals without channels a, b, c (b and c may be -1: none) in `kept`, and in their own places their errors."""
     S, r = params.residual, room.residual
     e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
@@ -162,7 +184,9 @@ def leave_out(params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int)
 
 
 @compiled
-def correct_rate(sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+def correct_rate(
+    sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int
+) -> float:
     """Correct the rate of the channels kept by their weights in this sample; return the chi-square they leave.
 
     `kept` holds residuals about the plain least-squares rate: of the size of the noise, so that the weighted solution
@@ -211,7 +235,15 @@ def along(axis: Array, vector: Array) -> float:
 
 
 @compiled
-def fit(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+def fit(
+    params: Hypotheses,
+    sensors: Sensors,
+    sample: SampleInput,
+    room: Scratch,
+    a: int,
+    b: int,
+    c: int,
+) -> float:
     """Fit the hypothesis that channels a, b, c are faulty: chi-square of the others; errors in `estimate`, rad/s."""
     leave_out(params, sensors.n, room, a, b, c)
     residual = 0.0
@@ -226,12 +258,16 @@ def fit(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch
         if i >= 0 and params.fixed:
             room.estimate[place] = room.kept[i] * sensors.noise_std[i]
         elif i >= 0:
-            room.estimate[place] = room.kept[i] - along(sensors.axes[i], room.correction)
+            room.estimate[place] = room.kept[i] - along(
+                sensors.axes[i], room.correction
+            )
     return residual
 
 
 @compiled
-def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int) -> float:
+def whitened(
+    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int
+) -> float:
     """Error of channel i over its standard deviation; 0 if no fault of it is seen."""
     if not sensors.detectable[i]:
         return 0.0
@@ -240,13 +276,21 @@ def whitened(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Sc
     leave_out(params, sensors.n, room, i, -1, -1)
     correct_rate(sensors, sample, room, i, -1, -1)
     h, s = sensors.axes[i], room.inverse
-    own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (s[3] * h[1] + 2 * s[4] * h[2])
+    own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (
+        s[3] * h[1] + 2 * s[4] * h[2]
+    )
     spread = room.variance[i] + own_part + h[2] * s[5] * h[2]
     return (room.kept[i] - along(h, room.correction)) / math.sqrt(spread)
 
 
 @compiled
-def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
+def explain(
+    params: Hypotheses,
+    sensors: Sensors,
+    sample: SampleInput,
+    room: Scratch,
+    verdict: SampleVerdict,
+) -> None:
     """Name the channels that explain a sample taken by `fill_scratch`: suspects, whether isolated, their errors.
 
     A single channel and its rivals, else pairs, else a whole unit, else all: docs/methods.md#likelihood_ratio.
@@ -260,11 +304,16 @@ def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scr
             best = min(best, room.remaining[i])
     if best <= params.single_limit:
         for i in range(n):
-            verdict.suspects[i] = sensors.detectable[i] and room.remaining[i] <= best + params.rival_margin
-        verdict.isolated = params.can_isolate and add_alike(sensors, verdict.suspects) == 1
-    elif not explain_by_pairs(params, sensors, sample, room, verdict) and not explain_by_units(
+            verdict.suspects[i] = (
+                sensors.detectable[i]
+                and room.remaining[i] <= best + params.rival_margin
+            )
+        verdict.isolated = (
+            params.can_isolate and add_alike(sensors, verdict.suspects) == 1
+        )
+    elif not explain_by_pairs(
         params, sensors, sample, room, verdict
-    ):
+    ) and not explain_by_units(params, sensors, sample, room, verdict):
         verdict.isolated = False
         for i in range(n):
             verdict.suspects[i] = sensors.detectable[i]
@@ -275,7 +324,11 @@ def explain(params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scr
 
 @compiled
 def explain_by_pairs(
-    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+    params: Hypotheses,
+    sensors: Sensors,
+    sample: SampleInput,
+    room: Scratch,
+    verdict: SampleVerdict,
 ) -> bool:
     """Name the channels of all pairs that explain the sample; False, and nothing is named, if none does."""
     if not params.pairs:
@@ -287,7 +340,11 @@ def explain_by_pairs(
     for i in range(n):
         for j in range(i + 1, n):
             # Two that cannot be told apart explain no more together than one of them.
-            if sensors.detectable[i] and sensors.detectable[j] and not sensors.alike[i, j]:
+            if (
+                sensors.detectable[i]
+                and sensors.detectable[j]
+                and not sensors.alike[i, j]
+            ):
                 residual = fit(params, sensors, sample, room, i, j, -1)
                 if residual <= params.pair_limit:
                     possible += 1
@@ -300,13 +357,17 @@ def explain_by_pairs(
 
 
 @compiled
-def add_suspect(room: Scratch, verdict: SampleVerdict, i: int, residual: float, estimate: float) -> None:
+def add_suspect(
+    room: Scratch, verdict: SampleVerdict, i: int, residual: float, estimate: float
+) -> None:
     """Make a channel of a pair that explains the sample a suspect; its error is that of the best pair it is in.
 
     Of pairs that explain the sample equally well, as all pairs of three parallel axes do, the largest error counts.
     """
     verdict.suspects[i] = True
-    as_good = residual <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(verdict.error[i])
+    as_good = residual <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(
+        verdict.error[i]
+    )
     if residual < room.misfit[i] - SAME_FIT or as_good:
         verdict.error[i] = estimate
     room.misfit[i] = min(room.misfit[i], residual)
@@ -314,13 +375,20 @@ def add_suspect(room: Scratch, verdict: SampleVerdict, i: int, residual: float, 
 
 @compiled
 def explain_by_units(
-    params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+    params: Hypotheses,
+    sensors: Sensors,
+    sample: SampleInput,
+    room: Scratch,
+    verdict: SampleVerdict,
 ) -> bool:
     """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
     found, possible = -1, 0
     for k in range(params.units):
         unit = params.unit[k]
-        if fit(params, sensors, sample, room, unit[0], unit[1], unit[2]) <= params.unit_limit:
+        if (
+            fit(params, sensors, sample, room, unit[0], unit[1], unit[2])
+            <= params.unit_limit
+        ):
             found, possible = k, possible + 1
             for place in range(3):
                 room.misfit[place] = room.estimate[place]
@@ -363,14 +431,18 @@ class Constants:
 
 
 @callback(Constants, Scratch, SampleInput, SampleVerdict)
-def judge(params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge(
+    params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Largest whitened residual of all channels; on alarm, the channels that explain it."""
     sensors, largest = params.sensors, 0.0
     fill_scratch(params.hypotheses, sensors, sample, room)
     for i in range(sensors.n):
         verdict.scores[i] = math.nan
         if sensors.detectable[i]:
-            verdict.scores[i] = abs(whitened(params.hypotheses, sensors, sample, room, i))
+            verdict.scores[i] = abs(
+                whitened(params.hypotheses, sensors, sample, room, i)
+            )
             largest = max(largest, verdict.scores[i])
     verdict.statistic, verdict.threshold = largest, params.threshold
     verdict.alarm = largest >= params.threshold
@@ -417,10 +489,24 @@ class LikelihoodRatio(Detector):
         sample_rate: float | None = None,
         confidence: float = 0.999,
     ) -> None:
-        rate = FalseAlarmRate(None, false_alarm_probability, false_alarms_per_hour, sample_rate)
+        rate = FalseAlarmRate(
+            None, false_alarm_probability, false_alarms_per_hour, sample_rate
+        )
         self.probability = rate.per_sample()
-        super().__init__(geometry, noise, {"false_alarm_probability": self.probability, "confidence": confidence})
+        super().__init__(
+            geometry,
+            noise,
+            {"false_alarm_probability": self.probability, "confidence": confidence},
+        )
         params = self.constants[0]
-        prepare_hypotheses(params["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
-        self.threshold = max_normal_threshold(whitened_directions(geometry, self.noise), self.probability)
+        prepare_hypotheses(
+            params["hypotheses"],
+            geometry,
+            self.noise,
+            confidence,
+            fixed=self.noise.constant,
+        )
+        self.threshold = max_normal_threshold(
+            whitened_directions(geometry, self.noise), self.probability
+        )
         params["threshold"] = self.threshold

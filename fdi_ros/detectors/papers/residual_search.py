@@ -56,22 +56,50 @@ class ResidualSearch(SingleFaultDetector):
 
     Constants = WithForms
     judge = judge_sums
-    criterion_squares: ClassVar[bool] = False  # the criterion sums squares, not absolute values
-    criterion_largest: ClassVar[bool] = False  # the worst channel has the largest figure, not the least
+    criterion_squares: ClassVar[bool] = (
+        False  # the criterion sums squares, not absolute values
+    )
+    criterion_largest: ClassVar[bool] = (
+        False  # the worst channel has the largest figure, not the least
+    )
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel, *, tolerance: str = "calibrated", **rate: Any) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        tolerance: str = "calibrated",
+        **rate: Any,
+    ) -> None:
         paper = chosen("tolerance", tolerance, TOLERANCES) == "paper"
-        if paper and any(value is not None for name, value in rate.items() if name != "sample_rate"):
-            raise ConfigError("tolerance 'paper' keeps no false-alarm rate: leave it out, or take 'calibrated'")
+        if paper and any(
+            value is not None for name, value in rate.items() if name != "sample_rate"
+        ):
+            raise ConfigError(
+                "tolerance 'paper' keeps no false-alarm rate: leave it out, or take 'calibrated'"
+            )
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
         scored = self.criterion_largest or geometry.n > 4
         largest = self.criterion_largest or not scored
-        super().__init__(geometry, noise, {"tolerance": tolerance}, largest=largest, scored=scored, **rate)
+        super().__init__(
+            geometry,
+            noise,
+            {"tolerance": tolerance},
+            largest=largest,
+            scored=scored,
+            **rate,
+        )
         params = self.constants[0]
-        set_forms(params, self._forms(geometry) if scored else self.errors[None], self.criterion_squares and scored)
+        set_forms(
+            params,
+            self._forms(geometry) if scored else self.errors[None],
+            self.criterion_squares and scored,
+        )
         params["paper"] = paper
         if not paper:
-            params["limit"] = largest_form_threshold(self.errors, geometry, self.noise, self.probability)
+            params["limit"] = largest_form_threshold(
+                self.errors, geometry, self.noise, self.probability
+            )
         self._try_faults()
 
     def _forms(self, geometry: Geometry) -> Array:
@@ -111,7 +139,12 @@ class RateDeviation(ResidualSearch):
     def _forms(self, geometry: Geometry) -> Array:
         # Leaving out j changes the rate by G_i[:, j] (z_j - z_jp).
         return _squares(
-            geometry, lambda forms, gain: forms * np.linalg.norm(gain, axis=0)[:, None] / math.sqrt(3 * len(forms))
+            geometry,
+            lambda forms, gain: (
+                forms
+                * np.linalg.norm(gain, axis=0)[:, None]
+                / math.sqrt(3 * len(forms))
+            ),
         )
 
 

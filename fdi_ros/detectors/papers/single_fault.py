@@ -54,7 +54,9 @@ def resting_std(forms: Array, noise: NoiseModel) -> Array:
     return np.sqrt(forms**2 @ noise.noise_std**2)
 
 
-def largest_form_threshold(forms: Array, geometry: Geometry, noise: NoiseModel, probability: float) -> float:
+def largest_form_threshold(
+    forms: Array, geometry: Geometry, noise: NoiseModel, probability: float
+) -> float:
     """Level that the largest |f| / std of forms (k, n) exceeds with a probability when every channel is healthy.
 
     A row of zeros is a form that is always zero.
@@ -62,7 +64,9 @@ def largest_form_threshold(forms: Array, geometry: Geometry, noise: NoiseModel, 
     gain = forms[np.abs(forms).max(axis=1) > 0] @ geometry.parity.T
     covariance = (geometry.parity * noise.noise_std**2) @ geometry.parity.T
     directions = gain @ np.linalg.cholesky(covariance)
-    return max_normal_threshold(directions / np.linalg.norm(directions, axis=1, keepdims=True), probability)
+    return max_normal_threshold(
+        directions / np.linalg.norm(directions, axis=1, keepdims=True), probability
+    )
 
 
 @compiled
@@ -87,7 +91,9 @@ class SingleFault:
     errors: Square  # row i: z_i - z_ip, channel i against its prediction from all others, as a form of z
     resting: Channels  # standard deviation of z_i - z_ip at rest, rad/s
     limit: Real  # threshold of the method's figure
-    suspects: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # row i: suspects when i is named
+    suspects: Annotated[
+        NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)
+    ]  # row i: suspects when i is named
     names: Flags  # the fault is isolated when i is named
     sign: Real  # +1: the worst channel has the largest score; -1: the least
     scored: Flag  # the scores tell channels apart; if not, none are published
@@ -130,20 +136,33 @@ class SingleFaultDetector(Detector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        rate = FalseAlarmRate(None, false_alarm_probability, false_alarms_per_hour, sample_rate)
+        rate = FalseAlarmRate(
+            None, false_alarm_probability, false_alarms_per_hour, sample_rate
+        )
         super().__init__(geometry, noise, {**options, **rate.as_options()})
         self.probability = rate.per_sample()
         n = geometry.n
         self.errors = prediction_errors(geometry.axes) if errors is None else errors
         params = self.constants[0]
-        params["errors"][:n, :n], params["resting"][:n] = self.errors, resting_std(self.errors, self.noise)
-        params["limit"], params["sign"], params["scored"] = np.inf, 1.0 if largest else -1.0, scored
-        self._set_suspects(geometry.group_matrix & geometry.detectable, geometry.isolable)
+        params["errors"][:n, :n], params["resting"][:n] = (
+            self.errors,
+            resting_std(self.errors, self.noise),
+        )
+        params["limit"], params["sign"], params["scored"] = (
+            np.inf,
+            1.0 if largest else -1.0,
+            scored,
+        )
+        self._set_suspects(
+            geometry.group_matrix & geometry.detectable, geometry.isolable
+        )
 
     @property
     def isolable(self) -> Mask:
         """Channels whose fault is named, and no other's fault in its place, (n,)."""
-        return self._names & ~(self._suspects & ~np.eye(self.geometry.n, dtype=bool)).any(axis=0)
+        return self._names & ~(
+            self._suspects & ~np.eye(self.geometry.n, dtype=bool)
+        ).any(axis=0)
 
     def _set_suspects(self, suspects: Mask, names: Mask) -> None:
         """Set the suspects when channel i is named, row i of (n, n), and whether that isolates the fault, (n,)."""
@@ -162,7 +181,11 @@ class SingleFaultDetector(Detector):
         functions of z, of which the fault then is the larger part.
         """
         n = self.geometry.n
-        noise = TRIAL_NOISE * self.noise.noise_std * np.random.default_rng(n).standard_normal((TRIALS, n))
+        noise = (
+            TRIAL_NOISE
+            * self.noise.noise_std
+            * np.random.default_rng(n).standard_normal((TRIALS, n))
+        )
         found = self._suspects.copy()
         for channel in np.flatnonzero(self.geometry.detectable):
             z = noise.copy()
@@ -190,18 +213,24 @@ def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
 
 
 @compiled
-def fill_variances(params: SingleFault, sample: SampleInput, verdict: SampleVerdict) -> None:
+def fill_variances(
+    params: SingleFault, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Error variance of each channel at the least-squares rate of the sample, (rad/s)^2, where that depends on it.
 
     It is in the place of the errors, which is free until the verdict is concluded.
     """
     for i in range(0 if params.sensors.constant else params.sensors.n):
         rate_along = sample.z[i] - error_of(params, i, sample) * params.sensors.share[i]
-        verdict.error[i] = variance_of(params.sensors, i, rate_along, sample.acceleration)
+        verdict.error[i] = variance_of(
+            params.sensors, i, rate_along, sample.acceleration
+        )
 
 
 @compiled
-def std_of(params: SingleFault, form: Array, resting: float, verdict: SampleVerdict) -> float:
+def std_of(
+    params: SingleFault, form: Array, resting: float, verdict: SampleVerdict
+) -> float:
     """Return the standard deviation of one form in the sample, after `fill_variances`, from that at rest."""
     if params.sensors.constant:
         return resting
@@ -212,17 +241,31 @@ def std_of(params: SingleFault, form: Array, resting: float, verdict: SampleVerd
 
 
 @compiled
-def conclude_by_error(params: SingleFault, sample: SampleInput, verdict: SampleVerdict) -> None:
+def conclude_by_error(
+    params: SingleFault, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Fill the verdict, whose scores are there, by ``|z_i - z_ip|`` of the worst over its standard deviation."""
     named = worst(params, verdict)
     fill_variances(params, sample, verdict)
     std = std_of(params, params.errors[named], params.resting[named], verdict)
-    conclude(params, named, abs(error_of(params, named, sample)) / std, params.limit, sample, verdict)
+    conclude(
+        params,
+        named,
+        abs(error_of(params, named, sample)) / std,
+        params.limit,
+        sample,
+        verdict,
+    )
 
 
 @compiled
 def conclude(
-    params: SingleFault, named: int, statistic: float, threshold: float, sample: SampleInput, verdict: SampleVerdict
+    params: SingleFault,
+    named: int,
+    statistic: float,
+    threshold: float,
+    sample: SampleInput,
+    verdict: SampleVerdict,
 ) -> None:
     """Fill the verdict, whose scores are there, from the channel named, the statistic and its threshold."""
     alarm = statistic >= threshold
@@ -245,18 +288,26 @@ class WithForms(SingleFault):
 
     terms: Whole  # forms per score
     squares: Flag  # sum squares, not absolute values
-    forms: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)]  # [t, i]: t of score i
+    forms: Annotated[
+        NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)
+    ]  # [t, i]: t of score i
     paper: Flag  # the tolerance of a residual search is that of its paper
 
 
 def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
     """Fill in forms (t, n, n)."""
     terms, n, _ = forms.shape
-    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = terms, squares, forms
+    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = (
+        terms,
+        squares,
+        forms,
+    )
 
 
 @callback(WithForms, NoState, SampleInput, SampleVerdict)
-def judge_sums(params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+def judge_sums(
+    params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict
+) -> None:
     """Judge one sample by the error of the channel that the sums of absolute or squared forms name."""
     for i in range(params.sensors.n):
         for t in range(params.terms):
@@ -265,7 +316,17 @@ def judge_sums(params: WithForms, state: NoState, sample: SampleInput, verdict: 
     if params.paper:
         named = worst(params, verdict)
         residual = error_of(params, named, sample)
-        zero, scale = params.sensors.noise_std[named], params.sensors.scale_std[named] * (sample.z[named] - residual)
-        conclude(params, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
+        zero, scale = (
+            params.sensors.noise_std[named],
+            params.sensors.scale_std[named] * (sample.z[named] - residual),
+        )
+        conclude(
+            params,
+            named,
+            abs(residual),
+            3 * math.sqrt(zero * zero + scale * scale),
+            sample,
+            verdict,
+        )
     else:
         conclude_by_error(params, sample, verdict)
