@@ -32,10 +32,10 @@ from trials import CONFIGS, Array, Asked, Mask, Row, faulty, is_state, seconds_o
 from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.faults.fault import fault_from
+from fdi_ros.inspection.starting_config import starting_config_of
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.starting_config import starting_config_of
 
 WITHIN = (
     1.0,

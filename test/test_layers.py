@@ -1,10 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The layers are what the imports say: every arrow points down, and each outside library has one place."""
+"""Imports follow the layers of docs/architecture.md, and each library has one place."""
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from functools import cache
@@ -15,23 +16,20 @@ import pytest
 from fdi_ros.system import REQUIRED
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
-LAYERS = (
-    ("errors",),
-    ("system",),
-    ("config",),
-    ("model", "compiling"),
-    ("core",),
-    ("estimator",),
-    ("detectors",),
-    ("monitor",),
-    ("report", "faults", "mavlink"),
-    ("bag",),
-    ("replay", "setup"),
-    ("experiments", "fleet"),
-    ("ros",),
-    ("cli",),
-)
-LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
+ARCHITECTURE = PACKAGE.parent / "docs" / "architecture.md"
+
+
+def documented_layers():
+    """Rows of the table in docs/architecture.md, top first: the parts that each holds."""
+    section = ARCHITECTURE.read_text().partition("\n## Layers\n")[2]
+    rows = section.partition("\n## ")[0].splitlines()
+    cells = (row.split("|")[1] for row in rows if row.startswith("| `"))
+    return [re.findall(r"`(\w+)(?:/|\.py)`", cell) for cell in cells]
+
+
+LEVEL = {
+    part: level for level, parts in enumerate(documented_layers()) for part in parts
+}
 BAG_LIBRARIES = {"rosbags", "mcap"}
 MESSAGES = {
     f"{name}_msgs"
@@ -85,8 +83,8 @@ def violations(module, names):
         package, _, rest = name.partition(".")
         target = rest.partition(".")[0]
         if package == "fdi_ros":
-            if target in LEVEL and LEVEL[target] > LEVEL[part]:
-                found.append(f"{part} imports {name}, which stands above it")
+            if target in LEVEL and target != part and LEVEL[target] >= LEVEL[part]:
+                found.append(f"{part} imports {name}, which is not in a row above it")
             if target not in LEVEL and target != "__version__" and part != "cli":
                 found.append(f"{part} imports {name} through the package's own front")
         elif (
@@ -118,10 +116,10 @@ def modules():
     }
 
 
-def test_no_import_points_up():
+def test_imports_follow_the_table_of_layers():
     known = modules()
     assert {module.split(".")[1] for module in known} - LEVEL.keys() == set(), (
-        "they have no place in the layers"
+        "they have no row in the table of docs/architecture.md"
     )
     found = {
         module: violations(module.partition(".")[2], imports(path))
@@ -141,6 +139,12 @@ def test_no_import_goes_in_a_circle():
         for module, path in known.items()
     }
     graphlib.TopologicalSorter(graph).prepare()
+    folders = {}
+    for module, targets in graph.items():
+        names = {target.split(".")[1] for target in targets}
+        part = module.split(".")[1]
+        folders.setdefault(part, set()).update(names - {part})
+    graphlib.TopologicalSorter(folders).prepare()
 
 
 def python(code, *words):
@@ -172,7 +176,7 @@ def test_the_core_imports_without_ros_and_bag_libraries():
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
 
 
-OFFLINE = {"bag", "replay", "experiments", "report", "setup"}
+OFFLINE = {"bag", "inspection", "replay", "experiments", "report", "setup"}
 
 
 def test_a_live_node_imports_nothing_that_is_for_offline_use():

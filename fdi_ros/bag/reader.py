@@ -19,8 +19,6 @@ import zstandard
 from fdi_ros import __version__
 from fdi_ros.bag.csv_file import CsvLog
 from fdi_ros.bag.dataflash import DataflashLog
-from fdi_ros.bag.library_bags import Ros1File, SqliteFile
-from fdi_ros.bag.library_logs import Tlog, Ulog
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import (
     MADE_BY_FDI,
@@ -31,6 +29,10 @@ from fdi_ros.bag.raw import (
     Topic,
     find_files,
 )
+from fdi_ros.bag.ros1_file import Ros1File
+from fdi_ros.bag.sqlite_file import SqliteFile
+from fdi_ros.bag.tlog import Tlog
+from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError

@@ -15,23 +15,18 @@ from fdi_ros.bag.reader import Recording, convert
 from fdi_ros.cli.outputs import Kind, Outputs, check_part, progress
 from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
-from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.inspect import (
+from fdi_ros.inspection.findings import findings_figures, verdict_of
+from fdi_ros.inspection.fitness import candidates, needs, recording_findings
+from fdi_ros.inspection.starting_config import starting_config
+from fdi_ros.inspection.topics import (
     TopicReport,
     inspect,
     recording_figures,
     recording_text,
     topics_text,
 )
-from fdi_ros.setup.starting_config import (
-    candidates,
-    findings_figures,
-    needs,
-    recording_findings,
-    starting_config,
-    verdict_of,
-)
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.report.layout import unit_of
 from fdi_ros.system.files import whole
 from fdi_ros.system.text import LINE, shown
 

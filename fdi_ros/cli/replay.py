@@ -28,6 +28,8 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
+from fdi_ros.inspection.degrees import refuse_degrees
+from fdi_ros.inspection.starting_config import assumed_config
 from fdi_ros.mavlink.failover import failover_text
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
@@ -44,7 +46,6 @@ from fdi_ros.replay.words import (
     verdict,
 )
 from fdi_ros.report.layout import unit_of
-from fdi_ros.setup.starting_config import assumed_config, refuse_degrees
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text
 from fdi_ros.system.text import shown, storable

@@ -32,6 +32,8 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file, parameters_of
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
+from fdi_ros.inspection.segments import NoiseSegments
+from fdi_ros.inspection.starting_config import starting_config_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
@@ -41,8 +43,6 @@ from fdi_ros.replay.summary import Summary
 from fdi_ros.replay.words import sample_rate_notes, verdict
 from fdi_ros.report.layout import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
-from fdi_ros.setup.noise import NoiseSegments
-from fdi_ros.setup.starting_config import starting_config_of
 from fdi_ros.system.files import open_regular
 from fdi_ros.system.jobs import run_jobs
 from fdi_ros.system.text import date_of, shown, storable

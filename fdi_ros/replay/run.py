@@ -27,6 +27,7 @@ from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
+from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
@@ -47,7 +48,6 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.setup.starting_config import assumed_config, starting_config_of
 
 OnProgress = Callable[[float], None]  # called with the share done, 0 to 1
 Source = str | PathLike[str]

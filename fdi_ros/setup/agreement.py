@@ -19,18 +19,23 @@ import numpy as np
 
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
-from fdi_ros.model.geometry import ROUNDING, Geometry, spans_space
-from fdi_ros.model.samples import Array
-from fdi_ros.setup.blocks import WINDOW, Data
-
-LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s: biases are mostly less
-LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
-LEAST_WINDOWS = (
-    20  # in motion; with fewer, units are not compared, and no mount is estimated
+from fdi_ros.inspection.turns import (
+    LEAST_ROTATION,
+    LEAST_WINDOWS,
+    SHARED,
+    SQUARE,
+    WINDOW,
+    angle_of,
+    find_turn,
 )
-SHARED, SAME = 0.7, 0.9
-"""Share of rotation in common, or correlation: less contradicts, more shows the rotation, if along other axes or on
-another scale. Vibration and late stamps take some of it."""
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.samples import Array
+from fdi_ros.setup.blocks import Data
+
+LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
+#: Share of rotation in common from which two units show one rotation, along other axes
+#: or on another scale.
+SAME = 0.9
 SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
@@ -212,9 +217,6 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
     return found
 
 
-# How the units are turned against each other --------------------------------------------------------------------------
-
-
 LEAST_RATE = (
     LEAST_ROTATION / 5
 )  # rotation about some axis, root mean square, below which nothing turns, rad/s
@@ -222,36 +224,6 @@ LARGEST_ERROR = np.radians(
     2.0
 )  # a mount less certain than this, in any direction, is not shown
 SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
-SQUARE = np.radians(
-    10.0
-)  # a mount this close to axes along axes is taken for that: the rest is misalignment
-
-
-def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
-    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976).
-
-    Returns the rotation (3, 3) that takes its rates best into those of the first, v_first = R v_unit, and the same of
-    all mirrored frames; and the variance of the least certain direction, rad^2, over the mean square of what is left,
-    (rad/s)^2: infinite where the two never turn about two axes together.
-    """
-    left, size, right = np.linalg.svd(first.T @ unit)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation, mirrored = (left * sign) @ right, (left * sign * [1.0, 1.0, -1.0]) @ right
-    if size[1] <= ROUNDING * size[0]:
-        return rotation, mirrored, math.inf
-    a, b, c = size * sign
-    gram = (left * size**2) @ left.T
-    spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / (
-        (a + b) * (b + c) * (c + a)
-    )
-    return rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1])
-
-
-def angle_of(rotation: Array) -> float:
-    """Angle of a rotation (3, 3), rad."""
-    return 2.0 * math.asin(
-        min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0)
-    )
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
+from fdi_ros.inspection.repeats import repeated
+from fdi_ros.inspection.turns import WINDOW
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
-WINDOW = 0.25  # over which rates are averaged to compare units, s: turns by hand stay, noise goes
 SPIKE = 25.0  # usual sizes beyond which a value is a spike: vibration has tails, too
 SPIKE_PORTION = 256  # samples looked at at once
 MEDIAN_TO_RMS = (
@@ -109,58 +110,6 @@ def flag_runs(flags: Mask) -> Int:
     """First index and end (R, 2) of every run of set flags (N,)."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     return np.flatnonzero(edges).reshape(-1, 2)
-
-
-def least_run(step: float) -> int:
-    """Return the samples from which a run of one value is no chance, of samples every `step` s; 0: not known."""
-    return max(50, round(1.0 / step)) if step > 0 else 50
-
-
-def run_lengths(values: Array) -> NDArray[np.int64]:
-    """Lengths of the runs of one value in values (N,), N > 0, in order."""
-    return np.diff(
-        np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]]))
-    )
-
-
-def repeated(z: Array, step: float) -> Mask:
-    """Find samples of z (N, n), which come every `step` s, that are part of a long run of one value of a channel."""
-    found, least = np.zeros(z.shape, dtype=bool), least_run(step)
-    for k, values in enumerate(z.T):
-        lengths = run_lengths(values)
-        long = np.repeat(lengths >= least, lengths)
-        if long.any():
-            others = values[np.isfinite(values) & ~long]
-            spans = np.sort(
-                others[: len(others) // least * least].reshape(-1, least), axis=1
-            )
-            different = (np.diff(spans, axis=1) > 0).sum(axis=1) + 1
-            # Where all values hardly change when it is quiet, one that stays is rest.
-            coarse = len(spans) > 0 and np.percentile(different, 10.0) <= 3.0
-            found[:, k] = long & (not coarse)
-    return found
-
-
-class Repeats:
-    """Counts values in long runs of one value, of messages that come bit by bit."""
-
-    def __init__(self, channels: int) -> None:
-        self.count = np.zeros(channels, dtype=np.int64)  # (c,) values in long runs
-        self._last = np.full(channels, np.nan)
-        self._run = np.zeros(channels, dtype=np.int64)
-
-    def add(self, values: Array, step: float) -> None:
-        """Take in the next values (N, c), which come every `step` s; 0: not known yet."""
-        least = least_run(step)
-        for k, column in enumerate(values.T if len(values) else ()):
-            lengths, before = run_lengths(column), 0
-            if column[0] == self._last[k]:
-                before = int(self._run[k])
-                lengths[0] += before
-            self.count[k] += lengths[lengths >= least].sum() - (
-                before if before >= least else 0
-            )
-            self._last[k], self._run[k] = column[-1], lengths[-1]
 
 
 POINTS = 6  # of the interpolation

@@ -20,6 +20,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
+from fdi_ros.inspection.turns import LEAST_ROTATION, LEAST_WINDOWS
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.output import ChannelState, Output
@@ -32,13 +33,7 @@ from fdi_ros.monitor.pipeline import (
 )
 from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
-from fdi_ros.setup.agreement import (
-    LEAST_RATE,
-    LEAST_ROTATION,
-    LEAST_WINDOWS,
-    SHOWN,
-    check_agreement,
-)
+from fdi_ros.setup.agreement import LEAST_RATE, SHOWN, check_agreement
 from fdi_ros.setup.blocks import (
     NOT_SHIFTED,
     Data,

@@ -11,6 +11,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fdi_ros.core.sources import source_of
+from fdi_ros.inspection.findings import (
+    Finding,
+    Role,
+    findings_figures,
+    lines_of,
+    verdict_of,
+)
+from fdi_ros.inspection.fitness import copy_words, topic_findings
+from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
@@ -34,18 +43,8 @@ from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.calibrate import UNMEASURED, Calibration
 from fdi_ros.setup.estimate import SHOWN_DELAY
-from fdi_ros.setup.inspect import topic_columns
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, times_words
-from fdi_ros.setup.starting_config import (
-    Finding,
-    Role,
-    copy_words,
-    findings_figures,
-    lines_of,
-    topic_findings,
-    verdict_of,
-)
 from fdi_ros.system.text import LINE, shown
 
 SHOWN_AXES = (

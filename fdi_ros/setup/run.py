@@ -23,6 +23,10 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
+from fdi_ros.inspection.degrees import refuse_degrees
+from fdi_ros.inspection.fitness import candidates, clocks_apart, copy_words, needs
+from fdi_ros.inspection.starting_config import starting_config
+from fdi_ros.inspection.topics import GAP, TopicReport, inspect
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
 from fdi_ros.replay.outcomes import OutcomeKind
@@ -38,16 +42,7 @@ from fdi_ros.setup.calibrate import (
     calibrate,
     reference_channels,
 )
-from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.setup.starting_config import (
-    candidates,
-    clocks_apart,
-    copy_words,
-    needs,
-    refuse_degrees,
-    starting_config,
-)
 from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s

@@ -28,15 +28,15 @@ from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 
-from fdi_ros.bag.library_bags import SqliteFile
 from fdi_ros.bag.raw import Damage
 from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
 from fdi_ros.experiments.montecarlo import load_study
 from fdi_ros.faults.fault import load_scenario
+from fdi_ros.inspection.topics import inspect
 from fdi_ros.replay.run import replay
-from fdi_ros.setup.inspect import inspect
 from fdi_ros.system.text import shown
 
 CONFIG = Config.from_parameters(PARAMETERS)

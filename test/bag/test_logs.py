@@ -18,7 +18,7 @@ from bag.logs import FIX, SCALE, UTC, format_record, units, write_dataflash, wri
 from bag.recordings import IMU, STORE, bounded
 from pymavlink.DFReader import DFReader_binary
 
-from fdi_ros.bag import dataflash, flight_log, library_logs
+from fdi_ros.bag import dataflash, flight_log, ulog
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.sources import ImuSource
@@ -284,7 +284,7 @@ def test_what_is_read_does_not_depend_on_the_portions(tmp_path, kind, monkeypatc
     path = log(tmp_path, kind)
     whole = messages(path)
     monkeypatch.setattr(dataflash, "_PORTION", 5000)
-    monkeypatch.setattr(library_logs.Ulog, "together", 50)
+    monkeypatch.setattr(ulog.Ulog, "together", 50)
     monkeypatch.setattr(flight_log, "_TOGETHER", 64)
     cut = messages(path)
     assert cut[1] == whole[1]

@@ -15,12 +15,12 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
+from fdi_ros.inspection.findings import Role, lines_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.report import calibration_findings
-from fdi_ros.setup.starting_config import Role, lines_of
 
 CONFIG = Path(__file__).parents[2] / "config"
 

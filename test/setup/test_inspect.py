@@ -21,14 +21,10 @@ from bag.recordings import (
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
+from fdi_ros.inspection.fitness import NEEDED, candidates
+from fdi_ros.inspection.starting_config import starting_config, starting_config_of
+from fdi_ros.inspection.topics import inspect, recording_text, topics_text
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.setup.inspect import inspect, recording_text, topics_text
-from fdi_ros.setup.starting_config import (
-    NEEDED,
-    candidates,
-    starting_config,
-    starting_config_of,
-)
 
 
 def test_rates_gaps_and_noise_are_found(tmp_path):

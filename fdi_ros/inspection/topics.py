@@ -17,6 +17,8 @@ from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.core.health import copies_among
 from fdi_ros.core.sources import Source, source_of_type
+from fdi_ros.inspection.repeats import Repeats
+from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import (
     RADIANS,
@@ -27,8 +29,6 @@ from fdi_ros.report.layout import (
     table,
     told,
 )
-from fdi_ros.setup.blocks import Repeats
-from fdi_ros.setup.noise import NoiseSegments
 from fdi_ros.system.text import date_of, shown
 
 GAP = 3.0  # intervals longer than this many usual ones are gaps

@@ -1,35 +1,28 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Logs that are read whole by a library: PX4's ULog files by pyulog, telemetry logs of ground stations by pymavlink.
+"""PX4's ULog files (.ulg, .ulog), read whole by pyulog.
 
-ULog (.ulg, .ulog). Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time
-they were taken in) and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the
-uORB messages of these names say. By default they are logged at 1 to 2 Hz, and so is vehicle_imu_status (body frame,
-calibrated: the mean of the last 0.1 s): of such a log the means are read, for a coarse check. Times count from the
-start of the autopilot; in a simulation with the clock of the computer they are dates.
+Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and
+the time that each took) and sensor_gyro_fifo (board frame, all samples of the sensor,
+stamped with the last). By default these are logged at 1 to 2 Hz, and so is
+vehicle_imu_status (body frame, calibrated: the mean of the last 0.1 s). From a default
+log the means are read, for a coarse check. Times count from the start of the autopilot;
+a simulation on the clock of the computer stamps with dates.
 
-pyulog keeps each message that is no sample as an object, makes one for each field that a format announces, tries again
-byte by byte where a file is damaged, and prints. So it is given a file that ends early if it has more of that than
-any logger writes.
-
-Telemetry logs (.tlog). A record is 8 bytes of time (us since 1970, the first byte first) and a message of MAVLink 1 or
-2, with the time it came over a link. A record counts only where another one begins behind it, and one that is used only
-if pymavlink accepts it, by its checksum. What the messages of IMUs say is told by the same description as live
-(`fdi_ros.mavlink.protocol`), of one autopilot: the first with a HEARTBEAT. Stamps are the autopilot's own; UTC is
-that of the message that came with the least delay.
+pyulog keeps one object per message that is no sample and per field that a format
+announces, retries byte by byte where a file is damaged, and prints. The file that it
+gets therefore ends early when it holds more of these than any logger writes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-import struct
-from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count, takewhile
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,89 +30,23 @@ from numpy.typing import NDArray
 from fdi_ros.bag.flight_log import (
     FLU,
     SETTINGS,
-    FlightLog,
     ImuSamples,
-    Portion,
     Source,
     imu_samples,
     per_time,
     possible_start,
 )
+from fdi_ros.bag.library_log import Columns, LibraryLog, message_count
 from fdi_ros.errors import BagError
-from fdi_ros.mavlink.protocol import (
-    MESSAGES,
-    MOST_UNITS,
-    NO_AUTOPILOT,
-    RAW,
-    SCALED,
-    read,
-    understood,
-)
-from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system import require
 from fdi_ros.system.files import (
-    TLOG_BYTES,
     ULOG_BYTES,
     ULOG_FIELDS,
     ULOG_MESSAGE_COST,
     ULOG_OTHER_BYTES,
     ULOG_TOPIC_COST,
 )
-
-Columns = Mapping[str, NDArray[Any]]
-"""(k,) values of each field of k messages; pyulog has those of an array as fields ``name[0]``, ``name[1]``, ..."""
-
-
-class LibraryLog(FlightLog):
-    """An open log, read whole."""
-
-    most: ClassVar[int]  # bytes that it may have
-    together: ClassVar[int]  # messages of a source handed on at once, about
-
-    def begin(self) -> None:
-        """Begin a walk, and read the log up to `end`."""
-        super().begin()
-        if self.size > self.most:
-            sizes = f"{self.size >> 20} MB, expected at most {self.most >> 20}"
-            raise BagError(f"{self.path} has {sizes}: such a log is read whole")
-        self.file.seek(0)
-        self._columns = self.load(self.file.read(self.end))
-
-    @abstractmethod
-    def load(self, data: bytes) -> dict[Source, Columns]:
-        """Return the messages of IMUs; what else is told is taken in."""
-
-    @abstractmethod
-    def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
-        """Return the samples in messages of a kind; None: they lack a field, or have another form."""
-
-    def portions(self) -> Iterator[Portion]:
-        """Return the samples, some of each source together."""
-        portions = (
-            max(map(_size, self._columns.values()), default=0) // self.together + 1
-        )
-        for k in range(portions):
-            found = []
-            for source, columns in self._columns.items():
-                rows = slice(
-                    _size(columns) * k // portions, _size(columns) * (k + 1) // portions
-                )
-                samples = self.samples(
-                    source.kind,
-                    {name: column[rows] for name, column in columns.items()},
-                )
-                if samples is not None:
-                    found.append((source, samples))
-            yield found, (k + 1) / portions
-
-
-def _size(columns: Columns) -> int:
-    """Return the number of messages."""
-    return len(next(iter(columns.values())))
-
-
-# ULog ----------------------------------------------------------------------------------------------------------------
 
 _HEAD = 3  # bytes of a message before its content: two of its size, one of its kind
 _SUBSCRIPTION, _DATA = b"AD"
@@ -201,7 +128,7 @@ class Ulog(LibraryLog):
             self.add_text(int(text.timestamp), text.log_level_str(), text.message)
         parts: defaultdict[Source, list[Columns]] = defaultdict(list)
         for one in log.data_list:
-            self.counts[one.name] += _size(one.data)
+            self.counts[one.name] += message_count(one.data)
             if one.name in _KINDS:
                 parts[Source(one.name, one.multi_id)].append(one.data)
             elif one.name in _GPS and self.start_utc is None:
@@ -327,7 +254,9 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
     What is interpolated over a second of flight differs by more than any fault.
     """
     stamps = {
-        source: _stamp(columns) for source, columns in topics.items() if _size(columns)
+        source: _stamp(columns)
+        for source, columns in topics.items()
+        if message_count(columns)
     }
     if len(stamps) < 2:
         return {}
@@ -394,166 +323,9 @@ def _start_utc(columns: Columns) -> int | None:
     fixed = (
         columns["fix_type"] >= _FIX
         if "fix_type" in columns
-        else np.ones(_size(columns), dtype=bool)
+        else np.ones(message_count(columns), dtype=bool)
     )
     utc, stamp = (
         columns[name].astype(np.int64)[fixed] for name in ("time_utc_usec", "timestamp")
     )
     return possible_start(utc, stamp)
-
-
-# Telemetry logs -------------------------------------------------------------------------------------------------------
-
-_HEARTBEAT, _STATUSTEXT = 0, 253
-_AUTOPILOT_COMPONENT = 1
-_MARKS = (0xFE, 0xFD)  # first bytes of messages of MAVLink 1 and 2
-_TIME = 8
-_LEAST = _TIME + 8  # bytes of the shortest record
-_MAX_DELAY_SPREAD = 3_600_000_000
-"""us; a message that came by so much more or less late than half of the others has a damaged time."""
-_LATEST = 1 << 53  # us; no time is later
-_ROW = struct.Struct("=3q6d")
-_COLUMNS = np.dtype(
-    [
-        ("stamp", "i8"),
-        ("came", "i8"),
-        ("end", "i8"),
-        ("rate", "f8", 3),
-        ("acceleration", "f8", 3),
-    ]
-)
-"""Of each sample, with the time at which its message came, us since 1970."""
-
-
-class Tlog(LibraryLog):
-    """An open log of a ground station."""
-
-    magic = b"\0"
-    refusal = "is no log of a ground station (.tlog)"
-    kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
-    settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
-    one_imu = (
-        "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
-        " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
-    )
-    slowest = 5.0  # many ground stations ask for no more than 10 Hz
-    most = TLOG_BYTES
-    together = 1 << 16
-
-    def load(self, data: bytes) -> dict[Source, Columns]:
-        """Read the messages of IMUs of the first autopilot that says that it is one."""
-        found: defaultdict[Source, bytearray] = defaultdict(bytearray)
-        texts: list[tuple[int, str]] = []
-        beats = (
-            beat
-            for _, _, beat in self._messages(data, (_HEARTBEAT,))
-            if beat.autopilot != NO_AUTOPILOT
-        )
-        if (beat := next(beats, None)) is None:
-            return {}
-        for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
-            if message.get_srcSystem() != beat.get_srcSystem():
-                continue
-            came, number = (
-                int.from_bytes(data[at : at + _TIME], "big"),
-                message.get_msgId(),
-            )
-            if number == _STATUSTEXT:
-                texts.append((came, str(message.text)))
-                continue
-            kind = MESSAGES[number].kind
-            if not understood(kind, beat.autopilot):
-                continue
-            self.counts[kind] += 1
-            start = at + _TIME
-            payload = start + (10 if data[start] == 0xFD else 6)
-            reading = read(number, data[payload : payload + data[start + 1]])
-            if reading is not None and reading.unit < MOST_UNITS:
-                times = min(reading.stamp // 1000, _LATEST), min(came, _LATEST)
-                row = _ROW.pack(*times, end, *reading.rate, *reading.acceleration)
-                found[Source(kind, reading.unit)] += row
-        raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
-        if raw in found and scaled not in found:
-            found[scaled] = found.pop(raw)
-        tables = {
-            source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()
-        }
-        self.start_utc = _start_utc_by(
-            [table["came"] - table["stamp"] for table in tables.values()]
-        )
-        if self.start_utc is not None:
-            for came, text in texts:
-                self.add_text(came - self.start_utc, "STATUSTEXT", text)
-        return {
-            source: {name: table[name] for name in _COLUMNS.names or ()}
-            for source, table in tables.items()
-        }
-
-    def samples(self, kind: str, columns: Columns) -> ImuSamples:
-        """Return the samples in messages of a kind."""
-        return imu_samples(
-            columns["stamp"], columns["rate"], columns["acceleration"], columns["end"]
-        )
-
-    def portions(self) -> Iterator[Portion]:
-        """Return the samples; at the end, say what was left out."""
-        yield from super().portions()
-        if self._lost:
-            self.note(f"{self._lost} bytes belong to no whole record and were left out")
-
-    def _messages(
-        self, data: bytes, numbers: tuple[int, ...]
-    ) -> Iterator[tuple[int, int, Any]]:
-        """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts; count what is lost.
-
-        Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
-        """
-        codec = dialect()
-        parser = codec.MAVLink(None)
-        at = lost = 0
-        while at + _LEAST <= len(data):
-            end = record_end(data, at)
-            if end > len(data):
-                break
-            if not end:
-                at, lost = at + 1, lost + 1
-                continue
-            start = at + _TIME
-            second = data[start] == 0xFD
-            number = (
-                int.from_bytes(data[start + 7 : start + 10], "little")
-                if second
-                else data[start + 5]
-            )
-            if (
-                number in numbers
-                and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT
-            ):
-                with contextlib.suppress(codec.MAVError):
-                    yield at, end, parser.decode(bytearray(data[start:end]))
-            at = end
-        self._lost = lost + len(data) - at
-
-
-def record_end(data: bytes, at: int) -> int:
-    """Return where the record at a place ends; 0: there is none, or none behind it that proves it."""
-    mark = data[at + _TIME]
-    if data[at] != 0 or mark not in _MARKS:
-        return 0
-    end = at + _TIME + data[at + _TIME + 1] + 8
-    if mark == 0xFD:
-        end += 4 + 13 * (data[at + _TIME + 2] & 1)
-    if end + _TIME >= len(data):
-        return end
-    return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
-
-
-def _start_utc_by(starts: Sequence[Int]) -> int | None:
-    """Return the UTC of the start of the autopilot by that of each message: of the one with the least delay."""
-    ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
-    near = (
-        ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD]
-        if len(ordered)
-        else ordered
-    )
-    return possible_start(near[:1], np.zeros_like(near[:1]))

@@ -1,113 +1,40 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags whose messages a library hands out one by one: sqlite3 files of rosbag2, and bags of ROS 1.
+"""rosbag2 databases (.db3), read by SQLite.
 
-A database may hold more than values: views, virtual tables and computed columns run whatever their maker wrote. Only
-plain tables are read, within a number of steps that follows from the size of the file. SQLite writes beside what it
-reads, and a rollback journal may have it delete any file: so a file is read as one that never changes, without looking
-beside it. Only what lies in a write-ahead log would be missing then: where there is one, a copy of both is read.
-
-A bag of ROS 1 that was not closed has no index, and is refused. rosbags keeps an object for each message of a bag,
-whatever its topic: so the index may have a size, and what is read and unpacked at once has another. Its messages become
-those of ROS 2.
+A database may hold more than values: views, virtual tables and computed columns run the
+code of their author. Only plain tables are read, within a number of steps that follows
+from the size of the file. SQLite writes beside a file that it reads, and a rollback
+journal may delete any file. The file is therefore opened as one that never changes. With
+a write-ahead log beside it, a copy of both is read.
 """
 
 from __future__ import annotations
 
-import bz2
 import contextlib
-import io
 import shutil
 import sqlite3
-import struct
 import tempfile
-from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import lz4.frame
-import numpy as np
 import zstandard
-from rosbags.rosbag1 import Reader, ReaderError
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
-from fdi_ros.core.sources import source_of_type
+from fdi_ros.bag.library_bag import LibraryBag, Message
+from fdi_ros.bag.raw import NO_HORIZON, Damage, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
     CHANNELS,
     CHUNK_BYTES,
     NAME,
-    PORTION_BYTES,
-    ROS1_INDEX_BYTES,
     STEPS,
     STEPS_PER_BYTE,
 )
 
-_TOGETHER = 4096  # messages handed on at once, at most
 _TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
-_WRONG = (
-    *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
-    *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
-)
-"""What rosbags and the unpacking libraries raise of a damaged bag."""
-_UNPACKERS = {
-    bz2.decompress: bz2.BZ2Decompressor,
-    lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
-}
-"""By the functions that rosbags takes, which have no bound."""
-Message = tuple[
-    int, int, bytes
-]  # number of its topic in the file, time of recording, ns, and content
-
-
-class LibraryBag(BagFile):
-    """An open bag that a library reads."""
-
-    _numbered: dict[int, Topic]  # by their numbers in the file
-
-    @abstractmethod
-    def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        """Yield the messages of one topic or more, in the order of recording, up to the first that cannot be read."""
-
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
-        """Read the messages of the topics."""
-        chosen = {
-            number: topics.index(one.name)
-            for number, one in self._numbered.items()
-            if one.name in topics
-        }
-        whole, read = sum(self._numbered[number].count for number in chosen), 0
-        found = self._messages(list(chosen)) if chosen else iter(())
-        while messages := list(_together(found)):
-            read += len(messages)
-            numbers, times, data = zip(*messages, strict=True)
-            length = np.array([len(one) for one in data])
-            yield Batch(
-                buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-                topic=np.array([chosen[number] for number in numbers]),
-                log_time=np.array(times, dtype=np.int64),
-                offset=np.cumsum(length) - length,
-                length=length,
-                horizon=times[-1],
-                progress=min(1.0, read / max(1, whole)),
-            )
-
-
-def _together(messages: Iterator[Message]) -> Iterator[Message]:
-    """Take as many messages as are handed on at once."""
-    held = 0
-    for k, message in enumerate(messages, 1):
-        yield message
-        held += len(message[2])
-        if k == _TOGETHER or held >= PORTION_BYTES:
-            return
 
 
 class SqliteFile(LibraryBag):
@@ -303,85 +230,3 @@ class SqliteFile(LibraryBag):
             return zstandard.ZstdDecompressor().stream_reader(content).read(CHUNK_BYTES)
         except (zstandard.ZstdError, MemoryError):
             return b""
-
-
-class _Bounded(io.BufferedReader):
-    """A file of which a reader reads so much in all, and so much at once."""
-
-    left = ROS1_INDEX_BYTES
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes."""
-        self.left -= size or 0
-        if self.left < 0 or (size or 0) > PORTION_BYTES:
-            raise ReaderError(
-                "its index, or a part of it, is larger than that of any recorder"
-            )
-        return super().read(size)
-
-
-class Ros1File(LibraryBag):
-    """An open bag of ROS 1; it must have an index, of bounded size."""
-
-    magic = b"#ROSBAG V2.0\n"
-    refusal = "is not a bag of ROS 1"
-
-    def __init__(self, path: Path, damage: Damage, most: int) -> None:
-        super().__init__(path, damage, most)
-        bounded = _Bounded(io.FileIO(self.file.fileno(), closefd=False))
-        bounded.seek(0)
-        # Stands for the path of a file that is open already.
-        place: Any = SimpleNamespace(exists=lambda: True, open=lambda _: bounded)
-        self._reader = Reader(place)
-        self._store = get_typestore(Stores.ROS2_JAZZY)
-        try:
-            self._reader.open()
-            self._numbered = {
-                one.id: Topic(one.topic, one.msgtype, "cdr", one.msgcount)
-                for one in self._reader.connections
-            }
-            self.start_time = self._reader.start_time
-        except _WRONG as error:
-            self.file.close()
-            if "not indexed" in str(error):
-                raise BagError(
-                    f"{path} has no index, its recording was cut off: run rosbag reindex"
-                ) from error
-            raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
-        self.topics = tuple(self._numbered.values())
-        bounded.left = most + self.size
-        for number, chunk in self._reader.chunks.items():
-            unpack = partial(self._unpacked, _UNPACKERS.get(chunk.decompressor))
-            self._reader.chunks[number] = chunk._replace(decompressor=unpack)
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._reader.bio is not None:
-            self._reader.close()
-        self.file.close()
-
-    def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        try:
-            connections = [one for one in self._reader.connections if one.id in numbers]
-            for connection, time, data in self._reader.messages(connections):
-                yield connection.id, time, self._converted(data, connection.msgtype)
-        except _WRONG as error:
-            self.note(f"it is damaged ({error}): read up to there")
-
-    def _converted(self, data: bytes, kind: str) -> bytes:
-        """Return a message as ROS 2 has it; a damaged one comes out empty, and is counted as malformed later."""
-        if source_of_type(kind) is None:
-            return b""
-        try:
-            return bytes(self._store.ros1_to_cdr(data, kind))
-        except _WRONG:
-            return b""
-
-    def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
-        """Unpack a chunk."""
-        if unpacker is not None:
-            data = unpacker().decompress(data, CHUNK_BYTES)
-        self._left -= len(data)
-        if self._left < 0:
-            raise ReaderError("it comes to more bytes than it should")
-        return data

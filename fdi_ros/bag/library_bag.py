@@ -1,0 +1,64 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bags whose messages a library hands out one by one."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from fdi_ros.bag.raw import BagFile, Batch, Topic
+from fdi_ros.system.files import (
+    PORTION_BYTES,
+)
+
+_TOGETHER = 4096  # messages handed on at once, at most
+Message = tuple[
+    int, int, bytes
+]  # number of its topic in the file, time of recording, ns, and content
+
+
+class LibraryBag(BagFile):
+    """An open bag that a library reads."""
+
+    _numbered: dict[int, Topic]  # by their numbers in the file
+
+    @abstractmethod
+    def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
+        """Yield the messages of one topic or more, in the order of recording, up to the first that cannot be read."""
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+        """Read the messages of the topics."""
+        chosen = {
+            number: topics.index(one.name)
+            for number, one in self._numbered.items()
+            if one.name in topics
+        }
+        whole, read = sum(self._numbered[number].count for number in chosen), 0
+        found = self._messages(list(chosen)) if chosen else iter(())
+        while messages := list(_together(found)):
+            read += len(messages)
+            numbers, times, data = zip(*messages, strict=True)
+            length = np.array([len(one) for one in data])
+            yield Batch(
+                buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
+                topic=np.array([chosen[number] for number in numbers]),
+                log_time=np.array(times, dtype=np.int64),
+                offset=np.cumsum(length) - length,
+                length=length,
+                horizon=times[-1],
+                progress=min(1.0, read / max(1, whole)),
+            )
+
+
+def _together(messages: Iterator[Message]) -> Iterator[Message]:
+    """Take as many messages as are handed on at once."""
+    held = 0
+    for k, message in enumerate(messages, 1):
+        yield message
+        held += len(message[2])
+        if k == _TOGETHER or held >= PORTION_BYTES:
+            return

@@ -1,0 +1,128 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bags of ROS 1 (.bag), read by rosbags.
+
+A bag that was not closed has no index and is refused. rosbags keeps one object per
+message of a bag, whatever its topic, so both the index and the amount unpacked at once
+are bounded. Messages are converted to those of ROS 2.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import lz4.frame
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from fdi_ros.bag.library_bag import LibraryBag, Message
+from fdi_ros.bag.raw import Damage, Topic
+from fdi_ros.core.sources import source_of_type
+from fdi_ros.errors import BagError
+from fdi_ros.system.files import (
+    CHUNK_BYTES,
+    PORTION_BYTES,
+    ROS1_INDEX_BYTES,
+)
+
+_WRONG = (
+    *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
+    *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
+)
+"""What rosbags and the unpacking libraries raise of a damaged bag."""
+_UNPACKERS = {
+    bz2.decompress: bz2.BZ2Decompressor,
+    lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+}
+"""By the functions that rosbags takes, which have no bound."""
+
+
+class _Bounded(io.BufferedReader):
+    """A file of which a reader reads so much in all, and so much at once."""
+
+    left = ROS1_INDEX_BYTES
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes."""
+        self.left -= size or 0
+        if self.left < 0 or (size or 0) > PORTION_BYTES:
+            raise ReaderError(
+                "its index, or a part of it, is larger than that of any recorder"
+            )
+        return super().read(size)
+
+
+class Ros1File(LibraryBag):
+    """An open bag of ROS 1; it must have an index, of bounded size."""
+
+    magic = b"#ROSBAG V2.0\n"
+    refusal = "is not a bag of ROS 1"
+
+    def __init__(self, path: Path, damage: Damage, most: int) -> None:
+        super().__init__(path, damage, most)
+        bounded = _Bounded(io.FileIO(self.file.fileno(), closefd=False))
+        bounded.seek(0)
+        # Stands for the path of a file that is open already.
+        place: Any = SimpleNamespace(exists=lambda: True, open=lambda _: bounded)
+        self._reader = Reader(place)
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        try:
+            self._reader.open()
+            self._numbered = {
+                one.id: Topic(one.topic, one.msgtype, "cdr", one.msgcount)
+                for one in self._reader.connections
+            }
+            self.start_time = self._reader.start_time
+        except _WRONG as error:
+            self.file.close()
+            if "not indexed" in str(error):
+                raise BagError(
+                    f"{path} has no index, its recording was cut off: run rosbag reindex"
+                ) from error
+            raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
+        self.topics = tuple(self._numbered.values())
+        bounded.left = most + self.size
+        for number, chunk in self._reader.chunks.items():
+            unpack = partial(self._unpacked, _UNPACKERS.get(chunk.decompressor))
+            self._reader.chunks[number] = chunk._replace(decompressor=unpack)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader.bio is not None:
+            self._reader.close()
+        self.file.close()
+
+    def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
+        try:
+            connections = [one for one in self._reader.connections if one.id in numbers]
+            for connection, time, data in self._reader.messages(connections):
+                yield connection.id, time, self._converted(data, connection.msgtype)
+        except _WRONG as error:
+            self.note(f"it is damaged ({error}): read up to there")
+
+    def _converted(self, data: bytes, kind: str) -> bytes:
+        """Return a message as ROS 2 has it; a damaged one comes out empty, and is counted as malformed later."""
+        if source_of_type(kind) is None:
+            return b""
+        try:
+            return bytes(self._store.ros1_to_cdr(data, kind))
+        except _WRONG:
+            return b""
+
+    def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
+        """Unpack a chunk."""
+        if unpacker is not None:
+            data = unpacker().decompress(data, CHUNK_BYTES)
+        self._left -= len(data)
+        if self._left < 0:
+            raise ReaderError("it comes to more bytes than it should")
+        return data

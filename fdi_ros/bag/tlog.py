@@ -1,0 +1,199 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Telemetry logs of ground stations (.tlog), decoded by pymavlink.
+
+A record is 8 bytes of time (us since 1970, big endian), which is when the message came
+over the link, and a message of MAVLink 1 or 2. A record counts only where another one
+begins behind it; its checksum is verified where its message is used. The messages of
+one autopilot are read, by the description that also serves a live link
+(`fdi_ros.mavlink.protocol`). Stamps are the autopilot's own; UTC is taken from the
+message with the least delay.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.bag.flight_log import (
+    ImuSamples,
+    Portion,
+    Source,
+    imu_samples,
+    possible_start,
+)
+from fdi_ros.bag.library_log import Columns, LibraryLog
+from fdi_ros.mavlink.protocol import (
+    MESSAGES,
+    MOST_UNITS,
+    NO_AUTOPILOT,
+    RAW,
+    SCALED,
+    read,
+    understood,
+)
+from fdi_ros.mavlink.vehicle import dialect
+from fdi_ros.model.samples import Int
+from fdi_ros.system.files import (
+    TLOG_BYTES,
+)
+
+_HEARTBEAT, _STATUSTEXT = 0, 253
+_AUTOPILOT_COMPONENT = 1
+_MARKS = (0xFE, 0xFD)  # first bytes of messages of MAVLink 1 and 2
+_TIME = 8
+_LEAST = _TIME + 8  # bytes of the shortest record
+_MAX_DELAY_SPREAD = 3_600_000_000
+"""us; a message that came by so much more or less late than half of the others has a damaged time."""
+_LATEST = 1 << 53  # us; no time is later
+_ROW = struct.Struct("=3q6d")
+_COLUMNS = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("came", "i8"),
+        ("end", "i8"),
+        ("rate", "f8", 3),
+        ("acceleration", "f8", 3),
+    ]
+)
+"""Of each sample, with the time at which its message came, us since 1970."""
+
+
+class Tlog(LibraryLog):
+    """An open log of a ground station."""
+
+    magic = b"\0"
+    refusal = "is no log of a ground station (.tlog)"
+    kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
+    settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
+    one_imu = (
+        "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
+        " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
+    )
+    slowest = 5.0  # many ground stations ask for no more than 10 Hz
+    most = TLOG_BYTES
+    together = 1 << 16
+
+    def load(self, data: bytes) -> dict[Source, Columns]:
+        """Read the messages of IMUs of the first autopilot that says that it is one."""
+        found: defaultdict[Source, bytearray] = defaultdict(bytearray)
+        texts: list[tuple[int, str]] = []
+        beats = (
+            beat
+            for _, _, beat in self._messages(data, (_HEARTBEAT,))
+            if beat.autopilot != NO_AUTOPILOT
+        )
+        if (beat := next(beats, None)) is None:
+            return {}
+        for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
+            if message.get_srcSystem() != beat.get_srcSystem():
+                continue
+            came, number = (
+                int.from_bytes(data[at : at + _TIME], "big"),
+                message.get_msgId(),
+            )
+            if number == _STATUSTEXT:
+                texts.append((came, str(message.text)))
+                continue
+            kind = MESSAGES[number].kind
+            if not understood(kind, beat.autopilot):
+                continue
+            self.counts[kind] += 1
+            start = at + _TIME
+            payload = start + (10 if data[start] == 0xFD else 6)
+            reading = read(number, data[payload : payload + data[start + 1]])
+            if reading is not None and reading.unit < MOST_UNITS:
+                times = min(reading.stamp // 1000, _LATEST), min(came, _LATEST)
+                row = _ROW.pack(*times, end, *reading.rate, *reading.acceleration)
+                found[Source(kind, reading.unit)] += row
+        raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
+        if raw in found and scaled not in found:
+            found[scaled] = found.pop(raw)
+        tables = {
+            source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()
+        }
+        self.start_utc = _start_utc_by(
+            [table["came"] - table["stamp"] for table in tables.values()]
+        )
+        if self.start_utc is not None:
+            for came, text in texts:
+                self.add_text(came - self.start_utc, "STATUSTEXT", text)
+        return {
+            source: {name: table[name] for name in _COLUMNS.names or ()}
+            for source, table in tables.items()
+        }
+
+    def samples(self, kind: str, columns: Columns) -> ImuSamples:
+        """Return the samples in messages of a kind."""
+        return imu_samples(
+            columns["stamp"], columns["rate"], columns["acceleration"], columns["end"]
+        )
+
+    def portions(self) -> Iterator[Portion]:
+        """Return the samples; at the end, say what was left out."""
+        yield from super().portions()
+        if self._lost:
+            self.note(f"{self._lost} bytes belong to no whole record and were left out")
+
+    def _messages(
+        self, data: bytes, numbers: tuple[int, ...]
+    ) -> Iterator[tuple[int, int, Any]]:
+        """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts; count what is lost.
+
+        Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
+        """
+        codec = dialect()
+        parser = codec.MAVLink(None)
+        at = lost = 0
+        while at + _LEAST <= len(data):
+            end = record_end(data, at)
+            if end > len(data):
+                break
+            if not end:
+                at, lost = at + 1, lost + 1
+                continue
+            start = at + _TIME
+            second = data[start] == 0xFD
+            number = (
+                int.from_bytes(data[start + 7 : start + 10], "little")
+                if second
+                else data[start + 5]
+            )
+            if (
+                number in numbers
+                and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT
+            ):
+                with contextlib.suppress(codec.MAVError):
+                    yield at, end, parser.decode(bytearray(data[start:end]))
+            at = end
+        self._lost = lost + len(data) - at
+
+
+def record_end(data: bytes, at: int) -> int:
+    """Return where the record at a place ends; 0: there is none, or none behind it that proves it."""
+    mark = data[at + _TIME]
+    if data[at] != 0 or mark not in _MARKS:
+        return 0
+    end = at + _TIME + data[at + _TIME + 1] + 8
+    if mark == 0xFD:
+        end += 4 + 13 * (data[at + _TIME + 2] & 1)
+    if end + _TIME >= len(data):
+        return end
+    return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
+
+
+def _start_utc_by(starts: Sequence[Int]) -> int | None:
+    """Return the UTC of the start of the autopilot by that of each message: of the one with the least delay."""
+    ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
+    near = (
+        ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD]
+        if len(ordered)
+        else ordered
+    )
+    return possible_start(near[:1], np.zeros_like(near[:1]))

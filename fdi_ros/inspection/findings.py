@@ -1,0 +1,82 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Findings: all that inspection and set-up found, as rows of one table.
+
+The verdict, the lines for people and the figures in JSON are made from these rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from typing import NamedTuple
+
+from fdi_ros.report.layout import Severity, Verdict
+from fdi_ros.system.text import LINE, shown
+
+
+class Role(str, Enum):
+    """What a finding is to the reader; the value is its list in JSON."""
+
+    FOUND = "found"  # what the settings are from
+    UNKNOWN = "not_found"  # what the recording does not show, what is taken instead, and how to get it
+    WARNING = "warnings"  # what to look at before the settings are trusted
+    WORTH = "worth"  # what it is good for: the verdict where nothing is wrong
+
+
+class Finding(NamedTuple):
+    """One thing that was found."""
+
+    role: Role
+    what: str  # the quantity or the trouble, in a word or two
+    words: str  # the whole of it in one line
+    who: Sequence[str] = ()  # channels, units or topics it is about; none: all
+    value: float | None = None  # of the quantity, SI; of several channels the worst
+    error: float | None = None  # standard error of the value
+    bound: float | None = None  # that the value keeps or breaks
+    headline: str = ""  # how the verdict begins where this decides it, one of `HEADLINES`; empty: it does not
+
+
+HEADLINES = {  # of verdicts, the first that is there decides
+    "NEEDS": Severity.BAD,
+    "NEEDS A LOOK": Severity.BAD,
+    "DO NOT USE": Severity.BAD,
+    "NO BETTER THAN BEFORE": Severity.UNKNOWN,
+    "USABLE, NOT CALIBRATED": Severity.UNKNOWN,
+    "USABLE, BUT LOOK": Severity.UNKNOWN,
+    "READY, BUT LOOK": Severity.UNKNOWN,
+    "USABLE": Severity.GOOD,
+    "READY": Severity.GOOD,
+}
+
+
+def lines_of(findings: Iterable[Finding], role: Role) -> list[str]:
+    """Return the lines of one kind."""
+    return [shown(one.words, LINE) for one in findings if one.role is role]
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict: by the first headline that a finding has, with all that it is of."""
+    words: dict[str, list[str]] = {}
+    for one in findings:
+        words.setdefault(one.headline, []).append(one.words)
+    headline = next(headline for headline in HEADLINES if headline in words)
+    between = " " if headline == "NEEDS" else ": "
+    return Verdict(
+        HEADLINES[headline], f"{headline}{between}{'; '.join(words[headline])}"
+    )
+
+
+def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:
+    """Return verdict, lines and table, for programs."""
+    first = verdict_of(findings)
+    return {
+        "verdict": {"severity": first.severity.value, "words": first.words},
+        **{
+            role.value: lines_of(findings, role)
+            for role in Role
+            if role is not Role.WORTH
+        },
+        "findings": [one._asdict() for one in findings],
+    }

@@ -1,0 +1,185 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a recording is fit for: gyros enough, in rad/s, stamped by one clock, each a sensor of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from fdi_ros.compiling.compiled import MAX_CHANNELS
+from fdi_ros.config.config import (
+    is_plain_name,
+)
+from fdi_ros.core.sources import SOURCES
+from fdi_ros.inspection.degrees import in_degrees
+from fdi_ros.inspection.findings import Finding, Role
+from fdi_ros.inspection.topics import (
+    BELIEVED,
+    TopicReport,
+    troubles,
+)
+from fdi_ros.model.geometry import MIN_CHANNELS
+from fdi_ros.model.noise import noisier_words
+from fdi_ros.monitor.diagnostics import DIAGNOSTICS
+from fdi_ros.monitor.output import OUTPUTS
+from fdi_ros.report.layout import RADIANS, Unit, first_of
+from fdi_ros.system.text import shown
+
+_OF_A_MONITOR = {
+    topic.name.rpartition("/")[2]
+    for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
+}
+_PREFERRED = sorted(
+    SOURCES.values(), key=lambda kind: not kind.stamped
+)  # kinds of input, first those with stamps
+NEEDED = ", or ".join(
+    f"two {kind.type.rpartition('/')[2]} topics"
+    if kind.stamped
+    else f"one array of {kind.value_counts.start} to {kind.value_counts.stop - 1} values"
+    for kind in _PREFERRED
+)
+
+
+def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
+    """Return the topics a config is made for: up to four units, else the first array that fits."""
+    possible = [report for report in reports if not _unusable(report)]
+    for kind in _PREFERRED:
+        alike = [report for report in possible if report.kind is kind]
+        if len(alike) >= kind.topic_counts.start:
+            return alike[: kind.topic_counts.stop - 1]
+    return []
+
+
+def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
+    """Say which units are stamped by clocks more than so many s off the first one's; empty: none is.
+
+    Less than 1 s may be the time that messages take.
+    """
+    first = next((report for report in reports if math.isfinite(report.ahead)), None)
+    off = (
+        []
+        if first is None
+        else [
+            (shown(report.topic.name), report.ahead - first.ahead) for report in reports
+        ]
+    )
+    words = [
+        f"{name} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}"
+        for name, v in off
+        if abs(v) > beyond
+    ]
+    if first is None or not words:
+        return ""
+    return (
+        f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
+        " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
+    )
+
+
+def _unusable(report: TopicReport) -> str:
+    """Say why a topic cannot be used for gyros; empty: it can."""
+    kind, received = report.kind, report.received
+    if kind is None:
+        return "its type carries no gyros"
+    # The first that holds is the reason.
+    reasons = {
+        "no messages": not received,
+        # The fused rate must not be its own witness.
+        "a monitor has published it": report.topic.name.rpartition("/")[2]
+        in _OF_A_MONITOR,
+        "no name that ROS allows": not is_plain_name(report.topic.name),
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels
+        and not kind.stamped,
+        f"all {received} messages are malformed, or have stamps before 1970": report.malformed
+        == received,
+        f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
+        "a single message": received == 1,
+        "its times of recording do not increase": not report.rate,
+        f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
+    }
+    return next((words for words, holds in reasons.items() if holds), "")
+
+
+def needs(reports: Sequence[TopicReport]) -> str:
+    """Say what a recording needs, and what is wrong with each topic that could do; empty: a config can be made."""
+    if chosen := candidates(reports):
+        return in_degrees(chosen)
+    why = [
+        (shown(report.topic.name), _unusable(report))
+        for report in reports
+        if report.kind is not None
+    ]
+    good = [name for name, words in why if not words]
+    bad = [f"{name}: {words}" for name, words in why if words]
+    usable = [f"usable: only {', '.join(good)}"] if good else []
+    return "; ".join(
+        [NEEDED, *usable, *([first_of(bad, 8, "; ", "; and")] if bad else [])]
+    )
+
+
+def recording_findings(
+    reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS
+) -> Iterator[Finding]:
+    """Say what a recording is fit for; refused: why no config can be made of it, where it needs nothing."""
+    chosen = candidates(reports)
+    lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
+    if lacking or clocks:
+        words = lacking or f"one clock: {clocks}"
+        yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
+        return
+    if copies := copy_words(reports):
+        yield Finding(
+            Role.WARNING,
+            "copy",
+            f"{copies}; the copy is left out",
+            headline="NEEDS A LOOK",
+        )
+    units = len(chosen) > 1
+    names = [
+        f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places
+    ]
+    groups = np.split(
+        np.arange(len(names)),
+        np.cumsum([one.channels for one in chosen])[:-1] if units else len(names),
+    )
+    words = (
+        f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
+    )
+    words += f" at {max(one.rate for one in chosen):.3g} Hz"
+    noise = np.concatenate([one.segments.noise().moving for one in chosen])
+    if noisy := noisier_words(
+        names, noise, [group.tolist() for group in groups], unit.name, unit.factor
+    ):
+        yield Finding(
+            Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK"
+        )
+    yield Finding(Role.WORTH, "ready", words, headline="READY")
+    yield from topic_findings(chosen, unit)
+
+
+def topic_findings(
+    chosen: Sequence[TopicReport], unit: Unit = RADIANS
+) -> Iterator[Finding]:
+    """Say what is wrong with the messages of each topic."""
+    for one in chosen:
+        words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
+        if words := words + troubles(one, unit):
+            yield Finding(
+                Role.WARNING,
+                "messages",
+                f"{one.topic.name}: {', '.join(words)}",
+                (one.topic.name,),
+            )
+
+
+_NO_REDUNDANCY = "one sensor on two topics is no redundancy"
+
+
+def copy_words(reports: Sequence[TopicReport]) -> str:
+    """Say which topics give the values of others; empty: none does."""
+    copies = [f"{shown(one.topic.name)} {one.copied}" for one in reports if one.copy_of]
+    return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""

@@ -1,0 +1,255 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Settings to start from, derived from the topics of a recording alone."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.config.config import (
+    MIN_LEARNED,
+    PARAMETERS,
+    Config,
+    parameter_file,
+)
+from fdi_ros.core.alignment import MAX_BRIDGE
+from fdi_ros.core.sources import input_of
+from fdi_ros.errors import BagError
+from fdi_ros.inspection.fitness import candidates, copy_words, needs
+from fdi_ros.inspection.topics import (
+    GAP,
+    TopicReport,
+    inspect,
+)
+from fdi_ros.inspection.turns import (
+    LEAST_WINDOWS,
+    SHARED,
+    SQUARE,
+    WINDOW,
+    angle_of,
+    find_turn,
+)
+from fdi_ros.system.text import shown
+
+_NUMBERED = re.compile(
+    r"/imu_[0-9]{1,3}"
+)  # topics of flight logs, which name units as a config does
+_REST = 3.0  # time at the start over which the bias could be learned, s
+_TIMEOUT = float(
+    PARAMETERS["imus.timeout"].default
+)  # s; that of health.stale_timeout is the same
+_BRIDGED = (
+    1.1 / MAX_BRIDGE
+)  # message intervals in a timeout: so that alignment draws a line from one to the next
+
+
+@dataclass(frozen=True)
+class StartingConfig:
+    """A config to start from."""
+
+    bag: str  # name of the recording
+    parameters: dict[str, Any]  # ``{"section.field": value}``
+    remarks: dict[str, str]  # how they were found, by parameter
+    look: str = ""  # what a person is to look at before they are used; empty: nothing
+
+    @property
+    def text(self) -> str:
+        """The parameter file."""
+        origin = f"made by fdi inspect from {self.bag}, to start from. Noise and rates are measured, mounts are not."
+        return parameter_file(self.parameters, origin, self.remarks)
+
+
+def starting_config_of(path: Path, refused: str) -> StartingConfig:
+    """Return the config that ``fdi inspect`` writes; `BagError` in these words where there are no gyros in rad/s."""
+    reports, _ = inspect(path)
+    if words := needs(reports):
+        raise BagError(f"{refused}: needs {words}")
+    return replace(starting_config(candidates(reports), path), look=copy_words(reports))
+
+
+def assumed_config(path: Path) -> tuple[Config, str]:
+    """Return settings to judge a recording by that came without any, and one line that says what they assume.
+
+    `BagError` if the recording shows no gyros, or they are not mounted alike: then axes have to be given.
+    """
+    refused = f"{shown(path.name)}: no config given, and none can be assumed"
+    found = starting_config_of(path, refused)
+    config = Config.from_parameters(found.parameters)
+    if not config.imus.topics:
+        raise BagError(
+            f"{refused}: the axes of an array of channels are in no message; --config says them"
+        )
+    if turned := _turned_units(path, config):
+        raise BagError(
+            f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes"
+        )
+    low, high = min(config.noise.noise_std), max(config.noise.noise_std)
+    copies = f"{found.look}, the second is left out; " if found.look else ""
+    return config, (
+        f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
+        f" noise {low:.2g} to {high:.2g} rad/s,"
+        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
+    )
+
+
+def _turned_units(path: Path, config: Config) -> str:
+    """Say which units measure the motion of the first one along other axes; empty: none that the motion shows."""
+    size, names = max(1, round(WINDOW * config.sample_rate)), config.imus.names
+    with Recording(path) as recording:
+        means = [
+            block.z[: len(block) // size * size]
+            .reshape(-1, size, 3 * len(names))
+            .mean(axis=1)
+            for block in Samples(recording, config).blocks()
+        ]
+    slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
+    slow = slow[np.isfinite(slow).all(axis=1)]
+    if len(slow) < LEAST_WINDOWS:
+        return ""
+    first, *others = np.split(slow - np.median(slow, axis=0), len(names), axis=1)
+    turned = []
+    for name, rate in zip(names[1:], others, strict=True):
+        rotation = find_turn(first, rate)[0]
+        # A fault stays, whatever the rotation.
+        explained = np.std(rate @ rotation.T - first) < (1.0 - SHARED) * np.std(
+            rate - first
+        )
+        if explained and angle_of(rotation) > SQUARE:
+            turned.append(
+                f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}"
+            )
+    return ", ".join(turned)
+
+
+def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
+    """Make a config to start from, of the topics of gyros in a recording."""
+    kind = chosen[0].kind
+    assert kind is not None
+    rate, largest = (
+        max(report.rate for report in chosen),
+        max(report.largest for report in chosen),
+    )
+    at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
+    largest_rate = _rounded_up(
+        max(*PARAMETERS["health.max_rate"].default, 1.001 * largest)
+    )
+    # Values of parameters, and remarks on them.
+    known: dict[str, tuple[Any, str]] = {
+        "input": (input_of(kind), ""),
+        "sample_rate": (float(f"{rate:.4g}"), ""),
+        "noise.noise_std": _noise_setting(chosen),
+        "noise.scale_std": (
+            [0.01],
+            "a guess, for scale factors and axes that are not calibrated",
+        ),
+        "noise.timing_std": ([float(f"{0.05 / chosen[0].rate:.2g}")], "a guess"),
+        "bias.startup_bias_duration": (
+            _REST if at_rest else 0.0,
+            f"the recording is {'' if at_rest else 'not '}at rest at the start",
+        ),
+        "detector.name": (PARAMETERS["detector.name"].default, ""),
+        "detector.false_alarms_per_hour": (0.001, ""),
+        "health.max_rate": (
+            [largest_rate],
+            "NOT KNOWN: put in what the data sheet says",
+        ),
+    }
+    topics = [report.topic.name for report in chosen]
+    if kind.stamped:
+        words = (
+            "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
+            " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
+            " three of them, isolate it"
+        )
+        numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
+        names = [
+            topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)
+        ]
+        known["imus.topics"], known["imus.names"] = (topics, ""), (names, "")
+        known["imus.mounts"] = np.tile(np.eye(3).ravel(), len(chosen)).tolist(), words
+        known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
+        if numbered:
+            words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+            known["decision.latch"] = False, words
+        if timeout := _longer(chosen, _BRIDGED, 10.0):
+            slowest, none = (
+                min(report.rate for report in chosen),
+                "none would be aligned between two",
+            )
+            words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
+            known["imus.timeout"] = timeout, words
+    else:
+        words = (
+            "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
+            " but for those of three reference channels: these must be right"
+        )
+        known["channels.topic"], known["geometry.preset"] = (
+            (topics[0], ""),
+            ("cone", words),
+        )
+        known["geometry.cone_channels"] = chosen[0].channels, ""
+    if silent := _longer(chosen, GAP, 60.0):
+        known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
+    parameters = {name: value for name, (value, _) in known.items()}
+    return StartingConfig(
+        shown(bag.name),
+        parameters,
+        {name: words for name, (_, words) in known.items() if words},
+    )
+
+
+def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
+    """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
+    noise = [report.segments.noise() for report in chosen]
+    share, levels = (
+        min(one.share for one in noise),
+        np.concatenate([one.moving for one in noise]),
+    )
+    words = f"in motion ({share:.0%} of the recording), vibration included"
+    if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
+        quiet = np.concatenate([one.quiet for one in noise])
+        usable = np.isfinite(quiet) & (quiet > 0)
+        if not usable.any():
+            return [0.0025], "a guess: the recording is too short to tell"
+        # A value that never changes shows no noise: that of the noisiest is taken for it.
+        levels = np.where(usable, quiet, quiet[usable].max())
+        words = "when quietest; in motion vibration, and axes that are not quite as given, add"
+    return [_rounded_up(value) for value in levels.tolist()], words
+
+
+def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
+    """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
+    nearly_all = [
+        float(np.quantile(np.concatenate(one.intervals), 0.999))
+        for one in chosen
+        if one.intervals
+    ]
+    needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
+    return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
+
+
+def _starts_at_rest(report: TopicReport) -> bool:
+    """Whether nothing moves over the time in which biases could be learned."""
+    segments = zip(
+        report.segments.all_segments(), report.segments.noise().rest, strict=True
+    )
+    begin = [
+        rest for segment, rest in segments if segment.first - report.first < _REST * 1e9
+    ]
+    return bool(begin) and all(begin)
+
+
+def _rounded_up(value: float) -> float:
+    """Round up to two digits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")

@@ -1,0 +1,53 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""How two units of one rigid body are turned against each other, by the rotation that both measure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdi_ros.model.geometry import ROUNDING
+from fdi_ros.model.samples import Array
+
+LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s: biases are mostly less
+#: Windows in motion: with fewer, units are not compared, and no mount is estimated.
+LEAST_WINDOWS = 20
+#: Time over which rates are averaged before units are compared, s: turns by hand stay,
+#: noise goes.
+WINDOW = 0.25
+#: Share of the rotation that two units of one body have in common at least. Vibration
+#: and late stamps take the rest.
+SHARED = 0.7
+SQUARE = np.radians(
+    10.0
+)  # a mount this close to axes along axes is taken for that: the rest is misalignment
+
+
+def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
+    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976).
+
+    Returns the rotation (3, 3) that takes its rates best into those of the first, v_first = R v_unit, and the same of
+    all mirrored frames; and the variance of the least certain direction, rad^2, over the mean square of what is left,
+    (rad/s)^2: infinite where the two never turn about two axes together.
+    """
+    left, size, right = np.linalg.svd(first.T @ unit)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation, mirrored = (left * sign) @ right, (left * sign * [1.0, 1.0, -1.0]) @ right
+    if size[1] <= ROUNDING * size[0]:
+        return rotation, mirrored, math.inf
+    a, b, c = size * sign
+    gram = (left * size**2) @ left.T
+    spread = ((a * b + b * c + c * a) * np.eye(3) + gram) / (
+        (a + b) * (b + c) * (c + a)
+    )
+    return rotation, mirrored, float(np.linalg.eigvalsh(spread)[-1])
+
+
+def angle_of(rotation: Array) -> float:
+    """Angle of a rotation (3, 3), rad."""
+    return 2.0 * math.asin(
+        min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0)
+    )

@@ -1,0 +1,161 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Biases that walk and constants, estimated from all groups of windows at once.
+
+Groups of windows say ``N x = r`` of the states x; biases b walk from group to group, all others c are constant. Written
+for the biases of all groups the system is banded, with the constants as its border: ``B b + C c = h, C' b + T c = g``.
+The biases are eliminated (banded Cholesky), and the marginal likelihood of the walk falls out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from fdi_ros.model.samples import Array
+
+WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
+NO_WALK = 1e-7  # rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
+SHOWN_GAIN = 4.0  # log-likelihood that a walk must gain over none to be shown: one of 200 without a walk does
+POSSIBLE = 2.0  # what one may lose against the best and be possible: one of 20 true ones loses more
+
+
+class NormalEquations:
+    """What the groups say of the states, the biases (n) first; kept in units of their standard deviations before.
+
+    In units of their own, information on them would be apart by more than what rounding leaves of a number. ``normal``,
+    ``right``: N (K, s, s) and r (K, s). ``apart`` (K,): time to the next group, s; the last is not read. ``prior``,
+    ``start`` (s,): standard deviations, of all biases the same, and means before.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        normal: Array,
+        right: Array,
+        apart: Array,
+        prior: Array,
+        start: Array,
+    ) -> None:
+        self.n, self.apart, self.prior = n, apart, prior
+        self.normal, self.right, self.start = (
+            normal * np.outer(prior, prior),
+            right * prior,
+            start / prior,
+        )
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Estimate of all states."""
+
+    constant: Array  # (m,) the states that stay
+    constant_covariance: Array  # (m, m) of them
+    curve: Array  # (K, n) biases over time, rad/s
+    mean: Array  # (n,) their mean over the recording
+    mean_covariance: Array  # (n, n) of it
+
+
+class RandomWalk(NamedTuple):
+    """How the biases walk, rad/s/sqrt(s)."""
+
+    value: float  # 0: none shown
+    possible: float  # the largest that the recording does not rule out
+
+
+def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:
+    """Eliminate the biases, of such a walk.
+
+    Returns B^-1 (K n, n + m + 1) of the mean of the biases, of C and of h, which gives the biases if all constants were
+    zero; information (m, m) on the constants and its right-hand side (m,); and the log of the marginal likelihood.
+    """
+    n, count = of.n, len(of.normal)
+    stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
+    blocks = of.normal[:, :n, :n].copy()
+    diagonal = np.einsum("kii->ki", blocks)
+    diagonal[0] += 1.0
+    diagonal[:-1] += stiffness
+    diagonal[1:] += stiffness
+    band = np.zeros((n + 1, count, n))
+    for below in range(n):
+        band[below, :, : n - below] = np.diagonal(blocks, -below, 1, 2)
+    band[n, :-1] = -stiffness
+    border, h = of.normal[:, :n, n:].reshape(count * n, -1), of.right[:, :n].copy()
+    h[0] += of.start[:n]
+    factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
+    mean = np.tile(np.eye(n) / count, (count, 1))
+    solved = cho_solve_banded(
+        (factor, True), np.column_stack([mean, border, h.ravel()])
+    )
+    from_constants, alone = solved[:, n:-1], solved[:, -1]
+    information = (
+        np.eye(border.shape[1])
+        + of.normal[:, n:, n:].sum(axis=0)
+        - border.T @ from_constants
+    )
+    information = 0.5 * (information + information.T)
+    side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
+    fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
+    volume = (
+        2.0 * np.log(factor[0]).sum()
+        - n * np.log(stiffness).sum()
+        + np.linalg.slogdet(information)[1]
+    )
+    return solved, information, side, 0.5 * (fits - float(volume))
+
+
+def find_random_walk(of: NormalEquations) -> RandomWalk:
+    """Find the walk of the biases by its marginal likelihood."""
+    if len(of.normal) < 3:
+        return RandomWalk(0.0, float(WALKS[-1]))
+    none, *logs = (_eliminate(of, walk)[-1] for walk in (0.0, *WALKS))
+    best = int(np.argmax(logs))
+    # Between the walks tried, by a parabola.
+    shift = 0.0
+    if 0 < best < len(WALKS) - 1:
+        a, b, c = logs[best - 1 : best + 2]
+        shift = float(np.clip(0.5 * (a - c) / min(a - 2 * b + c, -1e-9), -0.5, 0.5))
+    value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
+    likely = np.array(logs) > max(logs[best], none) - POSSIBLE
+    possible = float(WALKS[likely].max(initial=0.0))
+    return RandomWalk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
+
+
+def smooth(
+    of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None
+) -> Smoothed:
+    """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
+
+    Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
+    they count as uncertain as they are (Schmidt 1966).
+    """
+    n, (solved, information, side, _) = of.n, _eliminate(of, walk)
+    if known is None:
+        covariance = np.linalg.inv(information)
+        constant = covariance @ side
+    else:
+        k = len(known[0])
+        first, p = (
+            known[0] / of.prior[n : n + k],
+            known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k]),
+        )
+        free = np.linalg.inv(information[k:, k:])
+        by = -free @ information[k:, :k]
+        constant = np.concatenate([first, free @ side[k:] + by @ first])
+        covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
+    curve = (solved[:, -1] - solved[:, n:-1] @ constant).reshape(-1, n)
+    # The mean of the biases by itself, and by the constants.
+    mean = solved.reshape(len(curve), n, -1).mean(axis=0)
+    alone, each = mean[:, :n], mean[:, n:-1]
+    unit = of.prior[n:]
+    return Smoothed(
+        constant * unit,
+        covariance * np.outer(unit, unit),
+        curve * of.prior[0],
+        curve.mean(axis=0) * of.prior[0],
+        (alone + each @ covariance @ each.T) * of.prior[0] ** 2,
+    )
