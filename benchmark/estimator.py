@@ -41,6 +41,7 @@ PARTS = {
     "flights": ("flights", "measure", "FIGURES"),
     "cost": ("cost", "measure", "FIGURES"),
     "vibration": ("vibration", "measure", "FIGURES"),
+    "physics": ("physics", "measure", "FIGURES"),
     "calibration": ("calibration", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""

@@ -87,10 +87,10 @@ class Flight:
         return z + self.noise
 
 
-def manoeuvres(rng: Rng) -> Callable[[Array], Array]:
+def manoeuvres(rng: Rng, length: float = LENGTH) -> Callable[[Array], Array]:
     """Rest, hover, yaw turns, steps, and rest at the end."""
     times, rates = [0.0, MOTORS + 1.0], [np.zeros(3), np.zeros(3)]
-    while times[-1] < LENGTH - 6.0:
+    while times[-1] < length - 6.0:
         kind = rng.choice(["hover", "yaw", "step"], p=[0.4, 0.3, 0.3])
         if kind == "hover":
             targets = [(0.03 * rng.standard_normal(3), 0.4) for _ in range(8)]
