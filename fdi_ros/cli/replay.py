@@ -34,17 +34,12 @@ from fdi_ros.mavlink.failover import failover_text
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import build_geometry
+from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary, as_json
-from fdi_ros.replay.words import (
-    failures,
-    parse_check,
-    sample_rate_notes,
-    summary_text,
-    verdict,
-)
+from fdi_ros.replay.words import sample_rate_notes, summary_text, verdict
 from fdi_ros.report.layout import unit_of
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text

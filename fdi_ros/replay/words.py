@@ -1,23 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay finds, in words: the verdict, the sentences below it, the tables for a terminal; and whether it passes.
-
-What it must show to pass is asked as in ``fdi replay --check 'delay<1 isolated false=0'``, or ``'imu_2.y faulty'``.
-"""
+"""The verdict on a replay, the sentences below it, and the tables for a terminal."""
 
 from __future__ import annotations
 
-import math
-import operator
-import re
 import statistics
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 
 from fdi_ros.core.decision import Reason
-from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
@@ -168,7 +160,7 @@ def _healthy_words(summary: Summary) -> str:
 
 def _unchecked_at_the_end(summary: Summary) -> str:
     end, unchecked = summary.scores.end_s, summary.unchecked_channels
-    return _unchecked_words(
+    return unchecked_words(
         [
             one
             for one in unchecked
@@ -210,7 +202,7 @@ def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
     return lines
 
 
-def _unchecked_words(channels: Sequence[ChannelResult]) -> str:
+def unchecked_words(channels: Sequence[ChannelResult]) -> str:
     """Say which channels end how, from when on and why."""
     alike: dict[tuple[str, str], list[ChannelResult]] = {}
     for one in channels:
@@ -432,236 +424,3 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
         ]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
-
-
-# What it must show to pass --------------------------------------------------------------------------------------------
-
-
-_COMPARED: dict[str, Callable[[float, float], bool]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    "=": operator.eq,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
-_TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
-_OF_FAULTS = {"detected": ("",), "delay": ("<", "<="), "isolated": ("", "<", "<=")}
-"""Every injected fault is detected; it is, within so many seconds; it is isolated, or so within so many seconds."""
-_OF_ALL = {
-    "false": ("<", "<=", "="),  # number of declarations that no injected fault explains
-    "declared": (
-        "<",
-        "<=",
-        "=",
-    ),  # number of episodes in which a fault was declared, injected or not
-    "judged": (">", ">="),  # share of the samples that was judged
-    "unchecked": ("<", "<=", "="),  # number of channels that end STALE or UNCHECKED
-}
-_FORMS = (
-    _OF_FAULTS | _OF_ALL
-)  # how each quantity may be compared with a number; empty: it may stand without one
-CHANNEL_STATES = ("faulty", "ambiguous", "stale", "ok")
-"""What a channel may be asked to have been: declared by itself, in a set, silent; or none of these."""
-_IMPLIED = (
-    f"judged>={MOSTLY_JUDGED:g}",
-    "unchecked=0",
-)  # what must hold where nothing is said of it
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One condition, as it was written."""
-
-    text: str
-    name: str  # of a quantity, or of a state of channels
-    sign: str = ""
-    bound: float = math.nan
-    channels: tuple[
-        str, ...
-    ] = ()  # that are asked for: one, or those of a unit; empty: it is about a quantity
-
-    def reasons(self, judgement: Judgement) -> list[str]:
-        """Return why it does not hold, one line per reason; empty: it does."""
-        if self.channels:
-            return [
-                f"{name}: {why}"
-                for name in self.channels
-                if (why := self._of_channel(name, judgement))
-            ]
-        if self.name in _OF_ALL:
-            value, words = _measure(self.name, judgement)
-            return [] if self._holds(value) else [words]
-        if judgement.scores.faults:
-            return [
-                why
-                for fault in judgement.scores.faults
-                if (why := self._of_fault(fault))
-            ]
-        told = judgement.story.declared
-        return (
-            [episode_words(one) for one in told if one.state != "FAULTY"]
-            if told
-            else ["nothing was declared"]
-        )
-
-    def _holds(self, value: float) -> bool:
-        return not self.sign or _COMPARED[self.sign](value, self.bound)
-
-    def _of_fault(self, fault: Outcome) -> str:
-        """Say why an injected fault does not fulfil it; empty: it does."""
-        named, when, done = (
-            f"{fault.kind} on {fault.channel}",
-            fault.delay_s,
-            "detected",
-        )
-        if when is None:
-            missed = (
-                "declared before it began: nothing was left to detect"
-                if fault.declared_before
-                else "not detected"
-            )
-            return f"{named}: {missed}"
-        if self.name == "isolated":
-            when, done = fault.isolation_delay_s, "isolated"
-        if when is None:
-            return f"{named}: detected, not isolated; declared: {', '.join(fault.declared_channels)}"
-        return "" if self._holds(when) else f"{named}: {done} after {when:.3f} s"
-
-    def _of_channel(self, channel: str, judgement: Judgement) -> str:
-        """Say what was declared of a channel where that is not what was asked for; otherwise nothing."""
-        episodes = judgement.story.episodes
-        told = {one.state: one for one in episodes if channel in one.channels}
-        if self.name == "ambiguous":
-            told |= {
-                step.state: one
-                for one in episodes
-                for step in one.steps
-                if channel in step.channels
-            }
-        if not told if self.name == "ok" else self.name.upper() in told:
-            return ""
-        return (
-            "; ".join(dict.fromkeys(map(episode_words, told.values())))
-            or "nothing was declared of it"
-        )
-
-
-def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
-    """Return the value of a quantity of the whole recording, and how it is said."""
-    scores, story = judgement.scores, judgement.story
-    if name == "judged":
-        share = scores.samples_judged / max(1, scores.samples)
-        return (
-            share,
-            f"{scores.samples_judged} of {scores.samples} samples were judged, {share:.4f}",
-        )
-    if name == "unchecked":
-        lost, total = judgement.unchecked_channels, len(judgement.monitor.channels)
-        return (
-            len(lost),
-            f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{_unchecked_words(lost)}",
-        )
-    if name == "declared":
-        count, told = (
-            len(story.declared) + story.more,
-            "; ".join(map(episode_words, story.declared[:MOST_TOLD])),
-        )
-        which = f"episode{'s' if count != 1 else ''}"
-    else:
-        count, first = len(scores.declared), scores.declared[:MOST_TOLD]
-        told = "; ".join(
-            f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in first
-        )
-        which = (
-            "declarations that no injected fault explains"
-            if scores.faults
-            else "declarations, of channels"
-        )
-    return count, f"{count} {which}{f': {told}' if told else ''}"
-
-
-def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
-    """Return why what a monitor made of a recording does not pass, one line per reason; empty: it passes.
-
-    What was mostly not judged does not pass unless the conditions say what is enough, nor do channels that end
-    unchecked unless they say how many may.
-    """
-    named = {one.name for one in required}
-    implied = [
-        one for one in map(_on_quantity, _IMPLIED) if required and one.name not in named
-    ]
-    return [
-        f"{one.text}: {why}"
-        for one in (*required, *implied)
-        for why in one.reasons(judgement)
-    ]
-
-
-def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condition]:
-    """Read conditions separated by blanks or commas, ``delay<1 isolated false=0``; all must hold.
-
-    ``faults``: how many are injected. ``names``: of the channels, which may be asked for, as may their units.
-    `ConfigError` names the part that is wrong and what is allowed.
-    """
-    parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
-    if not parts:
-        raise ConfigError(
-            f"--check is empty, expected conditions on: {', '.join(_FORMS)}"
-        )
-    found: list[Condition] = []
-    while parts:
-        part = parts.pop(0)
-        if parts and parts[0].lower() in CHANNEL_STATES:
-            text = f"{part} {parts[0].lower()}"
-            meant = tuple(
-                name for name in names if name == part or name.startswith(f"{part}.")
-            )
-            if not meant:
-                raise ConfigError(
-                    f"--check: {text!r} names no channel, expected one of: {', '.join(names)}"
-                )
-            found.append(Condition(text, parts.pop(0).lower(), channels=meant))
-            continue
-        condition = _on_quantity(part)
-        if not faults and condition.name in _OF_FAULTS and part != "isolated":
-            raise ConfigError(
-                f"--check: {part!r} is about injected faults, and none is given by --fault; of a recording as it is ask"
-                " declared=0, isolated, or CHANNEL faulty"
-            )
-        found.append(condition)
-    return found
-
-
-def _on_quantity(part: str) -> Condition:
-    match = _TERM.fullmatch(part)
-    assert match is not None
-    name, sign, number = match[1], match[2] or "", match[3]
-    if name not in _FORMS:
-        raise ConfigError(
-            f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(_FORMS)}"
-        )
-    if sign not in _FORMS[name]:
-        expected = " or ".join(
-            f"{name}{form}NUMBER" if form else name for form in _FORMS[name]
-        )
-        what = f"is compared by {sign!r}" if sign else "has no bound"
-        raise ConfigError(f"--check: {part!r} {what}, expected {expected}")
-    if not sign:
-        return Condition(part, name)
-    try:
-        bound = float(number)
-    except ValueError:
-        bound = math.nan
-    if not 0 <= bound < math.inf:
-        raise ConfigError(
-            f"--check: {part!r} has the bound {number!r}, expected a number from 0 on"
-        )
-    # No quantity is below 0, no share above 1, no count a fraction.
-    most = 1.0 if name == "judged" else math.inf
-    if (
-        (sign, bound) in (("<", 0.0), (">", most))
-        or bound > most
-        or (sign == "=" and bound % 1 != 0)
-    ):
-        raise ConfigError(f"--check: {part!r} can never hold")
-    return Condition(part, name, sign, bound)

@@ -126,7 +126,7 @@ def test_a_missed_fault_and_a_false_declaration_fail_the_check(
     )
     assert code == 1
     assert re.match(
-        r"fdi: check not met: false<1: \d+ declarations, of channels: g\d [A-Z]+ at ",
+        r"fdi: check not met: false<1: \d+ declarations: g\d [A-Z]+ at ",
         err,
     )
 

@@ -19,9 +19,10 @@ from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outcomes import GRACE
 from fdi_ros.replay.run import replay
-from fdi_ros.replay.words import failures, noisy_lines, parse_check, sentences, verdict
+from fdi_ros.replay.words import noisy_lines, sentences, verdict
 from fdi_ros.report.layout import Severity
 
 FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0

@@ -19,10 +19,11 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.run import replay
 from fdi_ros.replay.summary import as_json
 from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep
-from fdi_ros.replay.words import failures, parse_check, summary_text, verdict
+from fdi_ros.replay.words import summary_text, verdict
 
 JUDGEMENT = re.compile(
     r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b",
@@ -106,7 +107,7 @@ def visible(path):
         ("imu_2.y faulty", ""),
         ("declared=1 isolated imu_1.x ok", ""),
         ("declared=0", "declared=0: 1 episode: imu_2.y FAULTY from "),
-        ("imu_2 faulty", "imu_2 faulty: imu_2.x: nothing was declared of it"),
+        ("imu_2 faulty", "imu_2 faulty: imu_2.x: nothing was declared"),
         ("imu_2.y ok,judged>0.5", "imu_2.y ok: imu_2.y: imu_2.y FAULTY from "),
     ],
 )
