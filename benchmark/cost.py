@@ -20,8 +20,8 @@ import numpy as np
 from trials import NOISE, PARALLEL, Asked, Flight, Row, Sines
 
 from fdi_ros import Block, Config, Pipeline
+from fdi_ros.core.live import MORE, SUPPLY
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.core.path import MORE, SUPPLY
 from fdi_ros.monitor.receiver import Receiver
 
 FIGURES = {

@@ -25,7 +25,7 @@ from fdi_ros.compiling.notice import announced
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, parse_fault
-from fdi_ros.monitor.pipeline import build_geometry
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.receiver import warm_path
 from fdi_ros.ros.watch import DEEP, Watcher, show
 

@@ -20,7 +20,7 @@ from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.pipeline import build_geometry
+from fdi_ros.monitor.building import build_geometry
 
 _TOGETHER = 16384  # messages handed on together: enough that calls do not count, little enough for the cache
 _HELD = 1 << 20  # messages that wait for earlier ones at most

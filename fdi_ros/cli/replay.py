@@ -33,7 +33,7 @@ from fdi_ros.inspection.starting_config import assumed_config
 from fdi_ros.mavlink.failover import failover_text
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.pipeline import build_geometry
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report

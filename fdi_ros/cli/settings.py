@@ -36,9 +36,9 @@ from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import ConfigError, FdiError, StudyError
-from fdi_ros.estimator.blocks import rests
 from fdi_ros.estimator.error_states import SIGNALS, Layout, fill_signals
 from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.estimator.rest import rests
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_detector, warm_path

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time alignment: messages of 1 to 4 sensor units to samples, by their stamps; samples to one instant, by their delays.
+"""Time alignment: messages of 1 to 4 sensor units to samples, by their stamps.
 
 Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives
 the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
@@ -27,10 +27,7 @@ gone on for ``timeout`` since its last message. When all leave the base together
 system) it has moved. That is accepted once every live unit stands within ``timeout`` of the others there, or one has
 gone on there for ``timeout`` while no other delivered. After a step back, ``shift`` is added to the stamps of samples.
 
-Delays that are set are taken off before all of this. One that is estimated in flight leaves the stamps alone
-(`restamp`): where those of unit u are late by T_u, the value of the instant t is the one stamped t + T_u. So a sample
-stands for the instant that lies the largest delay back; the unit that is late most gives it as it is, the others what
-lies between their samples around that.
+Delays that are set are taken off before all of this; estimated ones after it (`fdi_ros.core.restamping`).
 """
 
 from __future__ import annotations
@@ -42,18 +39,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import MAX_UNITS, Units, allocate, compiled
-from fdi_ros.core.records import (
-    MAX_PENDING,
-    RESTAMP_SAMPLES,
-    RING,
-    Aligner,
-    Counters,
-    DelayBuffer,
-    PathSettings,
-    Sample,
-    Unit,
-)
+from fdi_ros.compiling.compiled import MAX_UNITS, allocate, compiled
+from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, Unit
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
@@ -518,102 +505,3 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
         samples["z"][:, : 3 * units].copy(),
         None if received.all() else received,
     )
-
-
-# Samples to one instant -----------------------------------------------------------------------------------------------
-
-
-@compiled
-def restamp(
-    line: DelayBuffer,
-    settings: PathSettings,
-    late: Units,
-    sample: Sample,
-    received: int,
-    plain: int,
-    out: Array,
-) -> int:
-    """Keep a sample, and give the values of the instant that it now stands for, into ``out`` (n,); NaN: none.
-
-    ``received``, ``plain``: bits of the values received, and of those finite and in range; ``late`` (units,): by how
-    much the stamps of each unit are late, s. Returned are the bits of the channels that have a value, of the instant
-    that the largest delay lies before the stamp.
-    """
-    n, units, members, stamp = (
-        settings.n,
-        settings.units,
-        settings.members,
-        sample.stamp,
-    )
-    row = line.rows[line.count % RESTAMP_SAMPLES]
-    if line.count > 0:
-        step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
-        line.step = (
-            step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
-        )
-    row.stamp, row.received, row.plain = stamp, received, plain
-    line.count += 1
-    top = 0.0
-    for u in range(units):
-        top = max(top, late[u])
-    for i in range(n):
-        row.values[i] = out[i] = sample.z[i]
-    found = received
-    for u in range(units):
-        back = round(1e9 * (top - late[u]))
-        if back > 0:
-            found &= ~members[u]
-            found |= interpolate(line, n, members[u], stamp - back, out)
-    return found
-
-
-@compiled
-def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array) -> int:
-    """Values of some channels at a stamp, into ``out``; return bits of those that there are.
-
-    By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not
-    there yet, by the line through the inner ones. Between a value in range and one out of it, or none, there is none.
-    """
-    k = line.count - 1
-    oldest = max(line.count - RESTAMP_SAMPLES, 0)
-    while k > oldest and line.rows[k % RESTAMP_SAMPLES].stamp > stamp:
-        k -= 1
-    before, after = line.rows[k % RESTAMP_SAMPLES], line.rows[(k + 1) % RESTAMP_SAMPLES]
-    span = after.stamp - before.stamp
-    found = members & before.received & after.received & ~(before.plain ^ after.plain)
-    if k + 1 >= line.count or before.stamp > stamp or span > MAX_STEPS * line.step:
-        found = 0
-    share = (stamp - before.stamp) / max(span, 1)
-    first, last = (
-        line.rows[(k - 1) % RESTAMP_SAMPLES],
-        line.rows[(k + 2) % RESTAMP_SAMPLES],
-    )
-    curved = 0
-    if (
-        found
-        and k - 1 >= oldest
-        and k + 2 < line.count
-        and last.stamp - first.stamp <= 2.0 * MAX_STEPS * line.step
-    ):
-        outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
-        curved = found & first.received & last.received & outer
-    # Places of the outer two where the inner ones are 0 and 1.
-    a, b = (
-        (first.stamp - before.stamp) / max(span, 1),
-        (last.stamp - before.stamp) / max(span, 1),
-    )
-    inside = share * (1.0 - share)
-    for i in range(n):
-        if members >> i & 1:
-            out[i] = (
-                before.values[i] + share * (after.values[i] - before.values[i])
-                if found >> i & 1
-                else math.nan
-            )
-            if curved >> i & 1:
-                # What is left over of the outer two, over s (1 - s), is a line through two values.
-                rise = after.values[i] - before.values[i]
-                low = (first.values[i] - before.values[i] - a * rise) / (a * (1.0 - a))
-                high = (last.values[i] - before.values[i] - b * rise) / (b * (1.0 - b))
-                out[i] += inside * (low + (share - a) / (b - a) * (high - low))
-    return found

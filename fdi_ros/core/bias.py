@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
+from fdi_ros.core.parity import apply_gain, eliminate_rate
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, ValueGroup
-from fdi_ros.core.subsets import apply_gain, eliminate_rate
 from fdi_ros.model.samples import MAX_RATE, Array
 
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)

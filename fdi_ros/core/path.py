@@ -1,16 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sample path: one sample through the monitor, in order, and one live message at a time.
+"""The sample path: one sample through the monitor, in order.
 
     values -> checks -> bias -> rate -> detector -> stuck -> decision -> fused rate -> states -> protection level
 
 `prepare_sample` is the path up to the detector, `conclude_sample` the rest. Between them the sample waits if the
 constants of the detector for just the channels present are still to be prepared, which happens once for each set of
 channels.
-
-Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), made of its reading and `receive_stamped` or
-`receive_arrived`. The samples that are complete then go through `process`.
 """
 
 from __future__ import annotations
@@ -22,35 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.alignment import enter, next_sample, restamp
+from fdi_ros.core.acceleration import differentiate_rate
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, update_bias
-from fdi_ros.core.decision import (
-    CHECKED,
-    alive,
-    at_least,
-    decide,
-    fill_suspects,
-    forget_kind,
-    gather_evidence,
-    left_out,
-    out_of_use,
-    update_states,
-    write_events,
-)
-from fdi_ros.core.fusion import fuse, update_level
-from fdi_ros.core.health import (
-    FINE,
-    OUT_OF_RANGE,
-    all_repeat,
-    check,
-    leave_flickering,
-    update_copies,
-    update_repeated,
-)
-from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
-from fdi_ros.core.records import Aligner, Core, Current, Live, PathSettings, Sample
-from fdi_ros.core.subsets import differentiate_rate, fill_rate, judge_sample
-from fdi_ros.model.samples import Bytes
+from fdi_ros.core.copies import update_copies
+from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
+from fdi_ros.core.evidence import fill_suspects, gather_evidence
+from fdi_ros.core.fusion import fuse
+from fdi_ros.core.health import FINE, OUT_OF_RANGE, check, leave_flickering
+from fdi_ros.core.judging import judge_sample
+from fdi_ros.core.level import update_level
+from fdi_ros.core.records import Core, Current, PathSettings, Sample
+from fdi_ros.core.repeated import all_repeat, update_repeated
+from fdi_ros.core.restamping import restamp
+from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
+from fdi_ros.core.subsets import fill_rate
 
 NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
 NOISIER = (
@@ -343,104 +325,3 @@ def skip_sample(core: Core) -> None:
         last.covariance[k] = math.nan
     last.statistic = last.threshold = math.nan
     last.valid = last.alarm = False
-
-
-WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
-"""Bits of what taking and working a message returns: a sample was worked; it has a fused rate; it brought
-events; another is to be worked; the path wants something prepared (before the next call, which goes on with the
-sample if none was worked); the message was refused."""
-NEVER = -1  # instead of a stamp
-AHEAD_OF_CLOCK = 1_000_000_000  # ns that a live stamp may be: clocks of two computers differ, and simulators step
-STEP_BACK = 100_000_000  # ns; a clock set back by more is followed, less is waited out: NTP slews that within minutes
-
-
-@compiled
-def receive_stamped(
-    live: Live, aligner: Aligner, unit: int, stamp: int, now: int
-) -> int:
-    """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
-
-    ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it arrived, ns; 0: not known. What
-    is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
-    """
-    inlet = live.inlets[unit]
-    inlet.received += 1
-    if stamp < 0:
-        inlet.error = -stamp
-        inlet.malformed += 1
-        return MALFORMED
-    inlet.error, inlet.stamp = GOOD, stamp
-    if now > 0 and stamp - now > AHEAD_OF_CLOCK:
-        aligner.units[unit].counters.ahead += 1
-        return MORE if live.ready else 0
-    enter(aligner, unit, stamp)
-    lag = aligner.units[unit].lag
-    inlet.lag = lag if inlet.lag == NEVER else min(lag, inlet.lag)
-    if not live.ready and next_sample(aligner, live.sample):
-        live.ready = True
-    return MORE if live.ready else 0
-
-
-@compiled
-def receive_arrived(live: Live, code: int, stamp: int) -> int:
-    """Take what was read of all channels, into `live.sample.z`, stamped on arrival; return `MALFORMED` or `MORE`."""
-    inlet, sample = live.inlets[0], live.sample
-    inlet.received += 1
-    inlet.error = code
-    if code != GOOD:
-        inlet.malformed += 1
-        return MALFORMED
-    # A clock set back: the samples go on, and the messages keep the time of the clock.
-    if stamp + live.clock_shift <= live.last_stamp:
-        if live.last_stamp - stamp - live.clock_shift > STEP_BACK:
-            live.clock_shift = live.last_stamp - stamp
-            live.restarts += 1
-        stamp = live.last_stamp + 1 - live.clock_shift
-    live.last_stamp = sample.stamp = stamp + live.clock_shift
-    sample.shift = live.clock_shift
-    for i in range(live.channels):
-        sample.received[i] = True
-    live.ready = True
-    return MORE
-
-
-@compiled
-def process(
-    path: Path,
-    aligner: NDArray[Any],
-    live: NDArray[Any],
-    events: NDArray[Any],
-    fused: Bytes,
-    integrity: Bytes,
-) -> int:
-    """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
-
-    ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and ``integrity`` the messages to be
-    published about it.
-    """
-    monitor, main = live[0], path[0][0]
-    if not monitor.ready:
-        return 0
-    sample = monitor.sample
-    count = step(path, sample, 0, events, 0)
-    if count < 0:
-        return SUPPLY | MORE
-    monitor.events = count
-    flags = WORKED | HAS_EVENTS if count > 0 else WORKED
-    if main.last.valid:
-        fill_imu(
-            fused,
-            monitor.fused_at,
-            main.last.instant - sample.shift,
-            main.last.rate,
-            main.last.covariance,
-        )
-        flags |= HAS_RATE
-    else:
-        monitor.without_rate += 1
-    if main.wanted or main.copies.found:
-        flags |= SUPPLY
-    fill_integrity(integrity, monitor.integrity_at, main.last, main.settings.n)
-    monitor.shift = sample.shift
-    monitor.ready = next_sample(aligner[0], sample)
-    return flags | MORE if monitor.ready else flags

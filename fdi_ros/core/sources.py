@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, compiled
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import INPUTS
+from fdi_ros.core.live import receive_arrived, receive_stamped
 from fdi_ros.core.messages import (
     CUT_VALUES,
     ENCAPSULATION,
@@ -42,7 +43,6 @@ from fdi_ros.core.messages import (
     read_only,
     read_rate,
 )
-from fdi_ros.core.path import receive_arrived, receive_stamped
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
@@ -85,7 +85,7 @@ class Source(ABC):
     ) -> int:
         """Take in one live message, its bytes, of the input topic ``inlet``, which arrived at ``stamp``, ns.
 
-        ``aligner``, ``live``: as for `fdi_ros.core.path.process`. Returned is `fdi_ros.core.path.MORE` if a sample is
+        ``aligner``, ``live``: as for `fdi_ros.core.live.process`. Returned is `fdi_ros.core.live.MORE` if a sample is
         ready to be worked, `MALFORMED` if the message was refused, else 0.
         """
 

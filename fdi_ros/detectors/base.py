@@ -31,16 +31,10 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.judging import REFUSED, UNPREPARED, judge_sample, present_in
 from fdi_ros.core.records import Bank, SampleInput, SampleVerdict
-from fdi_ros.core.subsets import (
-    REFUSED,
-    UNPREPARED,
-    describe_sensors,
-    flags_of,
-    judge_sample,
-    present_in,
-    whole_set,
-)
+from fdi_ros.core.sensors import describe_sensors
+from fdi_ros.core.subsets import flags_of, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

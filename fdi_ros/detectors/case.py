@@ -1,24 +1,21 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Evidence at four time scales, and the case that it opens: whether it stands against the noise of its own time.
+"""The case that evidence opens: whether it stands against the noise of its own time.
 
-Evidence is Shiryaev-Roberts sums over channels, signs and sizes of a fault. A large sum is looked back at: since when
-its channel is off, and how far beyond the scatter of that same time. As a case is opened, the states go back to before
-the onset (`predict_from`), and the mean since then is to be explained (`fdi_ros.detectors.naming`) against all that is
-not known of the sensors.
+As a case is opened, the states go back to before the onset (`predict_from`), and the mean since then is to be explained
+(`fdi_ros.detectors.naming`) against all that is not known of the sensors. A case lasts until its evidence has gone, or
+its channels are left out.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import (
-    MAX_CHANNELS,
     Channels,
     Flag,
     Mask,
@@ -35,7 +32,15 @@ from fdi_ros.detectors.naming import (
     moved_by,
     set_mean,
 )
-from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
+from fdi_ros.detectors.sums import (
+    KEPT,
+    PER_BLOCK,
+    SIZES,
+    Scales,
+    forget_sums,
+    look_back,
+    value_at,
+)
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
     LEAST_SHARE,
@@ -45,31 +50,9 @@ from fdi_ros.estimator.estimator import (
     Estimator,
     update_weights,
 )
-from fdi_ros.estimator.noise import (
-    BLOCK,
-    BURST,
-    FAR,
-    LONG,
-    SAMPLE,
-    SCALES,
-    update_block_noise,
-    update_long_noise,
-    update_sample_noise,
-    update_unknown,
-)
-from fdi_ros.estimator.shared_noise import update_shared
-from fdi_ros.model.samples import Array
+from fdi_ros.estimator.noise import BLOCK, SCALES, update_unknown
+from fdi_ros.estimator.snapshots import is_after_hole, move_biases, predict_from
 
-SIZES, KEPT = 6, 64  # of a fault; values of each time scale that are looked back at
-PER_BLOCK = (0, 1, 6, 48)  # blocks in a value of each time scale; 0: samples
-SMALLEST = 0.2
-"""Smallest size of a fault, in standard deviations at its time scale; each next one is twice as large, up to 6.4. From
-one to the next at most 11 % of the delay are lost, and smaller faults are found at a longer time scale."""
-FIRST_LONG = 2  # sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
-STEP_LIMIT = 7.0  # a value counts as this many standard deviations at most (Huber 1965): beyond the largest size
-CEILING = (
-    1e6  # sums stay below so many times the threshold: what has passed is forgotten
-)
 STANDS = 0.6
 """Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case: less
 than the sums need, as what is not known is counted here in full."""
@@ -95,24 +78,6 @@ LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biase
 FASTEST = (
     2.5  # and so many times as fast as that for a moment: warming is quickest at first
 )
-Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
-Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
-Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]
-
-
-@record
-class Scale:
-    """Evidence of one time scale."""
-
-    filled: Whole  # blocks in the value being filled
-    values: Channels  # sum of their A y, s/rad
-    information: Channels  # sum of their A_ii, s^2/rad^2
-    newest: Whole  # place of the last value
-    kept: Whole  # values that may be looked back at
-    series: Series  # values, in standard deviations
-    first: Firsts  # number of the first sample in each
-    sums: Sums
-    total: Real  # of all sums
 
 
 @record
@@ -145,189 +110,8 @@ class State:
     declared: Mask  # channels that were declared until then
     stamp: Whole  # of the last sample, ns
     estimator: Estimator
-    scales: Annotated[list[Scale], SCALES]
+    scales: Scales
     case: Case
-
-
-# The sums -------------------------------------------------------------------------------------------------------------
-
-
-@compiled
-def add_evidence(
-    params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int
-) -> None:
-    """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
-    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
-    scale.first[scale.newest] = first_sample
-    scale.kept = min(scale.kept + 1, KEPT)
-    scale.total = 0.0
-    for i in range(params.sensors.n):
-        if not kf.judged >> i & 1:
-            continue
-        y, cap = scale.series[scale.newest, i], kf.noise.cap[at, i]
-        for side in range(2):
-            sums, total, size = scale.sums[side, i], 0.0, SMALLEST
-            factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
-            for k in range(SIZES):
-                if k >= first:
-                    sums[k] = min(
-                        (1.0 + sums[k])
-                        * min(factor * math.exp(-0.5 * size * size), cap),
-                        ceiling,
-                    )
-                    total += sums[k]
-                factor *= factor
-                size *= 2.0
-            scale.total += total
-
-
-@compiled
-def value_at(scale: Scale, back: int, i: int) -> float:
-    """Return the value of channel i so many before the last one."""
-    return scale.series[(scale.newest - back + KEPT) % KEPT, i]
-
-
-@compiled
-def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> float:
-    """Variance of a mean of the last values times their number: of single ones, or of batches if that is more."""
-    worst, size = 0.0, 1
-    while count // size >= 4 or size == 1:
-        batches, squares = count // size, 0.0
-        for b in range(batches):
-            total = 0.0
-            for k in range(b * size, (b + 1) * size):
-                total += sign * value_at(scale, k, i) - mean
-            squares += total * total
-        worst = max(worst, squares / size / max(batches - 1.0, 1.0))
-        size *= 2
-    return worst
-
-
-@compiled
-def look_back(
-    params: Constants, kf: Estimator, scale: Scale, i: int, sign: float
-) -> tuple[int, float]:
-    """Find since when channel i is off, and the evidence for it against the noise of that same time.
-
-    Returns
-    -------
-    Values since the onset, and the logarithm of the likelihood ratio: Student's, with the degrees of freedom that the
-    learned noise counts for and those of the values themselves.
-    """
-    best, since, total = 0.0, 0, 0.0
-    for k in range(scale.kept):
-        total += sign * value_at(scale, k, i)
-        t = total / math.sqrt(k + 1.0)
-        if t > best:
-            best, since = t, k + 1
-    if since < 2:
-        return since, 0.0
-    mean, trust = best / math.sqrt(since), kf.noise.degrees[i]
-    squares, count = 0.0, 0
-    for j in range(params.sensors.n):
-        if kf.judged >> j & 1:
-            count += 1
-            for k in range(since - 1):
-                step = value_at(scale, k, j) - value_at(scale, k + 1, j)
-                squares += min(0.5 * step * step, FAR)
-    # Of so many channels three fewer differ from what a rate explains.
-    checks = max(count - 3.0, 1.0)
-    pooled = (trust + squares / max(count, 1) * checks) / (
-        trust + checks * (since - 1.0)
-    )
-    degrees = trust + since - 1.0
-    scatter = scatter_of(scale, i, sign, since, mean)
-    variance = max((trust + (since - 1.0) * scatter) / degrees, pooled)
-    return since, 0.5 * (degrees + 1.0) * math.log(
-        1.0 + mean * mean * since / variance / degrees
-    )
-
-
-@compiled
-def update_from_sample(params: Constants, state: State, learns: bool) -> None:
-    """Take the statistics of a sample into the noise and the sums."""
-    kf, scale = state.estimator, state.scales[SAMPLE]
-    noise = kf.noise
-    noise.seen[SAMPLE] += 1.0
-    scale.newest = (scale.newest + 1) % KEPT
-    for i in range(params.sensors.n):
-        scale.series[scale.newest, i] = 0.0
-        if kf.judged >> i & 1:
-            slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
-            scale.series[scale.newest, i] = kf.statistic[i] / math.sqrt(
-                max(1.0, BURST * noise.quick[i], slow)
-            )
-    update_shared(params, kf)
-    update_sample_noise(
-        noise,
-        params.sensors.n,
-        kf.judged,
-        kf.statistic,
-        kf.inflation,
-        learns,
-        kf.samples % 2,
-    )
-    add_evidence(params, kf, scale, SAMPLE, kf.samples)
-
-
-@compiled
-def update_from_block(params: Constants, state: State, learns: bool) -> None:
-    """Take the innovations of a block into the noise and the sums of the longer time scales."""
-    kf, noise, n = state.estimator, state.estimator.noise, params.sensors.n
-    mask, information = kf.masks[1] & kf.judged, kf.block_parity.information
-    for k in range(1, SCALES):
-        scale = state.scales[k]
-        for i in range(n):
-            if mask >> i & 1:
-                scale.values[i] += kf.block_values[i]
-                scale.information[i] += information[i, i]
-        scale.filled += 1
-        if scale.filled < PER_BLOCK[k]:
-            continue
-        noise.seen[k] += 1.0
-        scale.newest = (scale.newest + 1) % KEPT
-        known = 0
-        for i in range(n):
-            if scale.information[i] > 0.0:
-                known |= 1 << i
-                scale.values[i] /= math.sqrt(scale.information[i])
-        if k == BLOCK:
-            update_block_noise(noise, n, known, scale.values, params.expected, learns)
-        else:
-            update_long_noise(noise, k, n, known, scale.values, learns)
-        for i in range(n):
-            scale.series[scale.newest, i] = (
-                scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
-            )
-            scale.values[i] = scale.information[i] = 0.0
-        scale.filled = 0
-        add_evidence(
-            params, kf, scale, k, kf.samples - (PER_BLOCK[k] + 1) * params.length + 1
-        )
-
-
-@compiled
-def mean_of(params: Constants, state: State) -> float:
-    """Mean of all sums."""
-    total, channels = 0.0, 0
-    for k in range(SCALES):
-        total += state.scales[k].total
-    for i in range(params.sensors.n):
-        channels += state.estimator.judged >> i & 1
-    return total / max(2 * (SCALES * SIZES - FIRST_LONG) * channels, 1)
-
-
-@compiled
-def fill_scores(params: Constants, state: State, scores: Array) -> None:
-    """Logarithm of one plus the largest sum of each channel that is judged, NaN of others; scores (n,) takes them."""
-    for i in range(params.sensors.n):
-        largest = 0.0
-        for k in range(SCALES):
-            sums = state.scales[k].sums
-            for s in range(SIZES):
-                largest = max(largest, sums[0, i, s], sums[1, i, s])
-        here = state.estimator.judged & state.estimator.mask & (1 << i)
-        scores[i] = math.log(1.0 + largest) if here else math.nan
 
 
 @compiled
@@ -337,17 +121,7 @@ def forget_evidence(params: Constants, state: State) -> None:
     state.case.isolated = state.case.suspects = state.estimator.excluded_from_rate = (
         state.estimator.under_test
     ) = 0
-    for k in range(SCALES):
-        scale = state.scales[k]
-        scale.kept = scale.filled = 0
-        scale.total = 0.0
-        for i in range(params.sensors.n):
-            scale.values[i] = scale.information[i] = 0.0
-            for s in range(SIZES):
-                scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
-
-
-# The case -------------------------------------------------------------------------------------------------------------
+    forget_sums(params, state.scales)
 
 
 @compiled

@@ -29,8 +29,8 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, invert
 from fdi_ros.core.records import Matrix, Parity
-from fdi_ros.core.subsets import UNKNOWN_RATE, fill_joint_parity, invert
 from fdi_ros.estimator.error_states import fill_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
 from fdi_ros.estimator.noise import BLOCK, BURST, MOTION

@@ -3,7 +3,7 @@
 
 """The detector that flies: the path of a sample through the estimator, the sums, and the case that they open.
 
-The sums (`fdi_ros.detectors.case`) are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of
+The sums (`fdi_ros.detectors.sums`) are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of
 variance one, if what is known of the sensors holds. A case lasts until its evidence has gone, or its channels are left
 out.
 """
@@ -21,32 +21,28 @@ from fdi_ros.core.subsets import all_sets, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
-    fill_scores,
     follow_case,
     forget_evidence,
     goes_too_far,
     look_for_case,
     look_for_change_in_hole,
     look_for_drift,
-    mean_of,
     undo_move,
+)
+from fdi_ros.detectors.sums import (
+    fill_scores,
+    mean_of,
     update_from_block,
     update_from_sample,
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
-    REST_STD,
-    inflate_delays,
     judge_block,
-    keep_snapshot,
     learn,
-    pass_hole,
     predict_innovation_covariance,
-    transfer_delays,
     update_angular_acceleration,
-    update_rest,
-    update_time_offsets,
 )
+from fdi_ros.estimator.delays import transfer_delays, update_time_offsets
 from fdi_ros.estimator.error_states import (
     begin_states,
     fill_signals,
@@ -80,12 +76,14 @@ from fdi_ros.estimator.noise import (
     update_sample_variance,
     update_unknown,
 )
+from fdi_ros.estimator.rest import REST_STD, update_rest
 from fdi_ros.estimator.shared_noise import (
     begin_shared,
     update_line,
     update_shape,
     update_shared_level,
 )
+from fdi_ros.estimator.snapshots import inflate_delays, keep_snapshot, pass_hole
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
@@ -178,11 +176,13 @@ def process_block(params: Constants, state: State) -> None:
     kf.unseen = False
     update_angular_acceleration(params, kf)
     weight = judge_block(params, kf)
-    update_from_block(params, state, learns)
+    update_from_block(params, kf, state.scales, learns)
     update_rest(params, kf)
     if kf.rest and noise.regime == MOTION and learns:
         change_regime(noise, n, REST, False)
-    suspicious = mean_of(params, state) > math.sqrt(params.limit)
+    suspicious = mean_of(params, state.estimator, state.scales) > math.sqrt(
+        params.limit
+    )
     kf.held = kf.held + kf.span if suspicious else 0.0
     if learns and not suspicious:
         # Of a case that was refused.
@@ -242,7 +242,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     watch_for_motion(params, kf)
     update_statistics(params, kf)
     if not is_blind(kf):
-        update_from_sample(params, state, not state.case.open)
+        update_from_sample(params, kf, state.scales, not state.case.open)
 
 
 @compiled
@@ -272,7 +272,7 @@ def fill_verdict(
     unsure = case.open and case.isolated == 0
     # What the channels disagree by now beyond all that is known, as in a shock that they measure at other instants.
     odd = 1.0 if case.open else kf.odd
-    fill_scores(params, state, verdict.scores)
+    fill_scores(params, state.estimator, state.scales, verdict.scores)
     for i in range(n):
         variance = kf.shared.level[i] * odd
         verdict.noise[i] = math.sqrt(variance / params.expected[i])
@@ -332,7 +332,8 @@ def judge(
         return
     if sample.repeated:
         verdict.statistic = min(
-            math.log(1.0 + mean_of(params, state)), SHORT * verdict.threshold
+            math.log(1.0 + mean_of(params, state.estimator, state.scales)),
+            SHORT * verdict.threshold,
         )
         return
     update_shape(params, kf)
@@ -341,7 +342,7 @@ def judge(
         process_block(params, state)
         # Its covariance is that of now.
         correct_sample(params, kf, sample.z)
-    mean = mean_of(params, state)
+    mean = mean_of(params, state.estimator, state.scales)
     verdict.statistic = math.log(1.0 + mean)
     fill_outliers(params, state, verdict)
     if case.open:

@@ -33,13 +33,8 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, fill_joint_parity, fill_parity
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.core.subsets import (
-    UNKNOWN_RATE,
-    apply_gain,
-    fill_joint_parity,
-    fill_parity,
-)
 from fdi_ros.estimator.error_states import (
     ErrorStates,
     Layout,

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.subsets import apply_gain, fill_parity, invert
+from fdi_ros.core.parity import apply_gain, fill_parity, invert
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array

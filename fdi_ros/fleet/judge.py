@@ -35,8 +35,9 @@ from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
 from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.inspection.starting_config import starting_config_of
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_ros.config.settings import LEAST_NOISE
-from fdi_ros.estimator.blocks import REST_STD, rests
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.estimator.noise import THREE_SIGMA
+from fdi_ros.estimator.rest import REST_STD, rests
 from fdi_ros.model.samples import Array, Int
 
 LENGTH = (

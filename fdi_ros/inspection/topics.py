@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.core.health import copies_among
+from fdi_ros.core.copies import copies_among
 from fdi_ros.core.sources import Source, source_of_type
 from fdi_ros.inspection.repeats import Repeats
 from fdi_ros.inspection.segments import NoiseSegments

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.protocol import ARDUPILOT, MS, NS
 from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING

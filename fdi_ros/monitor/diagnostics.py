@@ -13,9 +13,9 @@ from enum import IntEnum
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
-from fdi_ros.core.decision import ChannelState, Reason
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.sources import source_of
+from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.monitor.output import Topic
 from fdi_ros.system.text import plus_minus
 

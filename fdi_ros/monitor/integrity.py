@@ -9,7 +9,7 @@ docs/integrity.md has the formulas.
 
 It is worked out once for each set of channels, at noise_std. For a sample whose errors are larger the risk stays shared
 among the hypotheses as it is there: then ``T_L + q_L sigma_L`` with ``q_L = (level - T_L) / sigma_L`` is enough, and
-the largest of these is bounded in the sample path (`fdi_ros.core.subsets.fill_level`). NumPy alone.
+the largest of these is bounded in the sample path (`fdi_ros.core.level.fill_level`). NumPy alone.
 """
 
 from __future__ import annotations

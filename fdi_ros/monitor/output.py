@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.decision import REASONS, ChannelState, Reason
 from fdi_ros.core.messages import (
     ChannelsTemplate,
     ImuTemplate,
     fill_imu,
     fill_integrity,
 )
+from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
 from fdi_ros.system import require

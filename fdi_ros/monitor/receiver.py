@@ -16,10 +16,10 @@ import numpy as np
 from fdi_ros.compiling.compiled import Callback, allocate
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
-from fdi_ros.core.health import copies_among
+from fdi_ros.core.live import MORE, NEVER, process
 from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
-from fdi_ros.core.path import MORE, NEVER, process
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.core.sources import SOURCES, Source, source_of
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class

@@ -24,7 +24,7 @@ from fdi_ros.core.decision import WHY
 from fdi_ros.core.subsets import mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
-from fdi_ros.estimator.blocks import LONGEST_DELAY
+from fdi_ros.estimator.delays import LONGEST_DELAY
 from fdi_ros.estimator.error_states import predict
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.pipeline import Pipeline

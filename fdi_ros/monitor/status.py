@@ -23,8 +23,8 @@ from fdi_ros.core.bias import (
     RESTORED,
     TOO_FEW,
 )
-from fdi_ros.core.decision import REASONS, ChannelState, Reason
 from fdi_ros.core.records import Condition
+from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import flags_of, is_in, mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block, Mask

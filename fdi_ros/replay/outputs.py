@@ -19,8 +19,8 @@ from fdi_ros import __version__
 from fdi_ros.bag.raw import MADE_BY_FDI, Batch
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
-from fdi_ros.core.decision import ChannelState
 from fdi_ros.core.sources import source_of
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import Samples
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import (
     Geometry,
     all_of_words,

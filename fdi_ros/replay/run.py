@@ -29,9 +29,10 @@ from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.model.samples import Array, Block, Int
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.replay.episodes import GAP, pieces
 from fdi_ros.replay.outcomes import Evaluation, finite

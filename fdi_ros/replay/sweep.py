@@ -24,8 +24,9 @@ from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Array, Block, Mask
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import pieces
 from fdi_ros.replay.outcomes import STANDING, Scored, StateChange, score, standing
 from fdi_ros.replay.run import Judge, Kept, Walk

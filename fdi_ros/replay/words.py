@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Sequence
 from itertools import pairwise
 
-from fdi_ros.core.decision import Reason
+from fdi_ros.core.states import Reason
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE

@@ -23,8 +23,8 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
-from fdi_ros.monitor.pipeline import build_geometry
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros.node import CheckedNode
 

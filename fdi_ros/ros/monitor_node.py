@@ -24,8 +24,9 @@ from fdi_ros.config.config import is_ros_parameter
 from fdi_ros.config.settings import MONITOR
 from fdi_ros.errors import FdiError
 from fdi_ros.model.noise import summary_line
+from fdi_ros.monitor.building import alarm_probability
 from fdi_ros.monitor.output import OUTPUTS, ChannelState
-from fdi_ros.monitor.pipeline import Pipeline, alarm_probability
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver, warm_detector
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros.node import CheckedNode

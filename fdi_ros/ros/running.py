@@ -14,8 +14,7 @@ from functools import partial
 import numpy as np
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
-from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.core.path import (
+from fdi_ros.core.live import (
     HAS_EVENTS,
     HAS_RATE,
     MALFORMED,
@@ -24,6 +23,7 @@ from fdi_ros.core.path import (
     SUPPLY,
     WORKED,
 )
+from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.monitor.diagnostics import (
     WHOLE,
     InputStatus,

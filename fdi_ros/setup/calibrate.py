@@ -23,14 +23,14 @@ from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.inspection.turns import LEAST_ROTATION, LEAST_WINDOWS
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.monitor.pipeline import (
+from fdi_ros.monitor.building import (
     CHANNEL_DELAY,
     UNIT_DELAY,
-    Pipeline,
     build_geometry,
     build_noise,
 )
+from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.setup.agreement import LEAST_RATE, SHOWN, check_agreement

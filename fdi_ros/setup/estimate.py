@@ -25,7 +25,6 @@ import numpy as np
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.estimator.blocks import QUIET, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     ERROR_KINDS,
     ONE,
@@ -36,9 +35,10 @@ from fdi_ros.estimator.error_states import (
     prepare_layout,
 )
 from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
+from fdi_ros.estimator.rest import QUIET, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array, Int, Mask
-from fdi_ros.monitor.pipeline import UNIT_DELAY
+from fdi_ros.monitor.building import UNIT_DELAY
 from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
 from fdi_ros.setup.noise import (
     Floor,

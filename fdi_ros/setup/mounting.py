@@ -24,7 +24,7 @@ from fdi_ros.model.noise import (
     summary_line,
 )
 from fdi_ros.model.samples import Array
-from fdi_ros.monitor.pipeline import alarm_probability, build_geometry, build_noise
+from fdi_ros.monitor.building import alarm_probability, build_geometry, build_noise
 from fdi_ros.report.layout import (
     PALETTE,
     RADIANS,

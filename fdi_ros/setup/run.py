@@ -28,7 +28,8 @@ from fdi_ros.inspection.fitness import candidates, clocks_apart, copy_words, nee
 from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.inspection.topics import GAP, TopicReport, inspect
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.building import build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, parse_swept, sweep
 from fdi_ros.report.layout import first_of

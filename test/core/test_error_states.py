@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate
-from fdi_ros.core.alignment import restamp
+from fdi_ros.core.parity import fill_joint_parity
 from fdi_ros.core.records import DelayBuffer, Parity, PathSettings, Sample, Sensors
-from fdi_ros.core.subsets import fill_joint_parity
+from fdi_ros.core.restamping import restamp
 from fdi_ros.estimator.error_states import (
     MAX_STATES,
     ErrorStates,

@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.core.subsets import LARGEST_RATE
+from fdi_ros.core.judging import LARGEST_RATE
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.base import MOST_ROWS, Detector, Verdict, accepted_options
 from fdi_ros.errors import DetectorError

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import config, mounted, parallel, told
 
-from fdi_ros.core.subsets import fill_level, passes_test, prepare_subsets
+from fdi_ros.core.level import fill_level, passes_test
+from fdi_ros.core.subsets import prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

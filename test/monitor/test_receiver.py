@@ -10,8 +10,8 @@ import pytest
 from monitor.streams import START, config, parallel, run, stream
 
 from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MORE, SUPPLY, WORKED
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MORE, SUPPLY, WORKED
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from monitor.streams import output_of, parallel
 from replay.summaries import summary_of
 
-from fdi_ros.core.decision import ChannelState, Reason
+from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel

@@ -14,11 +14,12 @@ from replay.summaries import Keep, examples
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.building import build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outcomes import GRACE
 from fdi_ros.replay.run import replay

@@ -43,7 +43,7 @@ from ros.processes import (
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.core.decision import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -27,7 +27,8 @@ from vehicles import vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.pipeline import Pipeline, build_geometry
+from fdi_ros.monitor.building import build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.run import Proof, Tried

@@ -23,7 +23,7 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
-from fdi_ros.core.subsets import variance_of
+from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.papers.likelihood_ratio import (
     Hypotheses,

@@ -31,7 +31,7 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
-from fdi_ros.core.subsets import variance_of
+from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space

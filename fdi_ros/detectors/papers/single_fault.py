@@ -30,7 +30,7 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
-from fdi_ros.core.subsets import variance_of
+from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector, NoState
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry

@@ -1,0 +1,189 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Units that are one sensor.
+
+Two gyros differ by their noise. Where a linear map of three channels explains to rounding what three others change
+by, from sample to sample, these are a copy, perhaps turned, scaled or some samples later: a topic that was mapped
+twice. A copy agrees with its original whatever is wrong with it, so it is left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate, compiled
+from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSettings
+from fdi_ros.model.geometry import ROUNDING
+from fdi_ros.model.samples import MAX_RATE, Array
+
+#
+# Two gyros differ by their noise. Where a linear map of three channels explains to rounding what three others change
+# by, from sample to sample, these are a copy, perhaps turned, scaled or some samples later: a topic that was mapped
+# twice. A copy agrees with its original whatever is wrong with it, so it is left out.
+
+
+PERIOD = 1_000_000_000  # from one comparison to the next, ns: a copy is found on the ground, and in no hurry
+ROWS = 24  # changes that are compared; quantised values of two gyros at rest may agree by chance in fewer
+FEW = ROWS // 3  # of these so many first: mostly they tell that there is no copy
+MAX_LAG = 20  # samples by which a copy may come later: a second topic of one driver is not held up for longer
+HITS = 2  # comparisons that make a copy: one alone may be of values that hardly change
+LEAST_NOISE = 0.02  # of what the noise makes: smaller changes are smooth, and what explains them may be the motion
+
+
+@compiled
+def update_copies(
+    copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int
+) -> None:
+    """Compare all pairs of units, once in `PERIOD`; ``copies.found`` is set where one is a copy and was none before."""
+    if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
+        return
+    copies.stamp = stamp
+    for a in range(settings.units):
+        for b in range(a + 1, settings.units):
+            if (
+                copies.original[a]
+                or copies.original[b]
+                or not is_copy(copies, settings, line, a, b)
+            ):
+                continue
+            copies.hits[a, b] += 1
+            if copies.hits[a, b] >= HITS:
+                copies.original[b] = a + 1
+                copies.channels |= settings.members[b]
+                copies.found = True
+
+
+@compiled
+def is_copy(
+    copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int
+) -> bool:
+    """Whether one of two units gives what the other gives, or gave some samples ago."""
+    first, second = (
+        first_of_three(settings.members[a]),
+        first_of_three(settings.members[b]),
+    )
+    if first < 0 or second < 0:
+        return False
+    for lag in range(min(MAX_LAG, min(line.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
+        for turned in range(2):
+            source, target = (second, first) if turned else (first, second)
+            agrees = True
+            for wanted in (FEW, ROWS):
+                agrees = agrees and sum_changes(
+                    copies, line, source, target, lag, wanted
+                )
+                agrees = agrees and is_explained(copies, settings, target, wanted)
+            if agrees:
+                return True
+    return False
+
+
+@compiled
+def first_of_three(members: int) -> int:
+    """Return the first of three successive channels; -1 if these are others."""
+    for i in range(MAX_CHANNELS):
+        if members == 7 << i:
+            return i
+    return -1
+
+
+@compiled
+def sum_changes(
+    copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
+) -> bool:
+    """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
+
+    Of the newest samples, until so many as wanted have changed. ``source``, ``target``: first channel of the unit that
+    may be the original, and of the one that may be the copy, later by ``lag`` samples. Return whether there are so
+    many, in no more than twice so many samples.
+    """
+    change, products, count = copies.change, copies.products, 0
+    for i in range(6):
+        for j in range(6):
+            products[i, j] = 0.0
+    newest, oldest = line.count - 1, max(line.count - RESTAMP_SAMPLES, 0)
+    for k in range(newest, max(newest - 2 * wanted, oldest + lag + 1), -1):
+        if not (
+            fill_change(line, source, k - lag, change, 0)
+            and fill_change(line, target, k, change, 3)
+        ):
+            continue
+        count += change[3] != 0.0 or change[4] != 0.0 or change[5] != 0.0
+        for i in range(6):
+            for j in range(6):
+                products[i, j] += change[i] * change[j]
+        if count == wanted:
+            return True
+    return False
+
+
+@compiled
+def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -> bool:
+    """Second differences of three channels up to sample k, into ``out``; return whether all are finite and in range."""
+    new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
+    old = line.rows[(k - 2) % RESTAMP_SAMPLES]
+    for i in range(3):
+        out[place + i] = (
+            new.values[first + i]
+            - 2.0 * middle.values[first + i]
+            + old.values[first + i]
+        )
+    return new.plain & middle.plain & old.plain & 7 << first == 7 << first
+
+
+@compiled
+def is_explained(
+    copies: Copies, settings: PathSettings, target: int, count: int
+) -> bool:
+    """Whether a linear map of the changes of one unit gives those of the other, ``count`` of them, and these are noise.
+
+    The products of both are reduced by those of the first, one channel after the other: what is left is unexplained.
+    """
+    products, noise, size, trace = copies.products, 0.0, 0.0, 0.0
+    for i in range(3):
+        copies.change[i] = products[3 + i, 3 + i]
+        size += products[3 + i, 3 + i]
+        trace += products[i, i]
+        noise += settings.sensors.noise_std[target + i] ** 2
+    for p in range(3):
+        pivot = products[p, p]
+        # A channel of which no more is its own adds nothing to what the others explain.
+        if pivot > 1e-12 * trace:
+            for i in range(p + 1, 6):
+                share = products[i, p] / pivot
+                for j in range(p + 1, 6):
+                    products[i, j] -= share * products[p, j]
+    for i in range(3):
+        if products[3 + i, 3 + i] > ROUNDING * copies.change[i]:
+            return False
+    return size > count * 6.0 * LEAST_NOISE**2 * noise
+
+
+def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
+    """Find pairs of series (N, 3) of one rate, rad/s, of which one is a copy of the other: their numbers."""
+    found = []
+    line, copies, settings = (
+        allocate(DelayBuffer),
+        allocate(Copies),
+        allocate(PathSettings),
+    )
+    settings["members"][0, :2] = 0b111, 0b111000
+    rows = line["rows"][0]
+    for a, b in itertools.combinations(range(len(series)), 2):
+        size = min(len(series[a]), len(series[b]), RESTAMP_SAMPLES)
+        if size < ROWS + 3:
+            continue
+        values = np.hstack([series[a][-size:], series[b][-size:]])
+        rows["values"][:size, :6] = values
+        rows["plain"][:size] = (np.abs(values) < MAX_RATE) @ (1 << np.arange(6))
+        hits = 0
+        for count in (size, size * 3 // 4, size // 2):
+            line["count"] = max(count, ROWS + 3)
+            hits += is_copy(copies[0], settings[0], line[0], 0, 1)
+        if hits >= HITS:
+            found.append((a, b))
+    return found

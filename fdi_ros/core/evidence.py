@@ -1,0 +1,121 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What one sample says to the decision: the verdict of the detector, stuck, drifted and broken channels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.health import (
+    INTERMITTENT_SHARE,
+    NON_FINITE_LASTING,
+    intermittent_channels,
+)
+from fdi_ros.core.records import Core, Current, PathSettings, SampleInput
+from fdi_ros.core.repeated import add_stuck, update_stuck
+from fdi_ros.core.sensors import variance_of
+
+SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit: by chance it is so once in 30 000
+
+
+@compiled
+def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
+    """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
+    settings, health, now, evidence = (
+        core.settings,
+        core.health,
+        core.now,
+        core.now.evidence,
+    )
+    evidence.judged = not math.isnan(now.verdict.statistic)
+    evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
+    if settings.estimates:
+        evidence.checked &= core.sample.estimate.checked
+    evidence.held = core.sample.held
+    evidence.broken = evidence.repeats = evidence.agrees = clear = 0
+    may_return = not settings.latch and core.decision.faulty != 0
+    for i in range(settings.n):
+        if health.condition[i] == NON_FINITE_LASTING:
+            evidence.broken |= 1 << i
+        if (
+            settings.stuck_time
+            and evidence.stamp - health.run_stamp[i] >= settings.stuck_time
+        ):
+            evidence.repeats |= 1 << i
+        if not now.verdict.suspects[i]:
+            clear |= 1 << i
+        evidence.error[i] = now.corrected[i] - now.along[i]
+        if may_return and now.plain >> i & 1:
+            # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+            variance = 2 * variance_of(
+                settings.sensors, i, now.along[i], core.acceleration.value
+            )
+            if abs(evidence.error[i]) <= settings.return_limit * math.sqrt(variance):
+                evidence.agrees |= 1 << i
+    evidence.intermittent = intermittent_channels(
+        health.gone, health.leaves, settings.n, INTERMITTENT_SHARE
+    )
+    clear &= now.usable
+    return update_stuck(core, subsets[clear], clear, evidence.stamp)
+
+
+@compiled
+def fill_suspects(core: Core, stuck: int) -> None:
+    """Fill in which channels the verdict and their repeated values name."""
+    settings, now, evidence, verdict = (
+        core.settings,
+        core.now,
+        core.now.evidence,
+        core.now.verdict,
+    )
+    n, evidence.certain, evidence.undecided = settings.n, 0, 0
+    evidence.outliers = bits_of(verdict.outliers, n) | now.repeated | evidence.flickers
+    if settings.by_evidence and verdict.alarm and not evidence.held:
+        if verdict.isolated:
+            evidence.certain = bits_of(verdict.suspects, n)
+        else:
+            evidence.undecided = bits_of(verdict.suspects, n)
+    for u in range(settings.units):
+        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        if settings.members[u] & stuck & now.repeated:
+            stuck |= settings.members[u]
+    update_drifted(settings, core.sample, now)
+    evidence.certain |= evidence.drifted
+    add_stuck(settings, now, stuck)
+    for i in range(n):
+        if verdict.error[i] != 0:
+            core.last_error[i] = verdict.error[i]
+    evidence.suspected, evidence.isolated = (
+        bits_of(verdict.suspects, n),
+        verdict.isolated,
+    )
+    if settings.by_evidence:
+        evidence.suspected, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+
+
+@compiled
+def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
+    """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
+    now.evidence.drifted, estimate = 0, sample.estimate
+    if settings.estimates and settings.max_drift > 0.0 and estimate.known:
+        for i in range(settings.n):
+            bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
+            if sample.mask >> i & 1 and bias > settings.max_drift:
+                now.evidence.drifted |= 1 << i
+                now.verdict.suspects[i], now.verdict.error[i] = True, estimate.bias[i]
+
+
+@compiled
+def bits_of(flags: NDArray[np.uint8], n: int) -> int:
+    """Set of the channels whose flag is set."""
+    mask = 0
+    for i in range(n):
+        if flags[i]:
+            mask |= 1 << i
+    return mask

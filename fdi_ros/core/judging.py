@@ -1,0 +1,98 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The call of the detector: one row of constants and of memory for each set of channels, or one for all."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.compiling.compiled import call, compiled
+from fdi_ros.core.records import Bank, SampleInput, SampleVerdict
+
+UNPREPARED, REFUSED = (
+    -1,
+    -2,
+)  # instead of a row: not prepared yet; the method cannot run on these channels
+LARGEST_RATE = 1e6  # rad/s; methods of a paper take a larger finite value for this, so that squares stay finite
+
+
+@compiled
+def present_in(z: NDArray[np.float64], n: int) -> int:
+    """Bits of the channels whose value is finite."""
+    mask = 0
+    for i in range(n):
+        if math.isfinite(z[i]):
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def clear_verdict(verdict: SampleVerdict, n: int) -> None:
+    """Verdict on a sample that was not judged: not judged is not healthy."""
+    verdict.statistic = verdict.threshold = math.nan
+    verdict.alarm = verdict.isolated = False
+    for i in range(n):
+        verdict.suspects[i] = verdict.outliers[i] = False
+        verdict.error[i] = verdict.noise[i] = 0.0
+        verdict.scores[i] = math.nan
+
+
+@compiled
+def judge_sample(
+    bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict
+) -> bool:
+    """Judge a sample by those of all values z (n,) that are in its mask; all else but its values is filled in already.
+
+    False, and nothing is done, if the constants for these channels are unprepared.
+    """
+    mask, judged = sample.mask, bank.judged
+    row = 0 if bank.takes_any else bank.row[mask]
+    if row == UNPREPARED:
+        return False
+    clear_verdict(verdict, bank.n)
+    if row == REFUSED:
+        return True
+    k = 0
+    for i in range(bank.n):
+        if bank.takes_any or mask >> i & 1:
+            sample.z[k] = (
+                min(max(z[i], -LARGEST_RATE), LARGEST_RATE)
+                if math.isfinite(z[i])
+                else 0.0
+            )
+            # What a method leaves untouched is no alarm.
+            judged.suspects[k] = judged.outliers[k] = False
+            judged.error[k] = judged.noise[k] = 0.0
+            judged.scores[k] = math.nan if bank.takes_any else 0.0
+            k += 1
+    judged.alarm = judged.isolated = sample.estimate.known = False
+    call(
+        bank.judge,
+        bank.constants,
+        row,
+        bank.constants_size,
+        bank.states,
+        bank.states_size,
+        sample,
+        judged,
+    )
+    verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
+    verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
+    k = 0
+    for i in range(bank.n):
+        if bank.takes_any or mask >> i & 1:
+            verdict.suspects[i], verdict.outliers[i] = (
+                judged.suspects[k],
+                judged.outliers[k],
+            )
+            verdict.error[i], verdict.scores[i], verdict.noise[i] = (
+                judged.error[k],
+                judged.scores[k],
+                judged.noise[k],
+            )
+            k += 1
+    return True

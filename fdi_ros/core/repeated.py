@@ -1,0 +1,151 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Values that repeat while others move.
+
+A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much
+longer time, or against motion that the others see along this channel's axis: then the channel is stuck, or the values
+of a whole unit are old. The others are evidence of motion only if they agree: in a sample with an alarm that does not
+isolate the channel that repeats, it is not called stuck, and so neither of two parallel ones because of the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.records import Core, Current, Health, PathSettings, Subset
+from fdi_ros.core.subsets import fill_rate
+from fdi_ros.model.geometry import MIN_SENSITIVITY
+
+LEAST_MOTION = 6.0  # standard deviations, beyond one step, that the others move by while a stuck value repeats
+STEPS = 3.0  # of a quantised sensor: it repeats its value by chance until the body has moved by so many
+RESTS, AT_REST = 3.0, 1e-3
+"""At rest the rate is within three standard deviations of a channel, and a step of MAVLink in rad/s, of zero."""
+COARSE_STEP = 0.5  # standard deviations: noise takes a value over smaller steps with nearly every sample
+ALL_REPEAT = 100_000_000
+"""ns that all channels repeat their values before none of them is believed: what a link may hold up. In coarse steps
+``stuck_time``, if that is longer: gyros without noise repeat for longer in a steady turn."""
+
+
+@compiled
+def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
+    """Predict each channel from the others of a subset, into ``now.prediction``, rad/s; NaN: they say nothing."""
+    axes, rate = settings.sensors.axes, now.others_rate
+    for i in range(settings.n):
+        along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        share = subset.sensitivity[i]
+        if share > MIN_SENSITIVITY**2:
+            residual = now.input[i] - along
+            now.prediction[i] = along + residual - residual / share
+        else:
+            now.prediction[i] = along if share == 0 else math.nan
+
+
+@compiled
+def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
+    """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
+    step = 0.0
+    for i in range(settings.n):
+        if now.usable >> i & 1:
+            step = max(step, health.step[i])
+    return step
+
+
+@compiled
+def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
+    """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
+    n, now, stuck = core.settings.n, core.now, 0
+    # Of values as they came: what is newly known of the errors is no motion.
+    fill_rate(subset, n, mask, now.input, now.others_rate)
+    leave_one_out(core.settings, now, subset)
+    step = largest_step(core.settings, core.health, now)
+    for i in range(n):
+        if core.health.run_stamp[i] == stamp:
+            core.reference[i] = now.prediction[i]
+        elif now.evidence.repeats & now.usable & (1 << i):
+            share = subset.sensitivity[i]
+            noise = core.settings.sensors.noise_std[i]
+            spread = math.sqrt(
+                (noise * noise + step * step / 12.0) / (share if share > 0 else 0.5)
+            )
+            moved = (
+                abs(now.prediction[i] - core.reference[i])
+                > LEAST_MOTION * spread + step
+            )
+            isolated = now.verdict.suspects[i] and now.verdict.isolated
+            if moved and (isolated or not now.verdict.alarm):
+                stuck |= 1 << i
+                core.health.stuck[i] += 1
+    return stuck
+
+
+@compiled
+def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
+    """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
+    verdict = now.verdict
+    if evidence and not verdict.alarm:
+        verdict.isolated = True
+    for i in range(settings.n):
+        if evidence >> i & 1:
+            verdict.suspects[i] = True
+            if verdict.error[i] == 0:
+                verdict.error[i] = now.corrected[i] - now.along[i]
+
+
+@compiled
+def update_repeated(core: Core) -> int:
+    """Channels of the units that give old values: all of theirs again, while the others have measured motion."""
+    members, sensors, found = core.settings.members, core.settings.sensors, 0
+    for u in range(core.settings.units):
+        # A unit with a channel that gives nothing, or nothing in range, is none of these: what it gives is new, or the
+        # sample is without it. One of which a channel was declared may well be one.
+        fresh, moved = members[u] & ~core.now.plain != 0, False
+        for i in range(core.settings.n):
+            if members[u] >> i & 1:
+                h, change = sensors.axes[i], 0.0
+                for a in range(3):
+                    change += h[a] * (core.now.rate[a] - core.unit_rate[u, a])
+                fresh = fresh or core.health.run_stamp[i] == core.now.evidence.stamp
+                moved = (
+                    moved
+                    or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+                )
+        if fresh:
+            for a in range(3):
+                core.unit_rate[u, a] = core.now.rate[a]
+        elif moved:
+            found |= members[u]
+    return found
+
+
+@compiled
+def is_at_rest(settings: PathSettings, now: Current) -> bool:
+    """Whether the rate of the channels in use is that of a vehicle at rest."""
+    square = (
+        now.rate[0] * now.rate[0]
+        + now.rate[1] * now.rate[1]
+        + now.rate[2] * now.rate[2]
+    )
+    least = RESTS * settings.largest_noise + AT_REST
+    return square < least * least
+
+
+@compiled
+def all_repeat(
+    settings: PathSettings, health: Health, now: Current, stamp: int
+) -> bool:
+    """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
+
+    A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
+    """
+    step, noise = largest_step(settings, health, now), settings.largest_noise
+    # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
+    coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
+    if not now.usable or (coarse and is_at_rest(settings, now)):
+        return False
+    fresh, least = 0, max(ALL_REPEAT, settings.stuck_time) if coarse else ALL_REPEAT
+    for i in range(settings.n):
+        if stamp - health.run_stamp[i] < least:
+            fresh |= 1 << i
+    return not now.usable & fresh

@@ -1,0 +1,45 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Error model of the channels, as every method needs it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.records import Sensors
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+
+@compiled
+def variance_of(
+    sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]
+) -> float:
+    """Error variance of a channel, (rad/s)^2, from the rate along its own axis, rad/s."""
+    axis = sensors.axes[i]
+    scale = sensors.scale_std[i] * rate_along
+    timing = sensors.timing_std[i] * (
+        axis[0] * acceleration[0]
+        + axis[1] * acceleration[1]
+        + axis[2] * acceleration[2]
+    )
+    return sensors.noise_std[i] * sensors.noise_std[i] + scale * scale + timing * timing
+
+
+def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> None:
+    """Fill a record of `Sensors`; noise with one value per channel."""
+    n = geometry.n
+    sensors["n"], sensors["constant"] = n, noise.constant
+    sensors["axes"][:n], sensors["gain"][:n] = geometry.axes, geometry.least_squares.T
+    for name in ("noise_std", "scale_std", "timing_std"):
+        sensors[name][:n] = getattr(noise, name)
+    sensors["share"][:n], sensors["detectable"][:n] = (
+        np.diag(geometry.S),
+        geometry.detectable,
+    )
+    sensors["alike"][:n, :n] = geometry.group_matrix

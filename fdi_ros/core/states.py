@@ -1,0 +1,198 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""State of each channel, and the reason for it, from what is declared and what its values show by themselves."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum, IntEnum
+from typing import Any
+
+from numpy.typing import NDArray
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.health import FROZEN, SILENT
+from fdi_ros.core.records import Core, Subset
+
+
+class ChannelState(IntEnum):
+    """State of one channel; the number is what ``~/integrity`` carries."""
+
+    OK = 0  # delivers, is checked against the others and agrees
+    SUSPECT = 1  # left out of the fused rate for now: under suspicion, not confirmed
+    AMBIGUOUS = (
+        2  # one of a named set of channels is faulty; the evidence cannot tell which
+    )
+    FAULTY = 3  # declared faulty and left out
+    STALE = 4  # gives nothing, or nothing new
+    UNCHECKED = 5  # delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run
+    EXCLUDED = 6  # taken out by the operator
+
+
+class Reason(str, Enum):
+    """Why a channel is in its state, in words; records hold the place in this list."""
+
+    NONE = ""
+    DISAGREES = "disagrees with the others"
+    NON_FINITE = "not a finite number"
+    OUT_OF_RANGE = "out of range"
+    STUCK = "stuck: repeats one value while the others move"
+    FROZEN = "frozen: has repeated one value for long"
+    NO_DATA = "gives no data"
+    TOO_FEW = "too few channels left to check it"
+    LATELY = "too few of its last samples could be checked"
+    CANNOT_RUN = "the detector cannot run on the channels left"
+    BIAS = "bias not learned yet"
+    OPERATOR = "taken out by the operator"
+    ALL_REPEAT = "all channels repeat their values: nothing new is measured"
+    DRIFTED = "has drifted: its bias is beyond bias.max_drift"
+    INTERMITTENT = "its values come and go"
+    COPY = "gives the values of another unit: one sensor, no redundancy"
+
+
+REASONS = tuple(Reason)
+
+OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED, EXCLUDED = map(int, ChannelState)
+_NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_FEW = (
+    range(8)
+)
+_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _COPY = (
+    range(8, len(REASONS))
+)
+_SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
+"""State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
+_OF_CONDITION = (
+    _DISAGREES,
+    _DISAGREES,
+    _NON_FINITE,
+    _OUT_OF_RANGE,
+    _FROZEN,
+    _NO_DATA,
+    _NON_FINITE,
+)
+"""Why, by `Condition`."""
+_OF_DECISION = (
+    _NONE,
+    _DISAGREES,
+    _STUCK,
+    _NON_FINITE,
+    _DRIFTED,
+    _INTERMITTENT,
+)  # by why a channel was declared
+
+
+@compiled
+def left_out(core: Core) -> int:
+    """Bits of the channels declared faulty, taken out, or copies of others."""
+    return core.decision.faulty | core.excluded | core.copies.channels
+
+
+@compiled
+def out_of_use(core: Core) -> int:
+    """Bits of the channels left out, or of unknown bias."""
+    return left_out(core) | ~core.bias.known
+
+
+@compiled
+def alive(core: Core) -> int:
+    """Bits of the channels in use that deliver something new."""
+    gone = 0
+    for i in range(core.settings.n):
+        if core.health.condition[i] in (SILENT, FROZEN):
+            gone |= 1 << i
+    return ((1 << core.settings.n) - 1) & ~(gone | out_of_use(core))
+
+
+@compiled
+def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> None:
+    """State of every channel; checked: bits of the channels whose fault would have been declared."""
+    for i in range(core.settings.n):
+        bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
+        # What comes later tells more of the channel.
+        state = OK if checked & bit and not core.now.all_repeat else UNCHECKED
+        if suspicion & bit:
+            state = SUSPECT
+        if core.decision.ambiguous & bit:
+            state = AMBIGUOUS
+        if learning:
+            state = UNCHECKED
+        if shown != OK:
+            state = shown
+        if core.decision.faulty & bit:
+            state = FAULTY
+        if core.excluded & bit:
+            state = EXCLUDED
+        core.last.state[i] = state
+
+
+@compiled
+def reason_of(core: Core, subset: Subset, i: int) -> int:
+    """Why a channel is in its state; subset: the channels alive."""
+    state, condition = core.last.state[i], core.health.condition[i]
+    if state in (OK, EXCLUDED):
+        return _NONE if state == OK else _OPERATOR
+    if state == FAULTY:
+        return _OF_DECISION[core.decision.why[i]]
+    if state == UNCHECKED:
+        return why_unchecked(core, subset, i)
+    if state == SUSPECT and core.now.evidence.flickers >> i & 1:
+        return _INTERMITTENT
+    return _OF_CONDITION[condition] if state == _SHOWN[condition] else _DISAGREES
+
+
+@compiled
+def why_unchecked(core: Core, subset: Subset, i: int) -> int:
+    """Why nothing checks a channel."""
+    if core.copies.channels >> i & 1:
+        return _COPY
+    if core.bias.learning or not core.bias.known >> i & 1:
+        return _BIAS
+    if core.now.all_repeat:
+        return _ALL_REPEAT
+    if subset.detectable >> i & 1:
+        return _LATELY
+    return _CANNOT_RUN if subset.refused else _TOO_FEW
+
+
+@compiled
+def write_events(
+    core: Core,
+    subset: Subset,
+    row: int,
+    learning: bool,
+    events: NDArray[Any],
+    count: int,
+) -> int:
+    """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
+    last = core.last
+    core.group = core.decision.ambiguous
+    for i in range(core.settings.n):
+        after, reason = last.state[i], reason_of(core, subset, i)
+        core.reason[i] = reason
+        if after != core.state[i]:
+            error = 0.0
+            if reason in (_DISAGREES, _DRIFTED) and not learning:
+                error = core.now.verdict.error[i]
+                if error == 0:
+                    # Of a drift that was declared before a restart the bias is known, too.
+                    error = (
+                        core.sample.estimate.bias[i]
+                        if reason == _DRIFTED
+                        else last.residual[i]
+                    )
+                if not math.isfinite(error):
+                    # It gives nothing in this very sample.
+                    error = 0.0
+            event = events[count]
+            event.row, event.stamp, event.channel, event.error = (
+                row,
+                last.stamp,
+                i,
+                error,
+            )
+            event.before, event.after, event.reason = core.state[i], after, reason
+            event.group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
+            core.state[i], core.since[i], core.error[i] = after, last.stamp, error
+            count += 1
+    return count

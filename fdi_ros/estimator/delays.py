@@ -1,0 +1,47 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delays between units: which are sure, and by how much values lie before their stamp."""
+
+from __future__ import annotations
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.estimator import Constants, Estimator
+
+TAKE_OFF = 0.002  # s; a smaller delay is an error state, whose first order is enough
+SURE = 25.0  # square of a delay in its variances from which it is sure: it moves the values of all that come after
+LONGEST_DELAY = (
+    0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
+)
+
+
+@compiled
+def update_time_offsets(params: Constants, kf: Estimator) -> None:
+    """Find by how much values lie before the stamp, if the earliest unit is in time, and how far units are apart.
+
+    `restamp` brings all units to the instant of the latest, the states what is left to that of the first unit.
+    """
+    latest = earliest = least = most = 0.0
+    for u in range(1, params.units):
+        late = kf.late[u]
+        remaining = late + kf.states.x[params.layout.delays[u]]
+        latest, earliest = max(latest, late), min(earliest, late)
+        most, least = max(most, remaining), min(least, remaining)
+    kf.behind, kf.spread = latest - earliest, most - least
+
+
+@compiled
+def transfer_delays(params: Constants, kf: Estimator) -> bool:
+    """Move delays that are sure from their states to ``late``, which `restamp` makes up for; return whether any was."""
+    changed = False
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
+        delay, variance = kf.states.x[place], kf.states.p[place, place]
+        if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
+            step = min(
+                max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u]
+            )
+            kf.late[u] += step
+            kf.states.x[place] -= step
+            changed = changed or step != 0.0
+    return changed

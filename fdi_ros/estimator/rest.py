@@ -1,0 +1,94 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whether the vehicle rests: the test is also that of calibration and inspection.
+
+The average of the biases at the start has one of its own, which needs no estimator (`core/bias.py`), and so has the
+check of values that repeat (`is_at_rest` in `core/repeated.py`).
+"""
+
+from __future__ import annotations
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS, Constants, Estimator
+from fdi_ros.estimator.noise import REST, THREE_SIGMA
+from fdi_ros.model.samples import Array
+
+QUIET = (
+    3.0  # variance of blocks over that of rest before: a hover in vibration has more
+)
+REST_STD = 3e-4  # rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates
+UNLEARNED = 0.003  # rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn
+REST_CHI = 1.6  # scatter of the blocks of a second over that of noise: 72 degrees of freedom exceed it once in 1000
+REST_LAST = 12.0  # square of the last block's distance from their mean: soon enough for motion that begins
+
+
+@compiled
+def rests(
+    rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float
+) -> bool:
+    """Whether the rates (`REST_BLOCKS`, c) of blocks, rad/s, scatter as noise does, about zero.
+
+    In any order, of the body or as single channels measure it; ``newest``: place of the last. ``variance``,
+    ``bias_variance`` (c,): of the noise of each and of what is not known of the biases, (rad/s)^2; ``floor``: of the
+    rate at rest.
+    """
+    scatter = largest = last = 0.0
+    for a in range(rates.shape[1]):
+        mean = 0.0
+        for k in range(REST_BLOCKS):
+            mean += rates[k, a] / REST_BLOCKS
+        for k in range(REST_BLOCKS):
+            gap = rates[k, a] - mean
+            scatter += gap * gap / (variance[a] + floor)
+            if k == newest:
+                last = max(last, gap * gap / (variance[a] + floor))
+        largest = max(
+            largest,
+            mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]),
+        )
+    return (
+        scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI
+        and largest < THREE_SIGMA
+        and last < REST_LAST
+    )
+
+
+@compiled
+def update_rest(params: Constants, kf: Estimator) -> None:
+    """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
+    for a in range(3):
+        kf.rest_rates[kf.rest_count % REST_BLOCKS, a] = kf.rates[1, a]
+    newest = kf.rest_count % REST_BLOCKS
+    kf.rest_count += 1
+    kf.rest = False
+    if kf.rest_count < REST_BLOCKS:
+        return
+    n = params.sensors.n
+    for a in range(3):
+        variance = known = 0.0
+        for i in range(n):
+            gain, part = kf.fused.gain[a, i], 0.0
+            if gain != 0.0:
+                variance += gain * gain * kf.noise.now.block[i] / params.length
+                for j in range(n):
+                    part += kf.fused.gain[a, j] * kf.at.covariance[i, j]
+                known += gain * part
+        kf.rest_noise[a] = variance
+        # Where little is known of the biases, a steady turn looks like them.
+        kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
+    kf.rest = rests(
+        kf.rest_rates,
+        newest,
+        kf.rest_noise,
+        kf.rest_bias_variance,
+        params.rest_std * params.rest_std,
+    )
+    if kf.noise.lived[REST] > LONG_TIME:
+        # A hover in vibration may turn as little: it is known by its noise.
+        for i in range(n):
+            if (
+                kf.masks[1] >> i & 1
+                and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]
+            ):
+                kf.rest = kf.rest and kf.noise.regime == REST

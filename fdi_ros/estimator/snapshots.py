@@ -1,0 +1,115 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The states as they were moments before, and after holes in the stream.
+
+After a fault the estimator goes back to states kept 0.12 to 490 s before, eight of each distance.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.error_states import ErrorStates, copy_states, predict
+from fdi_ros.estimator.estimator import (
+    LONG_TIME,
+    SNAPSHOTS,
+    TIERS,
+    Constants,
+    Estimator,
+)
+
+UNWATCHED, LONG_HOLE = 3e-4, 3600.0
+"""Random walk of a bias over a hole, rad/s/sqrt(s), which has gone its way, of a turn-on bias, in an hour."""
+AFTER_HOLE = 5.0 * LONG_TIME
+"""s of samples after a hole in which biases are compared with those before: five comparisons, and by then the states
+know what they can learn of the biases."""
+
+
+@compiled
+def keep_snapshot(params: Constants, kf: Estimator) -> None:
+    """Keep the states, so that they can be had again from before a fault."""
+    tier = 0
+    while tier < TIERS:
+        snapshot = kf.snapshots[tier * SNAPSHOTS + kf.taken[tier] % SNAPSHOTS]
+        snapshot.seconds = kf.seconds
+        copy_states(params.layout, kf.states, snapshot.states)
+        for u in range(params.units):
+            snapshot.late[u] = kf.late[u]
+        kf.taken[tier] += 1
+        if kf.taken[tier] % SNAPSHOTS != 1:
+            return
+        tier += 1
+
+
+@compiled
+def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
+    """Let the biases be others after a hole, in all states kept too: what changed in it is compared with those."""
+    if not is_after_hole(params, kf):
+        kf.hole_at, kf.hole_sample = kf.seconds - seconds, kf.samples
+    move_biases(params, kf, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
+
+
+@compiled
+def is_after_hole(params: Constants, kf: Estimator) -> bool:
+    """Whether there was a hole in the stream lately."""
+    return (
+        kf.hole_sample > 0
+        and (kf.samples - kf.hole_sample) * params.period < AFTER_HOLE
+    )
+
+
+@compiled
+def move_biases(params: Constants, kf: Estimator, std: float, rate_std: float) -> None:
+    """Let all biases be others by so much, rad/s, and their rates of change, rad/s^2; now and in all states kept."""
+    add_to_biases(params, kf.states, std, rate_std)
+    for k in range(TIERS * SNAPSHOTS):
+        add_to_biases(params, kf.snapshots[k].states, std, rate_std)
+
+
+@compiled
+def add_to_biases(
+    params: Constants, states: ErrorStates, std: float, rate_std: float
+) -> None:
+    """Add to the variances of the biases and of their rates of change."""
+    for r in range(params.layout.count):
+        if r < params.sensors.n:
+            states.p[r, r] += std * std
+        elif 0 <= params.layout.feeds[r] < params.sensors.n:
+            states.p[r, r] += rate_std * rate_std
+
+
+@compiled
+def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
+    """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
+    for u in range(1, params.units):
+        if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
+            place = params.layout.delays[u]
+            kf.states.p[place, place] += (
+                params.layout.prior[place] * params.layout.prior[place]
+            )
+            # The states kept are surer than what is known now.
+            for tier in range(TIERS):
+                kf.taken[tier] = 0
+
+
+@compiled
+def predict_from(
+    params: Constants, kf: Estimator, seconds: float, states: ErrorStates
+) -> bool:
+    """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
+    best, latest = -1, 0.0
+    for tier in range(TIERS):
+        for k in range(min(kf.taken[tier], SNAPSHOTS)):
+            snapshot = kf.snapshots[tier * SNAPSHOTS + k]
+            if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
+                best, latest = tier * SNAPSHOTS + k, snapshot.seconds
+    if best < 0:
+        return False
+    snapshot = kf.snapshots[best]
+    copy_states(params.layout, snapshot.states, states)
+    for u in range(1, params.units):
+        states.x[params.layout.delays[u]] += snapshot.late[u] - kf.late[u]
+    predict(params.layout, states, kf.seconds - latest)
+    return True
