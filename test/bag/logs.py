@@ -200,7 +200,8 @@ def _samples(unit, k, messages):
         "I": k,
         "TimeUS": written,
         "SampleUS": unit.stamp,
-        "TimeMS": unit.stamp // 1000,
+        # A record that has both times is written after its sample.
+        "TimeMS": (unit.stamp + 1500 * ("TimeUS" in message[2])) // 1000,
     }
     for a, axis in enumerate("XYZ"):
         logged |= {f"Gyr{axis}": unit.rate[:, a], f"Acc{axis}": unit.acceleration[:, a]}

@@ -108,6 +108,15 @@ def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     assert samples.malformed == {"gyro_channels": 1}
 
 
+def test_stamps_of_arrays_increase_across_blocks(tmp_path):
+    """Blocks of 1 ns: stamps that were moved forward overtake the block that follows."""
+    times = START + np.array([0, 0, 0, 0, 1, 1, 7])
+    messages = [("/gyro_channels", int(t), array([0.1] * 6)) for t in times]
+    path = write_mcap(tmp_path / "bag.mcap", messages, types={"/gyro_channels": ARRAY})
+    stamp, _, _ = read(path, Config(), period=1)
+    np.testing.assert_array_equal(stamp - START, [0, 1, 2, 3, 4, 5, 7])
+
+
 def cut_off(path, z):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 

@@ -214,6 +214,23 @@ def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> 
     check_flight(talk, 10.0)
 
 
+def test_a_message_of_all_units_is_asked_for_again_if_one_unit_comes_slowly() -> None:
+    """HIGHRES_IMU brings the IMUs by their ids: a fast one must not hide a slow one."""
+    talk = Conversation(Autopilot("px4", units=1), kind="HIGHRES_IMU").run(4.0)
+    autopilot = talk.autopilots[0]
+    second = mavlink.MAVLink(None, autopilot.system, 1)
+    for k in range(5):
+        time = autopilot.clock(talk.now) + 20_000 * k
+        values = (0.0, 0.0, -9.8, 0.1, 0.0, 0.0, *(0.0,) * 7)
+        message = second.highres_imu_encode(time, *values, 0x1FFF, 1)
+        talk.inject(bytes(message.pack(second)))
+    assert set(talk.vehicle.units) == {0, 1}
+    before = len(autopilot.commands)
+    talk.run(40.0)
+    asked = [number for _, number, _ in autopilot.commands[before:]]
+    assert 1 <= asked.count(105) <= 8
+
+
 def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> None:
     """Without requests ArduPilot streams RAW_IMU, SCALED_IMU2, SCALED_IMU3 (RAW_SENS); the first is IMU 1."""
     for kind in ("", "SCALED_IMU"):
