@@ -182,6 +182,30 @@ def test_time_passes_as_in_the_linear_model(seconds):
     assert np.linalg.eigvalsh(states["p"][:count, :count]).min() > 0
 
 
+def test_what_is_not_known_grows_as_in_the_linear_model():
+    """Covariance of the exact discretisation (Van Loan); the filter's steps are those of its blocks."""
+    layout, states = estimator(6, 2)
+    count, seconds, steps = int(layout["count"]), 100.0, 2500
+    before = states["p"][:count, :count].copy()
+    flow, noise = np.zeros((count, count)), np.diag(layout["walk"][:count] ** 2)
+    for r in range(count):
+        if layout["feeds"][r] >= 0:
+            flow[layout["feeds"][r], r], flow[r, r] = 1.0, -1.0 / layout["memory"][r]
+            noise[r, r] += 2.0 * layout["prior"][r] ** 2 / layout["memory"][r]
+    joint = np.block([[-flow, noise], [np.zeros_like(flow), flow.T]])
+    moved = expm(joint * seconds)
+    transition = moved[count:, count:].T
+    expected = transition @ before @ transition.T
+    expected += transition @ moved[:count, count:]
+    for _ in range(steps):
+        predict(layout, states, seconds / steps)
+    found = states["p"][:count, :count]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=0.005)
+    grown = np.diag(found) - np.diag(before)
+    assert (grown[layout["walk"][:count] > 0] > 0).all()
+
+
 ALL = 0b111111
 
 
