@@ -131,3 +131,14 @@ def test_a_fault_of_the_size_of_the_noise_is_not_declared_and_one_of_twelve_is(u
         block.z[round(4 * RATE) :, 1] += size * SIGMA
         states = {e for _, e in declarations(pipeline, pipeline.process(block))}
         assert bool(states) == declared, (size, states)
+
+
+@pytest.mark.parametrize("units", [2, 3, 4])
+def test_the_level_of_healthy_gyros_is_little_more_than_the_quantile_of_their_noise(units):
+    """In standard deviations of the fused rate: 5.33 for 1e-7, and the share of faults unnoticed."""
+    pipeline = Pipeline(parallel(units, detector__name="sequential"))
+    output = pipeline.process(stream(pipeline.geometry, round(20 * RATE)))
+    std = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
+    ratio = (output.level / std)[round(5 * RATE) :]
+    assert 5.33 <= ratio.min()
+    assert ratio.max() < 8.0

@@ -61,6 +61,19 @@ def test_stated_errors_are_the_actual_ones(kind):
     assert all(max(one) < 1.15 * min(one) for one in noise)
 
 
+def test_stated_errors_grow_where_the_model_does_not_fit():
+    """Gyros whose scale differs by 2 % between the directions of turn: no linear model fits them."""
+    one, linear = made(0, "rest and turns")
+    z = one.block.z.copy()
+    for channel, share in ((1, -0.02), (4, 0.02)):
+        size = np.abs(z[:, channel])
+        z[:, channel] *= 1.0 + share * size / size.max()
+    bent = calibrate(Block(one.block.stamp, z, one.block.received), one.config)
+    grown = bent.axes_std / linear.axes_std
+    assert 1.15 < np.median(grown) < 3.0
+    assert np.abs((bent.axes - one.axes) / bent.axes_std).max() < 4.0
+
+
 def slow_units(block):
     """The second unit at half the rate of the first, the third at a quarter, between each other."""
     k, z = np.arange(len(block)), block.z.copy()
