@@ -22,15 +22,10 @@ RUN apt-get update \
     && pip install --break-system-packages --no-cache-dir "numpy<2" pymavlink pyserial mcap rosbags lz4 zstandard \
     && rm -rf /var/lib/apt/lists/*
 
-# Readable for the user, however closed the files are where this is built.
+# The build compiles: no start has to. Readable for the user, however closed the files are where this is built.
 RUN . /opt/ros/jazzy/setup.sh && colcon build --packages-select fdi_ros \
     && chmod -R a+rX install \
     && ln -s install/fdi_ros/share/fdi_ros/config config
-
-# For any processor of this architecture: what is compiled for that of the builder would be compiled anew on another.
-ENV NUMBA_CPU_NAME=generic
-# Compiled code lies in the package and belongs to root; the user takes it over, and no start has to compile.
-RUN . /opt/ros/jazzy/setup.sh && . install/local_setup.sh && install/fdi_ros/lib/fdi_ros/fdi compile
 
 RUN useradd --create-home fdi
 USER fdi

@@ -3,17 +3,64 @@
 
 """Metadata, dependencies and installed files; one tree for pip and for colcon (ament_python)."""
 
+import os
+import shlex
+import subprocess
+import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
 NAME = "fdi_ros"
 # The wheels exist for this platform alone; elsewhere ROS 2 Jazzy comes from its own packages.
 ROS_WHEELS = 'platform_system == "Linux" and platform_machine == "x86_64"'
 
+SHIP = f"""
+import sys
+from pathlib import Path
+from {NAME}.cli.command_line import main
+from {NAME}.compiling.cache import ship
+
+status = main(["compile"])
+if status == 0:
+    ship(Path(sys.argv[1]))
+sys.exit(status)
+"""
+
+
+class BuildCompiled(build_py):
+    """Copy the modules, and compile them as C++ packages are, so that no start of a program has to.
+
+    Without Numba and the other libraries that this needs, the package is built without compiled code, and compiles at
+    its first start. So does an editable installation.
+    """
+
+    def run(self):
+        """Build."""
+        super().run()
+        if self.editable_mode:
+            return
+        # Results are kept from one build to the next: only what changed is compiled.
+        kept = Path(self.get_finalized_command("build").build_temp) / "compiled"
+        command = [sys.executable, "-c", SHIP, NAME]
+        environment = {"NUMBA_CACHE_DIR": str(kept.absolute()), **os.environ}
+        # There the copy hides any other fdi_ros.
+        done = subprocess.run(command, cwd=self.build_lib, env=environment, check=False)
+        if done.returncode != 0:
+            self.warn(f"built without compiled code: {shlex.join(command[:2])} failed")
+
+    def get_outputs(self, include_bytecode=True):
+        """Name all files that the build has made."""
+        shipped = Path(self.build_lib, NAME, "prebuilt").rglob("*.nb?")
+        return [*super().get_outputs(include_bytecode), *map(str, shipped)]
+
+
 setup(
     name=NAME,
     version="0.2.0",
+    cmdclass={"build_py": BuildCompiled},
     description="Online gyro fault detection and isolation for ROS 2",
     author="fdi_ros maintainers",
     maintainer="fdi_ros maintainers",

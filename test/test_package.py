@@ -18,6 +18,7 @@ import pytest
 from test_layers import ROS, imports
 
 import fdi_ros
+from fdi_ros.compiling.cache import folder
 from fdi_ros.system import BAGS
 
 pytest.importorskip(
@@ -66,29 +67,23 @@ def colcon():
     return shutil.which("colcon") or f"{Path(sys.executable).parent}/colcon"
 
 
-def with_compiled(command, root):
-    """Have the programs that were installed run the modules of the clone, where all is compiled: it takes minutes."""
-    return re.sub(
-        r"(\. install/local_setup\.(ba)?sh)",
-        rf"\1 && export PYTHONPATH={root}:$PYTHONPATH",
-        command,
-    )
-
-
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory):
     """The workspace as the RUN instructions of the Dockerfile leave it, from the build on; no image is built."""
     root, place = Path(__file__).parents[1], tmp_path_factory.mktemp("fdi_ws")
     (place / "src").mkdir()
     (place / "src" / "fdi_ros").symlink_to(root)
+    # The build finds what the clone has compiled, as it would find its own former results.
+    shutil.copytree(folder().parent, place / "kept" / "fdi_ros")
+    found = {**os.environ, "NUMBA_CACHE_DIR": str(place / "kept")}
     for command in (rest for word, rest in steps(root) if word == "RUN"):
         if "apt-get" in command or "useradd" in command:
             continue
         here = (
             command if Path("/opt/ros/jazzy").exists() else command.replace(SOURCED, "")
         )
-        here = with_compiled(here.replace("colcon build", f"{colcon()} build"), root)
-        run(here, place, shell=True)
+        here = here.replace("colcon build", f"{colcon()} build")
+        run(here, place, shell=True, env=found)
     yield place
     shutil.rmtree(place, ignore_errors=True)
 
@@ -123,11 +118,11 @@ def test_every_executable_has_something_to_run_and_all_settings_are_installed(
     share = install / "share"
     assert (share / "ament_index/resource_index/packages/fdi_ros").exists()
     assert (share / "fdi_ros/package.xml").exists()
-    for folder, pattern in (("config", "*.yaml"), ("launch", "*.launch.py")):
+    for kind, pattern in (("config", "*.yaml"), ("launch", "*.launch.py")):
         sources = {
-            path.relative_to(root / folder) for path in (root / folder).rglob(pattern)
+            path.relative_to(root / kind) for path in (root / kind).rglob(pattern)
         }
-        installed = share / "fdi_ros" / folder
+        installed = share / "fdi_ros" / kind
         assert sources <= {
             path.relative_to(installed) for path in installed.rglob(pattern)
         }
@@ -145,6 +140,85 @@ def test_the_installed_command_runs_and_finds_its_files_without_a_clone(
     shipped = install / "share" / "fdi_ros" / "config" / "two_imus.yaml"
     assert done.stdout.startswith(f"{shipped}\n6 channels")
     assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
+
+
+REFUSES = """
+from fdi_ros.compiling.notice import refused
+from fdi_ros.monitor.receiver import warm_path
+
+with refused("it compiles"):
+    warm_path()
+"""
+COMPILES = """
+from fdi_ros.cli.settings import warm_detector, warm_path, warm_verbs
+from fdi_ros.compiling import cache, compiled
+
+warm_path()
+warm_detector("sequential")
+warm_verbs()
+print(cache.PACKAGE, compiled.compilations(), len(compiled.missing()))
+"""
+
+
+@pytest.fixture
+def moved(install, tmp_path):
+    """The installed modules at another path, with other times, beside an empty home."""
+    (installed,) = install.glob("lib/python*/site-packages/fdi_ros")
+    place = tmp_path / "elsewhere" / "fdi_ros"
+    shutil.copytree(installed, place, ignore=NO_CACHE)
+    for path in place.rglob("*"):
+        os.utime(path, (1_000_000_000, 1_000_000_000))
+    (tmp_path / "home").mkdir()
+    return place
+
+
+def first_start(moved, script, **environment):
+    """Run a script with these modules, for the first time on a machine."""
+    environment = {
+        **{name: v for name, v in os.environ.items() if not name.startswith("NUMBA_")},
+        "HOME": str(moved.parents[1] / "home"),
+        "PYTHONPATH": str(moved.parent),
+        **environment,
+    }
+    return subprocess.run(
+        [sys.executable, "-B", "-c", script],
+        cwd=moved.parents[1],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_what_is_built_compiles_nothing_at_any_path(moved):
+    nothing = (f"{moved} 0 0\n", "")
+    done = first_start(moved, COMPILES)
+    assert (done.stdout, done.stderr) == nothing
+    # Where no file can be made among the modules, which others can write, too.
+    shutil.rmtree(moved / "__pycache__")
+    (moved / "__pycache__").write_text("")
+    for path in (moved, *moved.rglob("*")):
+        path.chmod(path.stat().st_mode | 0o020)
+    done = first_start(moved, COMPILES)
+    assert (done.stdout, done.stderr) == nothing
+
+
+@pytest.mark.parametrize("what", ["other sources", "other target", "open files"])
+def test_compiled_code_that_does_not_fit_or_may_be_a_strangers_is_not_taken(
+    moved, what
+):
+    environment = {}
+    if what == "other sources":
+        source = moved / "core" / "records.py"
+        source.write_text(source.read_text() + "\n# changed\n")
+    if what == "other target":
+        environment["NUMBA_CPU_NAME"] = "generic"
+    if what == "open files":
+        for path in (moved / "prebuilt").rglob("*.nb?"):
+            path.chmod(0o666)
+    done = first_start(moved, REFUSES, **environment)
+    assert done.stderr.endswith("FdiError: it compiles\n"), done.stderr
+    assert ("others can write it" in done.stderr) == (what == "open files")
 
 
 def test_one_version_everywhere_and_a_changelog_that_bloom_reads(root):
@@ -207,12 +281,7 @@ def test_the_steps_build_it_and_a_user_runs_it_without_compiling(
     assert given[-1] == "/config.yaml"
     # Of the image: its init, and the ROS in it.
     start = entry[len(INIT) :]
-    command = [
-        *start[:-1],
-        with_compiled(start[-1], root),
-        *given[:-1],
-        "config/two_imus.yaml",
-    ]
+    command = [*start, *given[:-1], "config/two_imus.yaml"]
     home = workspace / "home"
     home.mkdir()
     os.chown(home, USER, -1)

@@ -18,20 +18,21 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
 from fdi_ros.cli.outputs import Outputs, config_words, progress
+from fdi_ros.compiling.cache import folder
 from fdi_ros.compiling.compiled import (
     INTERPRETED,
     LOG,
     allocate,
     compilations,
-    folder,
     missing,
 )
-from fdi_ros.compiling.notice import share_logged
+from fdi_ros.compiling.notice import call_for_each, progress_logged
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
@@ -197,12 +198,31 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
     ]
     # Spawned: forking a process that has threads can hang.
     spawned = multiprocessing.get_context("spawn")
-    logged = share_logged() if missing() else nullcontext()
+    functions = sorted(missing())
+    compiled = spawned.Array("b", max(1, len(functions)), lock=False)
+
+    def done() -> set[str]:
+        return set(compress(functions, compiled))
+
+    logged = progress_logged(set(functions), done) if functions else nullcontext()
     with (
-        ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=spawned) as pool,
+        ProcessPoolExecutor(
+            min(2, os.cpu_count() or 1), spawned, _count_into, (functions, compiled)
+        ) as pool,
         logged,
     ):
         return sum(pool.map(_quietly, parts))
+
+
+def _count_into(functions: Sequence[str], compiled: Any) -> None:
+    """Set the flag of each function that this worker process compiles."""
+    places = {name: k for k, name in enumerate(functions)}
+
+    def count(name: str) -> None:
+        if name in places:
+            compiled[places[name]] = 1
+
+    call_for_each(count)
 
 
 def _quietly(part: tuple[Any, ...]) -> int:

@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is seen of compiling, which takes half a minute to two: a notice, the share done, a clock that leaves it out.
+"""What users see of compiling: a notice with the share done and the time left, and a clock that leaves it out.
 
-While it lasts, garbage is collected less often.
+While the compiler runs, garbage is collected less often.
 """
 
 from __future__ import annotations
@@ -18,54 +18,60 @@ from typing import Any
 
 from numba.core import event
 
-from fdi_ros.compiling.compiled import missing
+from fdi_ros.compiling.compiled import missing, name_of
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
-_PASS = "numba:run_pass"  # every compilation, and nothing that is only loaded, goes through the passes of the compiler
-_WHOLE = "numba:compile"  # one function, with all that it calls
-WORDS = "compiling what every sample passes through, once: half a minute to two (fdi compile does it beforehand)"
+WORDS = "compiling the code that every sample passes through, once (fdi compile does it beforehand)"
 YOUNG_OBJECTS = 7000
-"""The compiler makes millions of objects that last: looking for garbage among them ten times as often as this, which is
-Python's default, is a seventh of its time. More seldom still costs memory and saves nothing."""
-LOG_PERIOD = 10.0  # how often it is logged, s
+"""Young objects that start a garbage collection while the compiler runs. Python's default is a tenth of this. The
+compiler makes millions of objects that last, and the default costs a seventh of its time."""
+FIRST_REPORT = 2.0
+"""Time from the notice to the first report of progress, s: by then some twenty functions are compiled."""
+REPORT_PERIOD = 5.0  # s
+_PASS = "numba:run_pass"
+"""Event of Numba: a compiler pass. Every compilation has passes, a result loaded from disk has none."""
+_FUNCTION = "numba:compile"  # event of Numba: the compilation of one function with all functions that it calls
 
 
 class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
-    """Knows when the compiler runs, in this process."""
+    """Knows when the compiler runs in this process, and which functions it has compiled."""
 
     def __init__(self) -> None:
-        self.depth = 0
-        self.seconds = 0.0
-        self.begun = 0.0
-        self.collected = (
-            gc.get_threshold()
-        )  # when garbage is collected while nothing is compiled
-        self.hooks: list[
-            Callable[[bool], None]
-        ] = []  # called when the compiler begins, and when it has ended
+        self.depth = 0  # of nested compilations
+        self.seconds = 0.0  # spent compiling before the current compilation
+        self.begun = 0.0  # time at which the current compilation began, s
+        self.thresholds = gc.get_threshold()  # outside the compiler
+        self.hooks: list[Callable[[bool], None]] = []
+        """Called with True when the compiler begins, with False when it has ended."""
+        self.counters: list[Callable[[str], None]] = []
+        """Called with the name of each function that was compiled."""
 
     def on_start(self, event: Any) -> None:
         self.depth += 1
         if self.depth == 1:
             self.begun = time.perf_counter()
-            # Before the hooks: where one of them refuses, `on_end` is called, too.
-            young, *older = self.collected = gc.get_threshold()
+            # Before the hooks: if one of them raises, `on_end` is called, too.
+            young, *older = self.thresholds = gc.get_threshold()
             gc.set_threshold(max(young, YOUNG_OBJECTS) if young else 0, *older)
             for hook in tuple(self.hooks):
                 hook(True)
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
+        if event.kind == _FUNCTION:
+            name = name_of(event.data["dispatcher"].py_func)
+            for count in tuple(self.counters):
+                count(name)
         if self.depth == 0:
             self.seconds += time.perf_counter() - self.begun
-            gc.set_threshold(*self.collected)
+            gc.set_threshold(*self.thresholds)
             for hook in tuple(self.hooks):
                 hook(False)
 
     @contextlib.contextmanager
     def calling(self, hook: Callable[[bool], None]) -> Iterator[None]:
-        """Call a hook, too, for what is compiled within."""
+        """Call another hook for compilations within the context."""
         self.hooks.append(hook)
         try:
             yield
@@ -74,7 +80,7 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
 
 
 _watch = _Watch()
-for _kind in (_PASS, _WHOLE):
+for _kind in (_PASS, _FUNCTION):
     event.register(_kind, _watch)
 
 
@@ -85,39 +91,57 @@ def is_compiling() -> bool:
 
 def compiling_seconds() -> float:
     """Return for how long this process has compiled so far, s."""
-    return _watch.seconds + (
-        time.perf_counter() - _watch.begun if is_compiling() else 0.0
-    )
+    current = time.perf_counter() - _watch.begun if is_compiling() else 0.0
+    return _watch.seconds + current
 
 
 def clock() -> float:
-    """Return a time that passes as `time.perf_counter` does, but stands still while anything is compiled, s."""
+    """Return a time in s that passes as `time.perf_counter` does, but stands still while the compiler runs."""
     return time.perf_counter() - compiling_seconds()
 
 
+def call_for_each(counter: Callable[[str], None]) -> None:
+    """Call a counter with the name of each function that this process compiles from now on."""
+    _watch.counters.append(counter)
+
+
 @contextlib.contextmanager
-def share_logged() -> Iterator[None]:
-    """Log that what is missing is compiled within, here or in other processes, and now and then how far it is."""
+def progress_logged(
+    functions: set[str], done: Callable[[], set[str]]
+) -> Iterator[None]:
+    """Log that functions are compiled within the context, and every few seconds how many are done.
+
+    Parameters
+    ----------
+    functions
+        Names of the functions to compile.
+    done
+        Returns the names of the functions that were compiled so far.
+
+    The time left assumes that the rest of the functions takes as long as those that are done.
+    """
     LOG.warning(WORDS)
     begun, over = time.monotonic(), threading.Event()
 
-    def tick() -> None:
-        most = before = missing()
-        while not over.wait(LOG_PERIOD):
-            left = missing()
-            # What is to be compiled may become more on the way.
-            most = max(most, left)
-            if most and (left != before or is_compiling()):
-                share, spent = 1 - left / most, time.monotonic() - begun
-                LOG.warning(
-                    "compiling %3.0f %% |%-20s| %.0f s",
-                    100 * share,
-                    "#" * round(20 * share),
-                    spent,
-                )
-            before = left
+    def report() -> None:
+        wait = FIRST_REPORT
+        while not over.wait(wait):
+            wait = REPORT_PERIOD
+            left = (functions - done()) & missing()
+            count = len(functions) - len(left)
+            if not count:
+                continue
+            share = count / len(functions)
+            spent = time.monotonic() - begun
+            LOG.warning(
+                "compiling |%-20s| %d of %d functions, about %.0f s left",
+                "#" * round(20 * share),
+                count,
+                len(functions),
+                spent / share - spent,
+            )
 
-    thread = threading.Thread(target=tick, daemon=True)
+    thread = threading.Thread(target=report, daemon=True)
     thread.start()
     try:
         yield
@@ -128,7 +152,8 @@ def share_logged() -> Iterator[None]:
 
 @contextlib.contextmanager
 def announced() -> Iterator[None]:
-    """Log, before anything is compiled within, that it is, and now and then how far it is."""
+    """Log that this process compiles, before it does, and how far it is; nothing if all results are found."""
+    done: set[str] = set()
     with contextlib.ExitStack() as stack:
         begun = False
 
@@ -136,7 +161,9 @@ def announced() -> Iterator[None]:
             nonlocal begun
             if not begun:
                 begun = True
-                stack.enter_context(share_logged())
+                _watch.counters.append(done.add)
+                stack.callback(_watch.counters.remove, done.add)
+                stack.enter_context(progress_logged(missing(), lambda: done))
 
         stack.enter_context(_watch.calling(hook))
         yield
@@ -144,7 +171,7 @@ def announced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def refused(words: str) -> Iterator[None]:
-    """Compile nothing within: `FdiError` with these words when something is to be compiled."""
+    """Compile nothing within the context: raise `FdiError` with these words instead."""
 
     def hook(begins: bool) -> None:
         if begins:
