@@ -128,11 +128,12 @@ def update_gain(
     n, sensors = settings.n, settings.sensors
     for i in range(n):
         h, rate = sensors.axes[i], now.plain_rate
-        if settings.estimates and estimate.variance[i] > 0.0:
-            now.variance[i] = estimate.variance[i]
-        else:
+        now.variance[i] = estimate.variance[i]
+        if not (settings.estimates and estimate.known):
+            # The sample was not judged: the estimate is of an earlier motion.
             along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
-            now.variance[i] = variance_of(sensors, i, along, acceleration.value)
+            expected = variance_of(sensors, i, along, acceleration.value)
+            now.variance[i] = max(now.variance[i], expected)
         now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
         for a in range(3):
             now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0

@@ -81,6 +81,7 @@ from fdi_ros.estimator.shared_noise import (
     begin_shared,
     update_line,
     update_shape,
+    update_shared,
     update_shared_level,
 )
 from fdi_ros.estimator.snapshots import inflate_delays, keep_snapshot, pass_hole
@@ -176,7 +177,8 @@ def process_block(params: Constants, state: State) -> None:
     kf.unseen = False
     update_angular_acceleration(params, kf)
     weight = judge_block(params, kf)
-    update_from_block(params, kf, state.scales, learns)
+    if kf.judged:
+        update_from_block(params, kf, state.scales, learns)
     update_rest(params, kf)
     if kf.rest and noise.regime == MOTION and learns:
         change_regime(noise, n, REST, False)
@@ -188,7 +190,9 @@ def process_block(params: Constants, state: State) -> None:
         # Of a case that was refused.
         kf.under_test = 0
         update_line(params, kf)
-    if case.open or kf.held == 0.0 or kf.held > LONG_TIME:
+    holds = kf.held > 0.0 and kf.held <= LONG_TIME and not case.open
+    # Without redundancy only rest shows errors.
+    if not holds and (kf.judged or kf.rest):
         learn(params, kf, weight)
     if learns and not suspicious and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
         kf.snapshot_at = kf.seconds
@@ -199,7 +203,8 @@ def process_block(params: Constants, state: State) -> None:
             # What was measured before is of other instants.
             forget_evidence(params, state)
     predict_innovation_covariance(params, kf)
-    if not case.open and kf.all_blocks % STRIDE == 0 and kf.samples >= case.retry:
+    searches = kf.judged and not case.open and kf.samples >= case.retry
+    if searches and kf.all_blocks % STRIDE == 0:
         look_for_drift(params, state)
         look_for_change_in_hole(params, state)
 
@@ -241,7 +246,9 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     correct_sample(params, kf, sample.z)
     watch_for_motion(params, kf)
     update_statistics(params, kf)
-    if not is_blind(kf):
+    if kf.judged == 0:
+        update_shared(params, kf)
+    elif not is_blind(kf):
         update_from_sample(params, kf, state.scales, not state.case.open)
 
 
@@ -320,7 +327,7 @@ def judge(
     if state.cleared:
         forget_suspicion(params, state)
     update_mask(params, state, sample)
-    if not params.spans[kf.mask] or kf.judged == 0:
+    if not params.determines[kf.mask]:
         verdict.statistic = verdict.threshold = math.nan
         return
     if sample.held:
@@ -342,6 +349,12 @@ def judge(
         process_block(params, state)
         # Its covariance is that of now.
         correct_sample(params, kf, sample.z)
+    sample.estimate.known = True
+    if kf.judged == 0:
+        # The rate and its covariance go on; nothing checks the channels.
+        fill_verdict(params, state, sample, verdict)
+        verdict.statistic = verdict.threshold = math.nan
+        return
     mean = mean_of(params, state.estimator, state.scales)
     verdict.statistic = math.log(1.0 + mean)
     fill_outliers(params, state, verdict)
@@ -351,7 +364,6 @@ def judge(
         undo_move(params, state)
     elif mean >= params.limit and kf.samples >= case.retry:
         look_for_case(params, state)
-    sample.estimate.known = True
     fill_verdict(params, state, sample, verdict)
 
 
@@ -459,9 +471,11 @@ class Sequential(Detector):
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
         enough = used.sum(axis=1) >= MIN_CHANNELS
-        params["spans"][: 1 << n] = enough & (
+        determines = (used.sum(axis=1) >= 3) & (
             singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0]
         )
+        params["determines"][: 1 << n] = determines
+        params["spans"][: 1 << n] = enough & determines
         params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         params["limit"], params["confidence"] = self.run_length, confidence
 

@@ -100,7 +100,8 @@ class Constants:
         Real  # error that is not linear in the rate, standard deviation, share of it
     )
     rest_std: Real  # of the rate at rest, rad/s
-    spans: Sets  # sets of channels that span space
+    determines: Sets  # sets of channels that give a rate
+    spans: Sets  # of these, sets with redundancy
     least: Whole  # samples that a fault lasts
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real

@@ -136,6 +136,8 @@ class SharedNoise:
         Real  # share of the noise that lines explain, and independent channels do not
     )
     level: Channels  # variance of each channel now, (rad/s)^2
+    checked: Pair  # mean of `level` at rest, in motion, while checked, (rad/s)^2
+    checked_blocks: Two  # blocks that these are means of
     past: Annotated[NDArray[np.float64], "f8", (PAST, MAX_CHANNELS)]  # rad/s
     taken: Whole  # fourth differences of this block
     difference: Channels  # the last one, rad/s

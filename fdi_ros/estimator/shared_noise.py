@@ -47,6 +47,7 @@ UNEQUAL = 0.15  # by how much units see vibration differently; logs show 0.04 to
 INDEPENDENT = (
     4.0  # values of a block that are independent of one another: all four at 100 Hz
 )
+MOST_CHECKED = 250.0  # blocks (10 s) that the level while checked is a mean of
 NEAR_SINGULAR = 1e-3  # share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is measured
 
 
@@ -65,7 +66,8 @@ def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
 def update_shared(params: Constants, kf: Estimator) -> None:
     """Take the innovations of a sample and, every 20 ms, fourth differences of the corrected values."""
     shared = kf.shared
-    update_covariance(params, kf)
+    if kf.judged:
+        update_covariance(params, kf)
     for a in range(3):
         shared.rate_sum[a] += kf.rate[a]
         shared.rate_squares[a] += kf.rate[a] * kf.rate[a]
@@ -182,6 +184,10 @@ def update_shared_level(params: Constants, kf: Estimator) -> None:
                 )
         pooled /= max(k - 1.0, 0.5)
     shared.coherent = coherent
+    blocks = min(shared.checked_blocks[noise.regime] + 1.0, MOST_CHECKED)
+    if k > 0.0:
+        shared.checked_blocks[noise.regime] = blocks
+    share = 1.0 / blocks
     for i in range(n):
         level = noise.now.sample[i] * max(1.0, BURST * noise.quick[i], shared.excess)
         seen = 0.0
@@ -191,8 +197,16 @@ def update_shared_level(params: Constants, kf: Estimator) -> None:
                 * params.sensors.axes[i, a]
                 * shared.vibration[a]
             )
-        level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
-        shared.level[i] = level + coherent * max(pooled - level, 0.0)
+        if k > 0.0:
+            level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
+            level += coherent * max(pooled - level, 0.0)
+            before = shared.checked[noise.regime, i]
+            shared.checked[noise.regime, i] += share * (level - before)
+        else:
+            # Without redundancy vibration of the body and of one sensor look alike.
+            level = max(level, noise.now.sample[i] + seen)
+            level = max(level, shared.checked[noise.regime, i])
+        shared.level[i] = level
 
 
 @compiled
