@@ -51,12 +51,13 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         if doubtful & now.usable:
             add_doubt(core, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
-        # Whichever unit is in time, the others are early or late: the instant lies anywhere between.
+        # The rate is stated for the instant of the earliest unit, and the true one lies
+        # anywhere between that and the instant of the latest.
         for a in range(3):
             now.others_rate[a] = (
                 core.sample.estimate.spread * core.acceleration.value[a]
             )
-        add_square(last.covariance, now.others_rate, 1.0 / 12.0)
+        add_square(last.covariance, now.others_rate, 1.0 / 3.0)
         update_common_error(core)
     else:
         for k in range(6):

@@ -218,5 +218,8 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             )
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
+            # The instant may be that of any unit.
+            apart = core.sample.estimate.spread * core.acceleration.value[a]
+            last.level[a] += abs(apart)
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:
             cover_rivals(core)

@@ -350,12 +350,19 @@ def judge(
         # Its covariance is that of now.
         correct_sample(params, kf, sample.z)
     sample.estimate.known = True
+    if kf.judged:
+        follow_evidence(params, state, verdict)
+    fill_verdict(params, state, sample, verdict)
     if kf.judged == 0:
         # The rate and its covariance go on; nothing checks the channels.
-        fill_verdict(params, state, sample, verdict)
         verdict.statistic = verdict.threshold = math.nan
-        return
-    mean = mean_of(params, state.estimator, state.scales)
+
+
+@compiled
+def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> None:
+    """Follow the case that is open, or look for one where the mean of the sums reaches the limit."""
+    kf, case = state.estimator, state.case
+    mean = mean_of(params, kf, state.scales)
     verdict.statistic = math.log(1.0 + mean)
     fill_outliers(params, state, verdict)
     if case.open:
@@ -364,7 +371,6 @@ def judge(
         undo_move(params, state)
     elif mean >= params.limit and kf.samples >= case.retry:
         look_for_case(params, state)
-    fill_verdict(params, state, sample, verdict)
 
 
 class Sequential(Detector):

@@ -1,0 +1,58 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The published covariance is true where little or nothing checks the channels.
+
+The flights are those of ``benchmark/physics.py``. NEES is bounded from below as well: a covariance that claims too
+little is of no use.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_ros import Pipeline
+
+# For this import alone: a module there has the name of a folder of tests.
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmark"))
+from physics import CONDITIONS, config_of, fly
+from trials import Asked
+
+sys.path.pop(0)
+
+FLIGHTS = 3
+
+
+def flown(mounting, name, **settings):
+    condition = CONDITIONS[name]
+    changes = {key.replace("__", "."): value for key, value in settings.items()}
+    config = config_of(mounting, 100.0, {**condition.settings, **changes}, Asked())
+    pipeline = Pipeline.from_config(config)
+    flights = [
+        fly(pipeline, mounting, name, 0.0, np.random.default_rng([k, 7]))
+        for k in range(FLIGHTS)
+    ]
+    return {
+        key: np.array([getattr(one, key) for one in flights])
+        for key in ("nees", "level", "wrong", "no_rate")
+    }
+
+
+@pytest.mark.parametrize("mounting", ["cone", "2 units", "3 units"])
+@pytest.mark.parametrize(
+    "name", ["one unit ever", "unit lost at rest", "unit lost at rest, tones 0.05"]
+)
+def test_the_covariance_is_true_without_redundancy(mounting, name):
+    found = flown(mounting, name)
+    assert 0.2 < found["nees"].mean() < 2.0, found
+    assert found["nees"].max() < 3.0, found
+    assert not found["wrong"].any()
+    assert not found["no_rate"].any()
+
+
+@pytest.mark.parametrize("mounting", ["cone", "3 units"])
+def test_a_bias_that_was_never_learned_is_in_the_covariance(mounting):
+    found = flown(mounting, "one unit ever", bias__startup_bias_duration=0.0)
+    assert 0.1 < found["nees"].mean() < 2.0, found
