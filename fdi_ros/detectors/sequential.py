@@ -321,7 +321,7 @@ def judge(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
     verdict.threshold = math.log(1.0 + params.limit)
     seconds = pass_time(params, state, sample)
     if state.cleared:
