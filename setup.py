@@ -59,7 +59,7 @@ class BuildCompiled(build_py):
 
 setup(
     name=NAME,
-    version="0.2.0",
+    version="0.4.0",
     cmdclass={"build_py": BuildCompiled},
     description="Online gyro fault detection and isolation for ROS 2",
     author="fdi_ros maintainers",

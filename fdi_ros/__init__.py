@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fdi_ros.replay.run import read as read
     from fdi_ros.replay.run import replay as replay
 
-__version__ = "0.2.0"
+__version__ = "0.4.0"
 
 _HOMES = {
     "Block": "fdi_ros.model.samples",
