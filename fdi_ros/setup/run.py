@@ -23,8 +23,14 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
-from fdi_ros.inspection.degrees import refuse_degrees
-from fdi_ros.inspection.fitness import candidates, clocks_apart, copy_words, needs
+from fdi_ros.inspection.fitness import (
+    candidates,
+    clocks_apart,
+    copy_words,
+    needs,
+    no_common_time,
+    refuse_unfit,
+)
 from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.inspection.topics import GAP, TopicReport, inspect
 from fdi_ros.model.samples import Block
@@ -258,7 +264,7 @@ def set_up(
     if (
         units
         and not np.isfinite(block.z).all(axis=1).any()
-        and (apart := clocks_apart(chosen, 0.0))
+        and (apart := clocks_apart(chosen, 0.0) or no_common_time(chosen))
     ):
         raise BagError(f"{bag}: {apart}")
 
@@ -282,7 +288,7 @@ def recalibrate(
 
     `FdiError` if it cannot be read, lacks a topic, or its channels contradict each other.
     """
-    if copies := copy_words(refuse_degrees(bag, config)):
+    if copies := copy_words(refuse_unfit(bag, config)):
         raise CalibrationError(
             f"{bag}: {copies}; look at topics and remappings, or leave one out of the config"
         )

@@ -245,7 +245,7 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
         tmp_path / "two.yaml", {"input": "imus", "imus.topics": list(TOPICS)}
     )
     said = refused("calibrate", *made, "--config", config)
-    assert "fdi inspect says whether its topic is silent or of another clock" in said
+    assert words in said
 
 
 @pytest.mark.parametrize("odd", [0, 1, 2])
