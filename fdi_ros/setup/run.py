@@ -348,7 +348,7 @@ def _proved(
     learned, apart, source = (
         block,
         proof is not None,
-        "the same recording: too short to keep a part of it aside",
+        "the same recording, too short to keep a part of it aside",
     )
     if proof is not None:
         bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
@@ -360,7 +360,7 @@ def _proved(
         start, apart, source = (
             start + since,
             True,
-            f"the last {seconds:.0f} s, kept aside",
+            f"the last {seconds:.0f} s",
         )
     before, found = learn(learned)
     if needed and found.why is not None:
