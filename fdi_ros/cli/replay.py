@@ -156,7 +156,9 @@ def _sinks(
         )
     if arguments.output is not None:
         path = stack.enter_context(whole(arguments.output))
-        sinks.append(stack.enter_context(OutputBag(path, config, geometry.n)))
+        sinks.append(
+            stack.enter_context(OutputBag(path, config, geometry.channel_names))
+        )
     return sinks
 
 

@@ -161,6 +161,16 @@ class Config:
         return tuple(f"{imu}.{axis}" for imu in self.imu_names for axis in "xyz")
 
     @property
+    def unit_timeout(self) -> float:
+        """Time after which a unit is not waited for, s: ``imus.timeout``, and `LEAST_WAIT` samples at least."""
+        return max(self.imus.timeout, LEAST_WAIT / self.sample_rate)
+
+    @property
+    def stale_timeout(self) -> float:
+        """Time after which a silent channel is stale, s: ``health.stale_timeout``, `LEAST_WAIT` samples at least."""
+        return max(self.health.stale_timeout, LEAST_WAIT / self.sample_rate)
+
+    @property
     def has_units(self) -> bool:
         """Whether three-axis units arrive, each on a topic of its own, with the settings of ``imus``."""
         return INPUTS[self.input].section == "imus"
@@ -218,6 +228,9 @@ def check_lengths(config: Config, per: str, count: int) -> None:
             )
 
 
+LEAST_WAIT = (
+    4  #: samples: with fewer, a message that is late or lost looks like a silent unit
+)
 MIN_LEARNED = 10  #: samples that a bias is learned from at a start at rest
 MAX_SPAN = 1000  #: samples over which the angular acceleration is taken at most
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"

@@ -218,7 +218,7 @@ class ImusConfig:
     )
     timeout: float = setting(
         0.1,
-        "a unit silent for so long is not waited for; its input is STALE",
+        "a unit silent for so long, and for 4 samples, is not waited for; its input is STALE",
         "s",
         0.001,
         10.0,
@@ -416,7 +416,11 @@ class HealthConfig:
         86400.0,
     )
     stale_timeout: float = setting(
-        0.1, "stale when a channel gives nothing for this long", "s", 0.001, 60.0
+        0.1,
+        "stale when a channel gives nothing for this long, and for 4 samples",
+        "s",
+        0.001,
+        60.0,
     )
 
 

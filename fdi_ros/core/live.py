@@ -115,7 +115,9 @@ def process(
         monitor.without_rate += 1
     if main.wanted or main.copies.found:
         flags |= SUPPLY
-    fill_integrity(integrity, monitor.integrity_at, main.last, main.settings.n)
+    fill_integrity(
+        integrity, monitor.integrity_at, main.last, main.settings.n, sample.shift
+    )
     monitor.shift = sample.shift
     monitor.ready = next_sample(aligner[0], sample)
     return flags | MORE if monitor.ready else flags

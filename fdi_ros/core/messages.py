@@ -188,13 +188,31 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     _write_doubles(out, at + 24, covariance, _FULL, 9)
 
 
+def integrity_labels(names: Sequence[str]) -> list[str]:
+    """Return what each value of the integrity message is, for channels of these names."""
+    return [
+        "statistic",
+        "threshold",
+        *(f"state {name}" for name in names),
+        *(f"protection level {axis} [rad/s]" for axis in "xyz"),
+        "stamp [s]",
+        "stamp [ns]",
+    ]
+
+
 @compiled
-def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int) -> None:
-    """Write statistic, threshold, n states and level into a Float64MultiArray; out and at as for `fill_imu`."""
+def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> None:
+    """Write the values that `integrity_labels` names into a Float64MultiArray; out and at as for `fill_imu`.
+
+    The stamp is that of the sample less ``shift``, ns.
+    """
     _write_double(out, at, row.statistic)
     _write_double(out, at + 8, row.threshold)
     _write_doubles(out, at + 16, row.state, _IN_ORDER, n)
     _write_doubles(out, at + 16 + 8 * n, row.level, _IN_ORDER, 3)
+    stamp = row.stamp - shift
+    _write_double(out, at + 40 + 8 * n, stamp // _NS)
+    _write_double(out, at + 48 + 8 * n, stamp % _NS)
 
 
 class ImuTemplate:
@@ -231,10 +249,20 @@ class ImuTemplate:
 
 
 class ChannelsTemplate:
-    """Serialised std_msgs/Float64MultiArray of a fixed number of values, at least 1, without dimensions."""
+    """Serialised std_msgs/Float64MultiArray of a fixed number of values, at least 1.
 
-    def __init__(self, count: int) -> None:
-        head = struct.pack("<4B4I", 0, 1, 0, 0, 0, 0, count, 0)
+    With labels, one for each value and without commas, the array has one dimension: its label holds all of them,
+    separated by commas.
+    """
+
+    def __init__(self, count: int, labels: Sequence[str] = ()) -> None:
+        head = struct.pack("<4BI", 0, 1, 0, 0, 1 if labels else 0)
+        if labels:
+            label = ",".join(one.replace(",", " ") for one in labels).encode() + b"\0"
+            head += struct.pack("<I", len(label)) + label + bytes(-len(label) % 4)
+            head += struct.pack("<II", count, count)  # size and stride
+        head += struct.pack("<II", 0, count)  # offset of the data
+        head += bytes(-(len(head) - ENCAPSULATION) % 8)
         self.count = count
         self.bytes = np.frombuffer(bytearray(head + bytes(8 * count)), dtype=np.uint8)
         """The message, to be copied or filled in place."""

@@ -170,7 +170,7 @@ class Source(ABC):
         return (
             len(self.topics),
             round(imus.max_skew * 1e9),
-            round(imus.timeout * 1e9),
+            round(self.config.unit_timeout * 1e9),
             imus.delays,
         )
 
@@ -201,7 +201,7 @@ class UnitSource(Source):
         super().__init__(config)
         imus, count = config.imus, len(config.topics)
         self.names = self.units = config.imu_names
-        self.timeout, self.max_lag = imus.timeout, imus.max_skew
+        self.timeout, self.max_lag = config.unit_timeout, imus.max_skew
         self.delays = imus.delays or (0.0,) * count
         self.mounts = list(
             np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3))
@@ -216,10 +216,13 @@ class ArraySource(Source):
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        self.names, self.timeout = config.topics, config.health.stale_timeout
+        self.names, self.timeout = config.topics, config.stale_timeout
 
 
 # sensor_msgs/Imu ------------------------------------------------------------------------------------------------------
+
+
+NO_RATE = FIRST_OWN  #: an Imu that measures no angular rate, by its covariance
 
 
 @compiled
@@ -228,13 +231,23 @@ def _imu_place(data: Bytes, offset: int, length: int, count: int) -> int:
 
 
 @compiled
+def _imu_read(data: Bytes, offset: int, length: int, rate: Array) -> int:
+    """Read the rate of an Imu into rate (3,), and return its stamp, ns; or the code of what is wrong, negative."""
+    at = _imu_place(data, offset, length, 3)
+    if at >= 0:
+        first = np.int64(read_bits(data, at + 24, 8, data[offset + 1] == 1))
+        # REP-145: the first element of the covariance of what is not measured.
+        if first.view(np.float64) == -1.0:
+            return -NO_RATE
+    return read_rate(data, offset, length, IMU_BEFORE_RATE, IMU_DOUBLES, rate)
+
+
+@compiled
 def _imu_decode_into(
     data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
 ) -> None:
     for k in range(len(offset)):
-        measured = read_rate(
-            data, offset[k], length[k], IMU_BEFORE_RATE, IMU_DOUBLES, values[k]
-        )
+        measured = _imu_read(data, offset[k], length[k], values[k])
         if measured < 0:
             code[k] = -measured
         else:
@@ -247,9 +260,7 @@ def _imu_receive(
 ) -> int:
     if not 0 <= inlet < aligner[0].n:
         return 0
-    measured = read_rate(
-        data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate
-    )
+    measured = _imu_read(data, 0, len(data), aligner[0].rate)
     return receive_stamped(live[0], aligner[0], inlet, measured, stamp)
 
 
@@ -262,12 +273,22 @@ class ImuSource(UnitSource):
     decode_into = staticmethod(_imu_decode_into)
     receive = staticmethod(_imu_receive)
 
+    @classmethod
+    def explain(cls, code: int, data: bytes, count: int) -> str:
+        """Explain in one line what is wrong with a message."""
+        if code == NO_RATE:
+            return "angular_velocity_covariance[0] is -1: this Imu measures no angular rate (REP-145)"
+        return super().explain(code, data, count)
+
 
 # std_msgs/Float64MultiArray -------------------------------------------------------------------------------------------
 
 
+_MANY = 1 << 31
 MAX_DIMENSIONS = 16  # an array whose layout has more dimensions is no message of ours
-_DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES = range(FIRST_OWN, FIRST_OWN + 4)
+_DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES, _GAPS = range(
+    FIRST_OWN, FIRST_OWN + 5
+)
 
 
 @compiled
@@ -282,11 +303,21 @@ def _count_at(data: Bytes, offset: int, length: int) -> int:
     dimensions = read_bits(data, offset + ENCAPSULATION, 4, little)
     if dimensions > MAX_DIMENSIONS:
         return -_DIMENSIONS
-    for _ in range(dimensions):
+    span, values = 0, 1  # stride of the first dimension, product of all sizes
+    for k in range(dimensions):
         if at + 4 > length:
             return -_CUT_ARRAY
         # Label, aligned to 4, then size and stride.
-        at += 4 + (read_bits(data, offset + at, 4, little) + 3) // 4 * 4 + 8
+        at += 4 + (read_bits(data, offset + at, 4, little) + 3) // 4 * 4
+        if at + 8 > length:
+            return -_CUT_ARRAY
+        # Many publishers leave sizes or strides at 0.
+        values = min(values * read_bits(data, offset + at, 4, little), _MANY)
+        if k == 0:
+            span = read_bits(data, offset + at + 4, 4, little)
+        at += 8
+    if 0 < values < span:
+        return -_GAPS
     # The offset of the data, then the number of values.
     at += 4
     return offset + at if at + 4 <= length else -_CUT_ARRAY
@@ -297,11 +328,15 @@ def _array_place(data: Bytes, offset: int, length: int, count: int) -> int:
     at = _count_at(data, offset, length)
     if at < 0:
         return at
-    if read_bits(data, at, 4, data[offset + 1] == 1) != count:
+    little = data[offset + 1] == 1
+    before = read_bits(data, at - 4, 4, little)  # values that are padding
+    if read_bits(data, at, 4, little) != before + count:
         return -_WRONG_COUNT
     # The first byte of the values is aligned even where there is none.
     start = ENCAPSULATION + (at + 4 - offset - ENCAPSULATION + 7) // 8 * 8
-    return offset + start if start + 8 * count <= length else -_CUT_VALUES
+    if start + 8 * (before + count) > length:
+        return -_CUT_VALUES
+    return offset + start + 8 * before
 
 
 @compiled
@@ -338,7 +373,10 @@ def _array_receive(
 
 
 class ChannelsSource(ArraySource):
-    """The values of std_msgs/Float64MultiArray messages, whatever their layout says."""
+    """The values of std_msgs/Float64MultiArray messages.
+
+    The layout may have any dimensions and a ``data_offset``; strides that leave gaps between values are refused.
+    """
 
     type = "std_msgs/msg/Float64MultiArray"
     called = "an array"
@@ -357,6 +395,10 @@ class ChannelsSource(ArraySource):
             return (
                 f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"
             )
+        if code == _GAPS:
+            return (
+                "the strides of the array leave gaps between its values, expected none"
+            )
         if code == _CUT_ARRAY:
             return f"{size} bytes are too few for the array they announce"
         if code == _WRONG_COUNT:
@@ -372,9 +414,9 @@ class ChannelsSource(ArraySource):
         for start, size in zip(offset.tolist(), length.tolist(), strict=True):
             at = _count_at(data, start, size)
             if at >= 0:
-                return int.from_bytes(
-                    data[at : at + 4].tobytes(), "little" if data[start + 1] else "big"
-                )
+                order = "<" if data[start + 1] else ">"
+                padding, count = struct.unpack_from(f"{order}II", data, at - 4)
+                return max(0, int(count) - int(padding))
         return 0
 
 

@@ -183,7 +183,7 @@ def _fill_settings(
     settings["non_finite_time"] = _nanoseconds(health.non_finite_time)
     settings["stuck_time"] = _nanoseconds(health.stuck_time)
     settings["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
-    settings["stale_time"] = _nanoseconds(health.stale_timeout)
+    settings["stale_time"] = _nanoseconds(config.stale_timeout)
     settings["recovery_time"] = _nanoseconds(health.range_recovery_time)
     settings["alarms"], settings["window"] = (
         decision.confirm_alarms,

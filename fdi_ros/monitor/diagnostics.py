@@ -138,7 +138,7 @@ def describe(
 
     ``figures``: more key-values for the whole. ``silent``: no sample for this long, s, so that all is STALE; None:
     samples come. ``since``: stamps of the messages that brought the channels into their states, ns; None: those of the
-    samples. ``warning``: what else is wrong with the whole, while samples come.
+    samples. ``warning``: what else is wrong with the whole.
     """
     worse = _find_worse(status)
     level, message = _whole_message(status, worse)
@@ -154,6 +154,7 @@ def describe(
         words = (
             f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
         )
+        words += f"; {warning}" if warning else ""
         rows = [(name, Level.STALE, words, values) for name, _, _, values in rows]
     rows += [
         (f"{INPUT}{line.name}", *_input_message(line), _input_values(line))
@@ -487,6 +488,8 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         for kind, kind_in_words in ODD.items()
         if line.recent.get(kind)
     ]
+    if line.recent.get("malformed") and line.error:
+        odd.append(line.error)
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.unstamped:

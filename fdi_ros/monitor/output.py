@@ -17,6 +17,7 @@ from fdi_ros.core.messages import (
     ImuTemplate,
     fill_imu,
     fill_integrity,
+    integrity_labels,
 )
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
@@ -256,9 +257,8 @@ class SampleOutput:
     """What is said of each sample on a topic of its own."""
 
     topic: Topic
-    make: Callable[
-        [str, int], Template
-    ]  # a message to be filled, from the frame_id of the rate and n channels
+    make: Callable[[str, Sequence[str]], Template]
+    """Returns a message to be filled, from the frame_id of the rate and the names of the channels."""
     fill: Callable[[Template, Any, int, int], None]
     """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
     needs_rate: bool = False  # whether it is of samples with a fused rate alone
@@ -267,7 +267,7 @@ class SampleOutput:
 
 FUSED = SampleOutput(
     Topic("fused", "sensor_msgs/msg/Imu"),
-    lambda frame_id, n: ImuTemplate(frame_id),
+    lambda frame_id, names: ImuTemplate(frame_id),
     lambda out, row, n, shift: fill_imu(
         out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]
     ),
@@ -275,19 +275,19 @@ FUSED = SampleOutput(
 )
 INTEGRITY = SampleOutput(
     Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
-    lambda frame_id, n: ChannelsTemplate(n + 5),
-    lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n),
+    lambda frame_id, names: ChannelsTemplate(len(names) + 7, integrity_labels(names)),
+    lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n, shift),
     on_demand=True,
-)  # statistic, threshold, states of the channels, protection level
-OUTPUTS = (FUSED, INTEGRITY)  # all that is said of samples, live and in an output bag
+)
+OUTPUTS = (FUSED, INTEGRITY)  # of each sample, live and in an output bag
 
 
 class Encoder:
-    """Makes messages of the output of a monitor of n channels, from the frame_id of the fused rate on."""
+    """Makes messages of the output of a monitor, from the frame_id of the fused rate and the names of the channels."""
 
-    def __init__(self, frame_id: str, n: int) -> None:
-        self.n = n
-        self.templates = {output: output.make(frame_id, n) for output in OUTPUTS}
+    def __init__(self, frame_id: str, names: Sequence[str]) -> None:
+        self.n = len(names)
+        self.templates = {output: output.make(frame_id, names) for output in OUTPUTS}
 
     def fill(self, output: SampleOutput, row: Any, shift: int = 0) -> None:
         """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""

@@ -36,12 +36,36 @@ from fdi_ros.monitor.output import (
 )
 from fdi_ros.monitor.pipeline import Pipeline
 
+STANDING_TIME = 2_000_000_000  # ns of steady time; a simulation at a tenth of real time steps by 0.2 s
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
 RATE_WINDOWS = 4  # so many measurements in a row must agree with each other: a pause or a loss is no rate
 
 
+class SilenceClock:
+    """Time by which silence is judged: that of the clock, which goes on by a steady clock where the clock stands.
+
+    The clock of a simulation or a recording stands for `STANDING_TIME` between two of its messages at most, else it is
+    paused or lost: silence is no health then.
+    """
+
+    def __init__(self) -> None:
+        self.standing = 0.0
+        """Time for which the clock has stood, s; 0: it runs."""
+        self._clock = -1  # clock time of the last reading, ns
+        self._moved = 0  # steady time at which the clock moved last, ns
+
+    def read(self, now: int, steady: int) -> int:
+        """Return the time at the clock time now and a steady time, ns."""
+        if now != self._clock:
+            self._clock = now
+            self._moved = steady
+        stood = steady - self._moved
+        self.standing = stood / 1e9 if stood > STANDING_TIME else 0.0
+        return now + max(0, stood - STANDING_TIME)
+
+
 class Watchdog:
-    """Whether a counter has stood still for longer than a timeout, ns, by the clock."""
+    """Whether a counter has stood still for longer than a timeout, ns, by a `SilenceClock`."""
 
     def __init__(self, timeout: int) -> None:
         self.timeout = timeout
@@ -116,7 +140,7 @@ class Receiver:
             self.source.topics
         )  # why the last malformed message of each topic was refused
         self._events = allocate(EventRow, n)
-        self.encoder = Encoder(config.body_frame, n)
+        self.encoder = Encoder(config.body_frame, pipeline.channel_names)
         fused, integrity = (
             self.encoder.templates[output] for output in (FUSED, INTEGRITY)
         )
@@ -149,7 +173,7 @@ class Receiver:
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
         self.pipeline.supply()
-        self.encoder.fill(INTEGRITY, self.pipeline.core[0]["last"])
+        self.encoder.fill(INTEGRITY, self.pipeline.core[0]["last"], self.shift)
 
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""

@@ -106,11 +106,11 @@ class OutputBag(Sink):
     stops_at_events = True
     period = 1_000_000_000  # of the regular diagnostics, ns
 
-    def __init__(self, path: Path, config: Config, channels: int) -> None:
+    def __init__(self, path: Path, config: Config, names: Sequence[str]) -> None:
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # By this it may be replaced later: what anything else has recorded never is.
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
-        self._encoder = Encoder(config.body_frame, channels)
+        self._encoder = Encoder(config.body_frame, names)
         self._source = source_of(config)
         self._before: list[tuple[Newest, dict[str, int]]] = [
             (Newest(), {}) for _ in config.topics

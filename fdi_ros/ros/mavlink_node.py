@@ -292,7 +292,7 @@ class AutopilotNode(CheckedNode):
         self._called = True
         assert self._failover is not None
         now, count = time.monotonic_ns(), len(self.config.channel_names)
-        _, values = ChannelsSource.parse(data, count + 5)
+        _, values = ChannelsSource.parse(data, count + 7)
         # A second publisher is a stranger, a second monitor, or gives it rates that are not this autopilot's.
         self._failover.is_alone = all(
             self.count_publishers(topic) == 1 for topic in self._sole

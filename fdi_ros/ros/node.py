@@ -271,20 +271,26 @@ class CheckedNode(Node):
             given, self.config.topics if subscribes else (), publishes
         )
         own = {**ALL_NODES, **fields}
-        values = (
-            {name: field.default for name, field in own.items()}
-            | self.config.parameters()
-            | given
-        )
+        values = self.config.parameters()
         for name, field in own.items():
-            _checked(name, field, values[name])
-        for name, field in (own | PARAMETERS).items():
-            value = (
-                list(values[name]) if isinstance(values[name], tuple) else values[name]
-            )
-            self.declare_parameter(
-                name, value, _descriptor(name, field), ignore_override=True
-            )
+            values[name] = _checked(name, field, given.get(name, field.default))
+        self._declared = own | PARAMETERS
+        for name, field in self._declared.items():
+            typed = _typed(Parameter(name, value=values[name]), field)
+            described = _descriptor(name, field)
+            if isinstance(typed.value, Sequence) and not typed.value:
+                # rclpy takes any empty value for an array of bytes.
+                anything = ParameterDescriptor(dynamic_typing=True)
+                self.declare_parameter(
+                    name, typed.value, anything, ignore_override=True
+                )
+                self.set_parameters([typed])
+                described.type = typed.type_.value
+                self.set_descriptor(name, described)
+            else:
+                self.declare_parameter(
+                    name, typed.value, described, ignore_override=True
+                )
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def values(self, changes: Sequence[Parameter] = ()) -> dict[str, Any]:
@@ -383,8 +389,18 @@ class CheckedNode(Node):
         self, parameter_list: list[Parameter]
     ) -> SetParametersResult:
         """Set parameters together; every refusal is logged too."""
+        typed = [
+            _typed(one, self._declared[one.name]) if one.name in self._declared else one
+            for one in parameter_list
+        ]
         try:
-            result = super().set_parameters_atomically(parameter_list)
+            for one in typed:
+                field = self._declared.get(one.name)
+                if field and field.runtime and one.type_ != _TYPES[field.kind]:
+                    _checked(one.name, field, one.value)
+            result = super().set_parameters_atomically(typed)
+        except FdiError as error:
+            result = _refusal(str(error))
         except ParameterNotDeclaredException:
             unknown = next(
                 p.name for p in parameter_list if not self.has_parameter(p.name)
@@ -462,14 +478,44 @@ def _checked(name: str, field: Field, value: Any) -> Any:
     )
 
 
+_TYPES = {
+    "bool": Parameter.Type.BOOL,
+    "int": Parameter.Type.INTEGER,
+    "float": Parameter.Type.DOUBLE,
+    "text": Parameter.Type.STRING,
+    "numbers": Parameter.Type.DOUBLE_ARRAY,
+    "texts": Parameter.Type.STRING_ARRAY,
+}  # by the kind of a `Field`
+
+
+def _typed(parameter: Parameter, field: Field) -> Parameter:
+    """Return a parameter in the type of its field; unchanged where its value has no equal in that type."""
+    value, kind = parameter.value, _TYPES[field.kind]
+    is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+        is_list = True
+    if value is False and "off" in field.choices:
+        # YAML reads off as false.
+        value = "off"
+    elif field.kind == "float" and type(value) is int:
+        value = float(value)
+    elif field.kind in ("numbers", "texts"):
+        value = list(value) if is_list else [value]
+        if field.kind == "numbers" and all(type(one) in (int, float) for one in value):
+            value = [float(one) for one in value]
+    try:
+        return Parameter(parameter.name, kind, value)
+    except ValueError:
+        return parameter
+
+
 def _descriptor(name: str, field: Field) -> ParameterDescriptor:
     """Describe a parameter to ROS: meaning, unit, range; read-only unless it may change at run time."""
     unit = f" [{field.unit}]" if field.unit else ""
-    # A whole number given for a real one, or one value for an array of one, is checked by the table.
     described = ParameterDescriptor(
         description=field.description + unit, read_only=not field.runtime
     )
-    described.dynamic_typing = True
     bounded = math.isfinite(field.low) and math.isfinite(field.high)
     # Not in the table of settings: detectors are a layer above it.
     choices = tuple(DETECTORS) if name == "detector.name" else field.choices

@@ -25,6 +25,7 @@ from fdi_ros.core.live import (
 )
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.monitor.diagnostics import (
+    OLD,
     WHOLE,
     InputStatus,
     Level,
@@ -33,14 +34,22 @@ from fdi_ros.monitor.diagnostics import (
     encode_diagnostics,
 )
 from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
-from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
+from fdi_ros.monitor.receiver import (
+    Receiver,
+    SampleRateCheck,
+    SilenceClock,
+    Watchdog,
+)
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.monitor.status import ApartStatus
+from fdi_ros.monitor.status import ApartStatus, Status
 from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
 from fdi_ros.system.text import LINE, shown
 
 REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
+LATE_SAMPLE = 0.5
+"""Age from which the newest judged sample is reported, s: several times the time that the slowest link and the
+alignment take. A starved computer, or clocks that differ, look like this."""
 ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
 NAMED = 4  # publishers of one topic that are named at most
 QUIET = 5.0  # after a line about a channel the next one waits so long, s, unless its state becomes worse
@@ -253,8 +262,10 @@ class Running:
         ]
         self._count_subscribers()
         self._changes = ChangeLog(self._node.log, receiver.pipeline.channel_names)
-        self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
+        self._watchdog = Watchdog(round(config.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
+        self._silence_clock = SilenceClock()
+        self._clock_stood = False  # as it was logged
         self._due = 0.0  # steady time of the next regular report, s: the first at once
         self._at_once = (
             MAX_AT_ONCE  # changes that may still be reported at once before it
@@ -317,7 +328,8 @@ class Running:
     def check(self) -> None:
         """Look for everything that may have changed; to be called many times in the period of the reports."""
         self._count_subscribers()
-        now, log = self._node.get_clock().now().nanoseconds, self._node.log
+        now, log = self._now(), self._node.log
+        self._check_clock()
         is_open = bool(self._node.inputs.subscriptions)
         changes = [topic.check(now, log) for topic in self.topics] if is_open else []
         if is_open and (self._watchdog.check(self._samples, now) or any(changes)):
@@ -336,6 +348,46 @@ class Running:
                 topic.check_sources(self._node, self.topics, log)
             self._report()
             self._count_anew(now)
+
+    def _now(self) -> int:
+        """Return the time by which silence is judged, ns."""
+        clock = self._node.get_clock().now().nanoseconds
+        return self._silence_clock.read(clock, time.monotonic_ns())
+
+    def _check_clock(self) -> None:
+        """Log when the clock comes to stand, and when it runs again."""
+        words = self._clock_words()
+        if bool(words) != self._clock_stood:
+            self._clock_stood = bool(words)
+            if words:
+                self._node.log.warning(words)
+            else:
+                self._node.log.info("the clock runs again")
+
+    def _clock_words(self) -> str:
+        """Return what is wrong with the clock; empty: it runs."""
+        if not self._silence_clock.standing:
+            return ""
+        if self._node.get_clock().now().nanoseconds == 0:
+            return "no time on /clock, and use_sim_time is true: times are unknown"
+        return (
+            f"the clock has stood still for {self._silence_clock.standing:.0f} s, and"
+            " use_sim_time is true: times are unknown"
+        )
+
+    def _warnings(self, status: Status, clock: int) -> tuple[str, str, str]:
+        """Return what is wrong with the whole at a clock time, ns: its rate, the clock, the age of its samples."""
+        age = self._age(status, clock)
+        old = LATE_SAMPLE < age <= OLD and not self._has_no_samples
+        return (
+            self._rate_check.words,
+            self._clock_words(),
+            f"the newest judged sample is {age:.1f} s old" if old else "",
+        )
+
+    def _age(self, status: Status, clock: int) -> float:
+        """Return how long before a clock time, ns, the newest judged sample was measured, by its stamp, s."""
+        return (clock - status.stamp + self.receiver.shift) / 1e9
 
     def why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
@@ -393,7 +445,8 @@ class Running:
 
     def _report(self) -> None:
         """Publish the diagnostics."""
-        now, prefix = self._node.get_clock().now().nanoseconds, self._node.prefix
+        clock, now = self._node.get_clock().now().nanoseconds, self._now()
+        prefix = self._node.prefix
         if not self._node.inputs.subscriptions:
             hardware = self.receiver.pipeline.config.hardware_id
             lines = [
@@ -406,7 +459,13 @@ class Running:
             lines = describe(
                 *(status, prefix),
                 inputs=[topic.status(now) for topic in self.topics],
-                figures=self._figures(),
+                figures=[
+                    *self._figures(),
+                    (
+                        "age of the last sample (s)",
+                        f"{self._age(status, clock):.3f}" if status.samples else "none",
+                    ),
+                ],
                 silent=self._watchdog.seconds(now) if self._has_no_samples else None,
                 since=[
                     message if sample == channel.since else channel.since
@@ -414,9 +473,9 @@ class Running:
                         status.channels, self._changed, strict=True
                     )
                 ],
-                warning=self._rate_check.words,
+                warning="; ".join(filter(None, self._warnings(status, clock))),
             )
-        self._diagnostics.publish(encode_diagnostics(lines, now))
+        self._diagnostics.publish(encode_diagnostics(lines, clock))
 
     def _figures(self) -> list[tuple[str, str]]:
         median, late = (

@@ -72,7 +72,7 @@ def array(values, labels=(), order="<"):
     for label in labels:
         name = label.encode() + b"\0"
         out += bytes(-len(out) % 4) + struct.pack(order + "I", len(name)) + name
-        out += bytes(-len(out) % 4) + struct.pack(order + "II", 3, 5)
+        out += bytes(-len(out) % 4) + struct.pack(order + "II", 3, 3)
     out += bytes(-len(out) % 4) + struct.pack(order + "II", 0, len(values))
     out += bytes(-len(out) % 8) if values else b""
     return (

@@ -15,7 +15,7 @@ from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.monitor.output import FUSED, INTEGRITY, ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.receiver import Receiver, SilenceClock, Watchdog
 
 STEP = 10_000_000
 
@@ -80,14 +80,46 @@ def test_message_by_message_equals_the_whole_stream(units):
     )
     assert list(ear.events) == list(output.events)
     figures = np.array(
-        [ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity]
+        [ChannelsSource.parse(data, 3 * units + 7)[1] for data in ear.integrity]
     )
     np.testing.assert_array_equal(figures[:, 0], output.statistic)
     np.testing.assert_array_equal(figures[:, 2 : 2 + 3 * units], output.state)
-    np.testing.assert_array_equal(figures[:, -3:], output.level)
+    np.testing.assert_array_equal(figures[:, -5:-2], output.level)
+    assert (figures[:, -2:] @ [10**9, 1] == output.stamp).all()
     assert [*ear.rates()] == output.stamp[output.valid].tolist()
     np.testing.assert_array_equal([*ear.rates().values()], output.rate[output.valid])
     assert offline.core.tobytes() == ear.receiver.pipeline.core.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("rate", "timeout"), [(10.0, 0.4), (39.0, 4 / 39), (100.0, 0.1)]
+)
+def test_slow_samples_are_waited_for_four_intervals_and_fast_ones_as_configured(
+    rate, timeout
+):
+    alignment = Receiver(Pipeline(parallel(2, sample_rate=rate))).source.alignment
+    assert alignment[2] == pytest.approx(1e9 * timeout)
+
+
+def test_silence_is_judged_by_the_steady_clock_where_the_clock_stands():
+    second, clock = 10**9, SilenceClock()
+    watchdog = Watchdog(second // 10)
+    # A simulation at a twentieth of real time, with a clock that steps by 20 ms.
+    for k in range(200):
+        watchdog.check(
+            k, clock.read(5 * second + k // 40 * second // 50, k * second // 100)
+        )
+        assert not clock.standing
+        assert not watchdog.silent
+    # The clock and the messages stand, and later both go on.
+    before, moved = 5 * second + 4 * second // 50, 160 * second // 100
+    for steady, silent in ((1.9, False), (2.05, False), (2.2, True), (9.0, True)):
+        watchdog.check(199, clock.read(before, moved + round(steady * second)))
+        assert watchdog.silent == silent
+        assert clock.standing == (pytest.approx(steady) if steady > 2 else 0)
+    watchdog.check(200, clock.read(before + second, moved + 10 * second))
+    assert not watchdog.silent
+    assert not clock.standing
 
 
 def test_arrays_are_stamped_when_they_arrive_even_by_a_clock_set_back():
@@ -152,7 +184,7 @@ def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     names, thresholds = ("cusum", "guaranteed", "recursive", "likelihood_ratio"), []
     for k, (unit, data) in enumerate(messages(block, 3)):
         if k % 60 == 59:
-            thresholds.append(ChannelsSource.parse(ear.integrity[-1], 14)[1][1])
+            thresholds.append(ChannelsSource.parse(ear.integrity[-1], 16)[1][1])
             pipeline.reconfigure(
                 pipeline.config.replaced({"detector.name": names[k // 60 % 4]})
             )

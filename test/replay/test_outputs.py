@@ -38,11 +38,14 @@ def written(tmp_path_factory, root, flight):
         (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),),
     )
     keep = Keep()
-    with OutputBag(path, config, 6) as bag:
+    with OutputBag(path, config, config.channel_names) as bag:
         summary = replay(*request, sinks=[bag, keep])
     output = keep.output
     integrity = np.column_stack(
-        [output.statistic, output.threshold, output.state, output.level]
+        [
+            *(output.statistic, output.threshold, output.state, output.level),
+            *np.divmod(output.stamp, 10**9),
+        ]
     )
     return path, output, integrity, summary, request
 
@@ -90,11 +93,16 @@ def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
             == -1
         )
         assert message.header.frame_id == "base_link"
-    values = [
-        STORE.deserialize_cdr(data, ARRAY).data
+    told = [
+        STORE.deserialize_cdr(data, ARRAY)
         for _, data in messages["/fdi_node/integrity"]
     ]
-    np.testing.assert_array_equal(values, integrity)
+    np.testing.assert_array_equal([message.data for message in told], integrity)
+    (dimension,) = told[0].layout.dim
+    labels = dimension.label.split(",")
+    assert len(labels) == dimension.size == dimension.stride == integrity.shape[1]
+    assert labels[:3] == ["statistic", "threshold", "state imu_1.x"]
+    assert labels[-2:] == ["stamp [s]", "stamp [ns]"]
     with Recording(bag) as recording:
         originals = defaultdict(list)
         for batch in recording.batches(config.topics):

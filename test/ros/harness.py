@@ -164,7 +164,7 @@ class Listener(Node):
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
-        told = [ChannelsSource.parse(data, 11)[1][2:8] for data in list(self.integrity)]
+        told = [ChannelsSource.parse(data, 13)[1][2:8] for data in list(self.integrity)]
         return np.array(told).astype(int).reshape(-1, 6)
 
     def status(self, name: str) -> DiagnosticStatus:

@@ -4,7 +4,10 @@
 """The live node on real DDS: faults in, rate and diagnostics out, and no message stops it."""
 
 import math
+import signal
 import struct
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -14,7 +17,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue, SetParametersResult
+from rcl_interfaces.msg import ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import (
     DescribeParameters,
     GetParameters,
@@ -22,7 +25,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, healthy, monitoring, struck
-from ros.processes import wait
+from ros.processes import ROOT, wait
 from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
@@ -95,6 +98,30 @@ def test_a_fault_is_isolated_told_at_once_and_reset_and_the_rate_stays_right(
     assert report["imu_1.x"].level == DiagnosticStatus.OK
     assert "imu_2.y" in listener.trigger("reset").message
     assert listener.settle()
+
+
+def test_the_example_subscriber_prints_what_the_monitor_declares(listener) -> None:
+    before = listener.count_subscribers("fdi_node/integrity")
+    words = ["--ros-args", "-r", "integrity:=fdi_node/integrity"]
+    with subprocess.Popen(
+        [sys.executable, ROOT / "examples" / "integrity.py", *words],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as example:
+        try:
+            assert wait(
+                lambda: listener.count_subscribers("fdi_node/integrity") > before
+            )
+            stamps = listener.play(struck(600, 100, seed=4)[1])
+            for line in example.stdout:
+                stamp, channel, state = line.split()
+                if state == "FAULTY":
+                    break
+        finally:
+            example.send_signal(signal.SIGINT)
+    assert channel == "imu_2.y"
+    assert stamps[100] / 1e9 <= float(stamp) + 1e-3 <= stamps[-1] / 1e9
+    assert example.returncode == 0
 
 
 def test_no_message_stops_it_and_no_bad_value_reaches_the_output(listener) -> None:
@@ -251,6 +278,28 @@ def test_each_parameter_has_a_description_a_unit_and_a_range(listener) -> None:
     assert (rate.read_only, timeout.read_only) == (False, True)
     assert "cusum, sequential" in detector.additional_constraints
     assert alarms.integer_range[0].from_value == 1
+
+
+def test_parameters_keep_their_types_whatever_they_are_set_to(listener) -> None:
+    def types(*names):
+        asked = {"names": list(names)}
+        said = listener.call(
+            DescribeParameters, "fdi_node/describe_parameters", **asked
+        )
+        had = listener.call(GetParameters, "fdi_node/get_parameters", **asked)
+        assert [one.type for one in said.descriptors] == [v.type for v in had.values]
+        return [value.type for value in had.values]
+
+    texts, real = ParameterType.PARAMETER_STRING_ARRAY, ParameterType.PARAMETER_DOUBLE
+    names = ("excluded_channels", "bias.max_rest_rate", "imus.delays")
+    expected = [texts, real, ParameterType.PARAMETER_DOUBLE_ARRAY]
+    assert types(*names) == expected
+    rest_rate = TWO_IMUS.bias.max_rest_rate
+    assert listener.set(excluded_channels=[], bias__max_rest_rate=1).successful
+    assert types(*names) == expected
+    assert listener.set(bias__max_rest_rate=rest_rate).successful
+    refused = listener.set(bias__max_rest_rate="fast")
+    assert "bias.max_rest_rate is 'fast', expected a number" in refused.reason
 
 
 def test_what_changes_together_is_taken_over_whole_or_not_at_all(

@@ -212,6 +212,13 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         listener,
         process,
     ):
+        # Without a clock nothing looks healthy, neither while messages come nor after.
+        warned = False
+        while not warned:
+            listener.play(healthy(10)[1])
+            warned = "no time on /clock" in listener.status("monitor").message
+        assert listener.says("monitor", "no sample for")
+        assert listener.status("monitor").level == DiagnosticStatus.STALE
         clock = listener.create_publisher(Clock, "/clock", 10)
         assert wait(lambda: clock.get_subscription_count() == 1)
         origin = 1000 * 10**9
@@ -249,10 +256,16 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         assert only_the_second_is_silent()
         assert listener.says("input imu_2", "silent for")
         end = play(z, end)
-        # The clock stands still: nothing is silent by it, however long the wall waits.
+        # A clock that stands is no health: what is silent then is silent by the wall.
         listener.diagnostics.clear()
-        assert wait(lambda: len(listener.diagnostics) > 1)
-        assert "no sample" not in listener.status("monitor").message
+        assert listener.says("monitor", "no sample for")
+        assert "the clock has stood still for" in listener.status("monitor").message
+        end = play(z[:50], end)
+        assert wait(lambda: "clock" not in listener.status("monitor").message)
+        assert (
+            "[INFO]"
+            in process.said().partition("the clock runs again")[0].splitlines()[-1]
+        )
         # Times before 1970 and after 2038: whoever says them, the monitor goes on and its reports have a stamp.
         for sec, nanosec in ((-5, 0), (2**31 - 1, 2**32 - 1)):
             clock.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))

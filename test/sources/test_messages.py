@@ -17,7 +17,12 @@ from bag.recordings import imu as imu_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError
+from fdi_ros.core.messages import (
+    ChannelsTemplate,
+    ImuTemplate,
+    MessageError,
+    as_batch,
+)
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 
 finite = st.floats(allow_nan=False)
@@ -147,6 +152,11 @@ class TestOneMessage:
                 "an Imu whose frame_id has 4294967295 bytes",
             ),
             (read_6, array[:9], "9 bytes are too few for the array they announce"),
+            (
+                read_6,
+                overwritten(array_bytes([1.0] * 6, ["a"]), 20, "<I", 8),
+                "the strides of the array leave gaps between its values, expected none",
+            ),
             (read_6, array[:60], "60 bytes are too few for 6 values (little endian)"),
             (read_6, overwritten(array, 4, "<I", 2**32 - 1), "4294967295 dimensions"),
             (
@@ -255,6 +265,29 @@ class TestManyMessages:
         assert 7.77 not in decoded.values
         if not decoded.good[1]:
             assert same(decoded.values[1], [0, 0, 0])
+
+    @given(st.integers(0, 6), st.sampled_from("<>"))
+    def test_values_begin_at_the_offset_that_the_layout_gives(
+        self, padding, order
+    ) -> None:
+        values = [9.0] * padding + [1.0, 2.0, 3.0, 4.0]
+        array = overwritten(array_bytes(values, (), order), 8, f"{order}I", padding)
+        assert array_count(*as_batch(array)) == 4
+        assert parse_channels(array, 4) == (1.0, 2.0, 3.0, 4.0)
+
+    @given(orders)
+    def test_an_imu_that_measures_no_rate_says_so_and_is_not_read(self, order) -> None:
+        imu = imu_bytes(5, (1.0, 2.0, 3.0), "frame", order)
+        at = len(imu) - 8 * (9 + 3 + 9)
+        for first, measures in ((-1.0, False), (0.0, True), (1e-6, True)):
+            one = overwritten(imu, at, f"{order}d", first)
+            decoded = decode_imu(*as_batch(one))
+            assert decoded.good[0] == measures
+            assert same(decoded.values[0], [1.0, 2.0, 3.0] if measures else [0] * 3)
+        with pytest.raises(
+            MessageError, match=r"measures no angular rate \(REP-145\)$"
+        ):
+            parse_imu(overwritten(imu, at, f"{order}d", -1.0))
 
     def test_the_first_readable_array_says_how_many_values(self) -> None:
         assert (
