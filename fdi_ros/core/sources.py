@@ -415,7 +415,9 @@ class ChannelsSource(ArraySource):
             at = _count_at(data, start, size)
             if at >= 0:
                 order = "<" if data[start + 1] else ">"
-                padding, count = struct.unpack_from(f"{order}II", data, at - 4)
+                padding, count = struct.unpack_from(
+                    f"{order}II", data[at - 4 : at + 4].tobytes()
+                )
                 return max(0, int(count) - int(padding))
         return 0
 

@@ -291,15 +291,19 @@ def test_parameters_keep_their_types_whatever_they_are_set_to(listener) -> None:
         return [value.type for value in had.values]
 
     texts, real = ParameterType.PARAMETER_STRING_ARRAY, ParameterType.PARAMETER_DOUBLE
-    names = ("excluded_channels", "bias.max_rest_rate", "imus.delays")
+    names = ("excluded_channels", "detector.false_alarms_per_hour", "imus.delays")
     expected = [texts, real, ParameterType.PARAMETER_DOUBLE_ARRAY]
     assert types(*names) == expected
-    rest_rate = TWO_IMUS.bias.max_rest_rate
-    assert listener.set(excluded_channels=[], bias__max_rest_rate=1).successful
+    usual = TWO_IMUS.detector.false_alarms_per_hour
+    assert listener.set(
+        excluded_channels=[], detector__false_alarms_per_hour=1
+    ).successful
     assert types(*names) == expected
-    assert listener.set(bias__max_rest_rate=rest_rate).successful
-    refused = listener.set(bias__max_rest_rate="fast")
-    assert "bias.max_rest_rate is 'fast', expected a number" in refused.reason
+    assert listener.set(detector__false_alarms_per_hour=usual).successful
+    refused = listener.set(detector__false_alarms_per_hour="fast")
+    assert (
+        "detector.false_alarms_per_hour is 'fast', expected a number" in refused.reason
+    )
 
 
 def test_what_changes_together_is_taken_over_whole_or_not_at_all(
