@@ -15,7 +15,6 @@ import time
 from types import FrameType
 
 from fdi_ros.cli import STOPPED
-from fdi_ros.signals import heeded
 
 PATIENCE = 2.0  # s in which further signals do not disturb the end: what is half written is removed
 
@@ -43,8 +42,13 @@ class Stop:
 def fdi() -> int:
     """Run the command line; return its exit code."""
     stop = Stop()
-    stopping = heeded()
-    for number in stopping:
+    # A shell has what it starts in the background ignore the keyboard.
+    heeded = [
+        one
+        for one in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(one) is not signal.SIG_IGN
+    ]
+    for number in heeded:
         signal.signal(number, stop)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
@@ -59,7 +63,7 @@ def fdi() -> int:
     except KeyboardInterrupt:
         return STOPPED
     finally:
-        for number in stopping:
+        for number in heeded:
             # While Python ends, it gives signals their first effect back; what is ignored stays so.
             signal.signal(number, signal.SIG_IGN)
 

@@ -35,8 +35,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     )
     evidence.judged = not math.isnan(now.verdict.statistic)
     evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
-    if settings.estimates:
-        evidence.checked &= core.sample.estimate.checked
+    evidence.checked &= core.sample.estimate.checked
     evidence.held = core.sample.held
     evidence.broken = evidence.repeats = evidence.agrees = clear = 0
     may_return = not settings.latch and core.decision.faulty != 0
@@ -88,9 +87,6 @@ def fill_suspects(core: Core, stuck: int) -> None:
     update_drifted(settings, core.sample, now)
     evidence.certain |= evidence.drifted
     add_stuck(settings, now, stuck)
-    for i in range(n):
-        if verdict.error[i] != 0:
-            core.last_error[i] = verdict.error[i]
     evidence.suspected, evidence.isolated = (
         bits_of(verdict.suspects, n),
         verdict.isolated,
@@ -103,7 +99,7 @@ def fill_suspects(core: Core, stuck: int) -> None:
 def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
     """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
     now.evidence.drifted, estimate = 0, sample.estimate
-    if settings.estimates and settings.max_drift > 0.0 and estimate.known:
+    if settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
             if sample.mask >> i & 1 and bias > settings.max_drift:

@@ -25,7 +25,6 @@ from fdi_ros.core.records import (
 from fdi_ros.core.repeated import is_at_rest
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.core.subsets import fill_rate
-from fdi_ros.model.geometry import MIN_SENSITIVITY
 
 
 @compiled
@@ -40,7 +39,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     update_gain(settings, core.sample.estimate, core.acceleration, now, subset)
     for a in range(3):
         last.rate[a] = now.plain_rate[a]
-    if last.valid and settings.estimates:
+    if last.valid:
         apply_gain(now.gain, n, now.corrected, last.rate)
     update_residuals(settings, now, last)
     update_lag(core)
@@ -49,7 +48,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
             now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance
         )
         if doubtful & now.usable:
-            add_doubt(core, subsets, doubtful & now.usable)
+            add_units(settings, now, last, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
         # The rate is stated for the instant of the earliest unit, and the true one lies
         # anywhere between that and the instant of the latest.
@@ -85,8 +84,7 @@ def choose_fused(
 ) -> int:
     """Channels that are to be fused."""
     usable = now.usable
-    # Methods that judge each sample by itself need no caution.
-    for i in range(settings.n if settings.estimates else 0):
+    for i in range(settings.n):
         if health.returning[i] and subsets[usable & ~(1 << i)].spare:
             usable &= ~(1 << i)
     trusted = usable & ~doubtful
@@ -130,7 +128,7 @@ def update_gain(
     for i in range(n):
         h, rate = sensors.axes[i], now.plain_rate
         now.variance[i] = estimate.variance[i]
-        if not (settings.estimates and estimate.known):
+        if not estimate.known:
             # The sample was not judged: the estimate is of an earlier motion.
             along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
             expected = variance_of(sensors, i, along, acceleration.value)
@@ -138,35 +136,11 @@ def update_gain(
         now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
         for a in range(3):
             now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
-    if settings.estimates and subset.spans:
+    if subset.spans:
         fill_parity(now.parity, sensors, now.fused, now.uncertainty)
         for a in range(3):
             for i in range(n):
                 now.gain[a, i] = now.parity.gain[a, i]
-
-
-@compiled
-def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Add to the covariance what channels under doubt may be wrong by that could not be left out.
-
-    Where units are in doubt as a whole, the rates that would be left without one or the other are as likely as each
-    other; else, where no detector has estimated it, each channel may be off by its difference from the others.
-    """
-    if core.settings.estimates:
-        add_units(core.settings, core.now, core.last, subsets, doubtful)
-        return
-    for i in range(core.settings.n):
-        if doubtful & core.now.fused & (1 << i):
-            doubt = core.last_error[i]
-            if (
-                doubt == 0.0
-                and subsets[core.now.fused].sensitivity[i] > MIN_SENSITIVITY
-            ):
-                # No verdict has estimated it: its difference from the others now.
-                doubt = core.now.tested[i] / subsets[core.now.fused].sensitivity[i]
-            for a in range(3):
-                core.now.others_rate[a] = core.now.gain[a, i] * doubt
-            add_square(core.last.covariance, core.now.others_rate, 1.0)
 
 
 @compiled
@@ -210,8 +184,6 @@ def update_common_error(core: Core) -> None:
     With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G) C (I - H G)'`` the roots of the
     diagonal in ``core.remaining``.
     """
-    if not core.settings.estimates:
-        return
     n, axes, taken = (
         core.settings.n,
         core.settings.sensors.axes,

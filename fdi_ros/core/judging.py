@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The call of the detector: one row of constants and of memory for each set of channels, or one for all."""
+"""The call of a detector: one row of constants and of memory for each set of channels, or one for all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import call, compiled
-from fdi_ros.core.records import Bank, SampleInput, SampleVerdict
+from fdi_ros.core.records import Bank, Core, Current, SampleInput, SampleVerdict
 
 UNPREPARED, REFUSED = (
     -1,
@@ -96,3 +96,47 @@ def judge_sample(
             )
             k += 1
     return True
+
+
+@compiled
+def is_prepared(bank: Bank, mask: int) -> bool:
+    """Whether the constants for a set of channels are prepared, or the method refuses the set."""
+    return bank.takes_any or bank.row[mask] != UNPREPARED
+
+
+@compiled
+def judge_corrected(core: Core, bank: Bank) -> None:
+    """Judge the corrected values by another method than the estimator's own, into ``now.verdict``.
+
+    The method was prepared for the noise expected. Residuals are divided by the root of the excess of the noise of the
+    moment over it, so the method keeps its false-alarm rate. Noise and outliers stay those of the estimator.
+    """
+    now, asked, axes = core.now, core.now.asked, core.settings.sensors.axes
+    scale = math.sqrt(max(core.sample.estimate.excess, 1.0))
+    asked.stamp, asked.mask = core.sample.stamp, core.sample.mask
+    for i in range(core.settings.n):
+        along = (
+            axes[i, 0] * now.rate[0]
+            + axes[i, 1] * now.rate[1]
+            + axes[i, 2] * now.rate[2]
+        )
+        now.scaled[i] = along + (now.corrected[i] - along) / scale
+    judge_sample(bank, asked, now.scaled, now.verdict)
+    for i in range(core.settings.n):
+        now.verdict.error[i] *= scale
+        now.verdict.noise[i] = now.guard.noise[i]
+        now.verdict.outliers[i] = now.guard.outliers[i]
+
+
+@compiled
+def take_verdict(now: Current, n: int) -> None:
+    """Let the verdict of the estimator's own detector be the one that declares."""
+    source, target = now.guard, now.verdict
+    target.statistic, target.threshold = source.statistic, source.threshold
+    target.alarm, target.isolated = source.alarm, source.isolated
+    for i in range(n):
+        target.suspects[i] = source.suspects[i]
+        target.outliers[i] = source.outliers[i]
+        target.error[i] = source.error[i]
+        target.scores[i] = source.scores[i]
+        target.noise[i] = source.noise[i]

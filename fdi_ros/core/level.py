@@ -211,7 +211,7 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
     ):
         for a in range(3):
             last.level[a] = math.inf
-    elif core.settings.estimates:
+    else:
         for a in range(3):
             common = math.sqrt(
                 max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0)

@@ -93,7 +93,7 @@ def process(
     ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and ``integrity`` the messages to be
     published about it.
     """
-    monitor, main = live[0], path[0][0]
+    monitor, main = live[0], path.core[0]
     if not monitor.ready:
         return 0
     sample = monitor.sample

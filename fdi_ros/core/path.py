@@ -3,7 +3,8 @@
 
 """The sample path: one sample through the monitor, in order.
 
-    values -> checks -> bias -> rate -> detector -> stuck -> decision -> fused rate -> states -> protection level
+    values -> checks -> bias -> rate -> estimator and its detector -> other method -> decision -> fused rate -> states
+    -> protection level
 
 `prepare_sample` is the path up to the detector, `conclude_sample` the rest. Between them the sample waits if the
 constants of the detector for just the channels present are still to be prepared, which happens once for each set of
@@ -13,7 +14,7 @@ channels.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +27,14 @@ from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
 from fdi_ros.core.evidence import fill_suspects, gather_evidence
 from fdi_ros.core.fusion import fuse
 from fdi_ros.core.health import FINE, OUT_OF_RANGE, check, leave_flickering
-from fdi_ros.core.judging import judge_sample
+from fdi_ros.core.judging import (
+    is_prepared,
+    judge_corrected,
+    judge_sample,
+    take_verdict,
+)
 from fdi_ros.core.level import update_level
-from fdi_ros.core.records import Core, Current, PathSettings, Sample
+from fdi_ros.core.records import Bank, Core, Current, PathSettings, Sample
 from fdi_ros.core.repeated import all_repeat, update_repeated
 from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
@@ -43,9 +49,17 @@ RAIL_LIMIT = 10.0  # ranges that the detector sees of a value out of range at mo
 WAITING = -1  # instead of a number of events
 
 
-Path = tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]]
-"""What the path works on: the monitor, (1,) `Core`; its detector, (1,) `Bank`; the bytes of the detector's states; all
-sets of channels, (2^n,) `Subset`."""
+class Path(NamedTuple):
+    """What the path works on."""
+
+    core: NDArray[Any]  #: the monitor, (1,) `Core`
+    subsets: NDArray[Any]  #: all sets of channels, (2^n,) `Subset`
+    guard: NDArray[Any]  #: detector that keeps the estimator, (1,) `Bank`
+    guard_memory: NDArray[np.uint8]  #: bytes of its states
+    method: NDArray[
+        Any
+    ]  #: detector whose alarms declare, (1,) `Bank`; the same one, or another
+    method_memory: NDArray[np.uint8]  #: bytes of its states
 
 
 @compiled
@@ -65,7 +79,7 @@ def run(
     ``now.waiting`` is set; if the row before it lacks its level, the channels fused are in ``core.wanted``; or
     ``core.copies.found`` is set.
     """
-    core, count = path[0][0], 0
+    core, count = path.core[0], 0
     for k in range(start, len(samples)):
         if len(events) - count < core.settings.n:
             return k, count, False
@@ -83,20 +97,26 @@ def run(
 @compiled
 def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int) -> int:
     """Work one sample; the output is ``core.last``. Return the number of events, or `WAITING`: then give it again."""
-    core, bank = path[0][0], path[1][0]
+    core, method = path.core[0], path.method[0]
     now = core.now
     if not now.waiting:
         prepare_sample(path, sample)
-    now.waiting = not now.learned_from and not judge_sample(
-        bank, core.sample, now.input, now.verdict
-    )
-    return WAITING if now.waiting else conclude_sample(path, row, events, count)
+    now.waiting = not now.learned_from and not is_prepared(method, core.sample.mask)
+    if now.waiting:
+        return WAITING
+    if not now.learned_from:
+        judge_sample(path.guard[0], core.sample, now.input, now.guard)
+        apply_estimate(core)
+        if core.settings.guard_declares:
+            take_verdict(now, core.settings.n)
+        else:
+            judge_corrected(core, method)
+    return conclude_sample(path, row, events, count)
 
 
 @compiled
-def forget(path: Path) -> None:
-    """Let the detector forget all samples. A loop: the assignment of a slice takes seconds to compile."""
-    bank, memory = path[1][0], path[2]
+def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
+    """Let a detector forget all samples. A loop: the assignment of a slice takes seconds to compile."""
     for k in range(bank.rows * bank.states_size):
         memory[k] = 0
 
@@ -108,7 +128,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     The checks are on the values as delivered, so that what is wrong is met at once; where units are late the
     values judged are those of an earlier instant, of this and earlier samples that were checked, too.
     """
-    core, subsets = path[0][0], path[3]
+    core, subsets = path.core[0], path.subsets
     settings, now, stamp = core.settings, core.now, sample.stamp
     now.evidence.stamp = stamp
     now.evidence.interrupted = (
@@ -138,17 +158,13 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     given.held = (
         core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
     )
-    now.repeated = update_repeated(core) if settings.estimates else 0
+    now.repeated = update_repeated(core)
     given.repeated = now.repeated != 0
-    now.all_repeat = settings.estimates and all_repeat(
-        settings, core.health, now, stamp
-    )
+    given.wants_excess = not settings.guard_declares
+    now.all_repeat = all_repeat(settings, core.health, now, stamp)
     if now.all_repeat:
         given.mask = 0
-    if settings.needs_acceleration:
-        differentiate_rate(core.acceleration, stamp, now.rate)
-        for a in range(3):
-            given.acceleration[a] = core.acceleration.value[a]
+    differentiate_rate(core.acceleration, stamp, now.rate)
 
 
 @compiled
@@ -181,19 +197,20 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 @compiled
 def learn_bias(path: Path, stamp: int, plain: int) -> None:
     """Take a sample for the bias; whether it was taken is in ``now.learned_from``."""
-    core, subsets = path[0][0], path[3]
+    core, subsets = path.core[0], path.subsets
     bias = core.bias
     core.now.learned_from = update_bias(core, subsets, stamp, plain, left_out(core))
-    if core.settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
+    if bias.learning and bias.outcome == NOT_AT_REST:
         begin_in_motion(bias, core.settings.n)
     if not bias.learning:
-        forget(path)
+        forget(path.guard[0], path.guard_memory)
+        forget(path.method[0], path.method_memory)
         begin_bias(core)
 
 
 @compiled
 def apply_estimate(core: Core) -> None:
-    """Correct ``now.corrected`` anew by what the detector has found of the errors of the sensors."""
+    """Correct ``now.corrected`` anew by what the estimator has found of the errors of the sensors."""
     now, estimate = core.now, core.sample.estimate
     for i in range(core.settings.n if estimate.known else 0):
         if math.isfinite(now.input[i]):
@@ -275,15 +292,13 @@ def fill_input(core: Core, out: int) -> None:
 @compiled
 def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> int:
     """Decide, fuse and write events after the detector; the output is ``core.last``. Return the number of events."""
-    core, subsets = path[0][0], path[3]
+    core, subsets = path.core[0], path.subsets
     settings, now, last, verdict = core.settings, core.now, core.last, core.now.verdict
     last.stamp = now.evidence.stamp
     if now.learned_from:
         skip_sample(core)
         return write_events(core, subsets[alive(core)], row, True, events, count)
-    if settings.estimates:
-        apply_estimate(core)
-        update_noisy(settings, now)
+    update_noisy(settings, now)
     fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous
     changed = decide(settings, core.decision, now.evidence)
@@ -294,8 +309,8 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     enough = not changed or subsets[now.usable & ~now.doubtful].spare
     fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
     # What is known of the sensors holds whatever is declared.
-    if changed and not settings.estimates:
-        forget(path)
+    if changed and not settings.guard_declares:
+        forget(path.method[0], path.method_memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(
         core.decision, settings, CHECKED, settings.alarms

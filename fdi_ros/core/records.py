@@ -161,13 +161,14 @@ class Sensors:
 
 @record
 class Estimate:
-    """What a method that estimates the errors of the sensors knows of them in a sample."""
+    """What the estimator knows of the errors of the sensors in a sample."""
 
     known: Flag  # the rest is of this sample
     checked: Mask  # channels of which what is not known hides no fault
     corrected: Channels  # values less what is known of their errors, rad/s
     variance: Channels  # of their noise at the moment, (rad/s)^2
     covariance: Square  # of what is not known of their errors, (rad/s)^2
+    excess: Real  # largest variance of a residual over the one expected, at least 1; only where it is asked for
     bias: Channels  # of each, beyond the one at the start, rad/s
     bias_std: Channels  # standard deviation of that, rad/s
     late: Units  # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
@@ -193,6 +194,7 @@ class SampleInput:
     interrupted: Flag  # there is a hole in the stream before this sample
     held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
     repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
+    wants_excess: Flag  # another method is to judge the corrected values
     estimate: Estimate  # filled by the method, if it estimates the errors of the sensors; until the next one it stands
 
 
@@ -530,11 +532,10 @@ class PathSettings:
     mean_limit: Channels  # largest mean error of a channel that returns, rad/s
     return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
     # Of estimate and fusion:
-    needs_acceleration: Flag
     publish_under_doubt: (
         Flag  # a rate of channels under doubt, where they cannot be left out
     )
-    estimates: Flag  # the detector estimates the errors of the sensors
+    guard_declares: Flag  # the alarms of the estimator's own detector declare, not those of another method
     max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
     risk: Real  # allowed probability of an error above the level at a sample; 0: there is no level
     reach: Real  # standard deviations that it stands for
@@ -583,7 +584,10 @@ class Current:
     growth: (
         Channels  # error variance, with that of the bias that remains, in noise_std^2
     )
-    verdict: SampleVerdict
+    guard: SampleVerdict  # of the estimator's own detector
+    verdict: SampleVerdict  # of the method that declares
+    scaled: Channels  # corrected values with residuals in the noise expected, rad/s
+    asked: SampleInput  # corrected values, where another method declares
     evidence: Evidence
 
 
@@ -608,9 +612,6 @@ class Core:
     decision: Decision
     excluded: Mask  # taken out by the operator
     reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
-    last_error: (
-        Channels  # last estimate of each channel's error that was not zero, rad/s
-    )
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
     samples: Whole  # so far

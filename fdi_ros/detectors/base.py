@@ -91,8 +91,6 @@ class Detector(ABC):
     takes_any: ClassVar[bool] = False
     """One row of constants and one memory serve all sets of channels; else each set has its own."""
     sample_rate = 100.0  #: Hz, of samples without stamps
-    accumulates: ClassVar[bool] = False
-    """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
     def __init__(
         self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]

@@ -41,6 +41,7 @@ from fdi_ros.estimator.blocks import (
     learn,
     predict_innovation_covariance,
     update_angular_acceleration,
+    update_excess,
 )
 from fdi_ros.estimator.delays import transfer_delays, update_time_offsets
 from fdi_ros.estimator.error_states import (
@@ -98,6 +99,7 @@ PAUSE = 5.0
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any,
 calibrated or not."""
+FEWEST_BLOCKS = 3  # in a row from which the acceleration in the middle of one is known
 SHORT = (
     1.0 - 1e-9
 )  # what is shown of the threshold where the sums have reached it, and there is no alarm
@@ -148,10 +150,12 @@ def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
     if sample.mask != kf.mask or sample.beyond != kf.beyond:
         kf.mask, kf.beyond = sample.mask, sample.beyond
         update_weights(params, kf)
+        if sample.wants_excess:
+            update_excess(params, kf)
 
 
 @compiled
-def process_block(params: Constants, state: State) -> None:
+def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     noise, learns = kf.noise, not case.open
@@ -172,7 +176,7 @@ def process_block(params: Constants, state: State) -> None:
     update_shared_level(params, kf)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
-    if kf.blocks < 3:
+    if kf.blocks < FEWEST_BLOCKS:
         return
     kf.unseen = False
     update_angular_acceleration(params, kf)
@@ -197,14 +201,31 @@ def process_block(params: Constants, state: State) -> None:
     if learns and not suspicious and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
         kf.snapshot_at = kf.seconds
         keep_snapshot(params, kf)
-    if params.units > 1 and learns and kf.seconds - kf.taken_off_at > 1.0:
+    if learns:
+        take_delays_off(params, state)
+    predict_innovation_covariance(params, kf)
+    if sample.wants_excess:
+        update_excess(params, kf)
+    if kf.all_blocks % STRIDE == 0:
+        look_for_slow_faults(params, state)
+
+
+@compiled
+def take_delays_off(params: Constants, state: State) -> None:
+    """Take delays that are sure off the values from now on; looked at once a second."""
+    kf = state.estimator
+    if params.units > 1 and kf.seconds - kf.taken_off_at > 1.0:
         kf.taken_off_at = kf.seconds
         if transfer_delays(params, kf):
-            # What was measured before is of other instants.
+            # Evidence so far is of other instants.
             forget_evidence(params, state)
-    predict_innovation_covariance(params, kf)
-    searches = kf.judged and not case.open and kf.samples >= case.retry
-    if searches and kf.all_blocks % STRIDE == 0:
+
+
+@compiled
+def look_for_slow_faults(params: Constants, state: State) -> None:
+    """Look for faults that the states show and the sums do not."""
+    kf, case = state.estimator, state.case
+    if kf.judged and not case.open and kf.samples >= case.retry:
         look_for_drift(params, state)
         look_for_change_in_hole(params, state)
 
@@ -245,6 +266,10 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     update_time_offsets(params, kf)
     correct_sample(params, kf, sample.z)
     watch_for_motion(params, kf)
+    if kf.blocks < FEWEST_BLOCKS and kf.noise.regime == MOTION:
+        # No block says yet how the body moves, but the sample does.
+        project(params.layout, kf.states, kf.at)
+        update_weights(params, kf)
     update_statistics(params, kf)
     if kf.judged == 0:
         update_shared(params, kf)
@@ -300,6 +325,7 @@ def fill_verdict(
                 sample.estimate.covariance[i, i] + variance
             ):
                 sample.estimate.covariance[i, i] += innovation * innovation
+    sample.estimate.excess = kf.excess
     sample.estimate.behind, sample.estimate.spread = kf.behind, kf.spread
     sample.estimate.checked = 0 if is_blind(kf) else kf.checked
     for u in range(params.units):
@@ -346,7 +372,7 @@ def judge(
     update_shape(params, kf)
     process_sample(params, state, sample)
     if add_sample(params, kf, sample.z, seconds):
-        process_block(params, state)
+        process_block(params, state, sample)
         # Its covariance is that of now.
         correct_sample(params, kf, sample.z)
     sample.estimate.known = True
@@ -408,7 +434,6 @@ class Sequential(Detector):
     Constants = Constants
     State = State
     judge = judge
-    accumulates = True
     takes_any = True
 
     def __init__(

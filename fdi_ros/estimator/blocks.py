@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
+from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, fill_parity
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
@@ -34,6 +34,7 @@ from fdi_ros.estimator.shared_noise import UNEQUAL
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
+LEAST_REDUNDANCY = 1e-3  # share of a channel's own error in its residual, below which no method judges it
 PEAK = 0.8  # what a peak of motion fades to with every block: gone in half a second
 
 
@@ -292,3 +293,26 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
         kf.at.covariance[i, i] += kf.peak_extra[i]
     kf.speed_squared = kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     update_weights(params, kf)
+
+
+@compiled
+def update_excess(params: Constants, kf: Estimator) -> None:
+    """Find how much more residuals vary than the noise expected makes them, where they do so most.
+
+    With A of the noise expected and S the covariance of the noise of the moment, of vibration that lasts and of what is
+    not known of the states: the largest of ``(A S A)_ii / A_ii``, and no less than 1.
+    """
+    n, information = params.sensors.n, kf.expected_parity.information
+    fill_parity(kf.expected_parity, params.sensors, kf.mask, params.expected)
+    kf.excess = 1.0
+    for i in range(n):
+        if information[i, i] * params.expected[i] < LEAST_REDUNDANCY:
+            continue
+        variance = 0.0
+        for j in range(n):
+            for k in range(n):
+                together = kf.at.covariance[j, k] + kf.shared.line[j, k]
+                if j == k:
+                    together += kf.noise.now.sample[j]
+                variance += information[i, j] * together * information[i, k]
+        kf.excess = max(kf.excess, variance / information[i, i])

@@ -158,8 +158,10 @@ class Estimator:
     checked: (
         Mask  # of them, those of which what is not known of the states hides no fault
     )
+    excess: Real  # largest variance of a residual over the one expected, at least 1
     speed_squared: Real  # of the rate of the last block, (rad/s)^2
     parity: Parity  # of a sample
+    expected_parity: Parity  # of a sample in the noise expected
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
     taught: States  # share of its gain that each state takes from a block

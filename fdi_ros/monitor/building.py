@@ -25,7 +25,7 @@ from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import FalseAlarmRate, NoiseModel, normal_isf
+from fdi_ros.model.noise import MAX_RUN_LENGTH, FalseAlarmRate, NoiseModel, normal_isf
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
@@ -100,23 +100,52 @@ _RATES = {"false_alarms_per_hour", "false_alarm_probability", "run_length"}
 """Options in which one false-alarm rate is stated."""
 
 
+GUARD = "sequential"
+"""Name of the detector that keeps the estimator of the errors of the sensors, whichever method declares."""
+
+
+def build_guard(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
+    """Detector that keeps the estimator."""
+    detector = config.detector
+    if detector.name != GUARD and detector.false_alarm_probability > 0:
+        # Another method may be asked for rarer alarms than any run length states.
+        rarest = max(detector.false_alarm_probability, 1.0 / MAX_RUN_LENGTH)
+        config = config.replaced({"detector.false_alarm_probability": rarest})
+    return _build(GUARD, config, geometry, noise)
+
+
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
-    """Detector of a configuration, with those of the options that it takes."""
+    """Detector that declares, by a configuration.
+
+    A method other than `GUARD` is given corrected values, and the noise of the moment with what is not known of scale
+    and timing (`judge_corrected`): it is built for the additive noise alone.
+    """
+    if config.detector.name != GUARD:
+        noise = NoiseModel(
+            noise.noise_std, bound=noise.bound, bias_std=noise.bias_std
+        ).for_channels(geometry.n)
+    return _build(config.detector.name, config, geometry, noise)
+
+
+def _build(
+    name: str, config: Config, geometry: Geometry, noise: NoiseModel
+) -> Detector:
+    """Build a detector by name, with those of the options that it takes."""
     settings = config.detector
-    accepted = accepted_options(detector_class(settings.name))
+    accepted = accepted_options(detector_class(name))
     known = {field.name for field in fields(settings)} - _RATES
     options: dict[str, Any] = {
-        name: getattr(settings, name) for name in accepted if name in known
+        option: getattr(settings, option) for option in accepted if option in known
     }
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
     errors = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
-    options |= {name: value for name, value in errors.items() if name in accepted}
+    options |= {option: value for option, value in errors.items() if option in accepted}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     if options.get("tolerance") != "paper":
         options |= _false_alarm_rate(config, "run_length" in accepted).as_options(
             accepted
         )
-    return create_detector(settings.name, geometry, noise, **options)
+    return create_detector(name, geometry, noise, **options)
 
 
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
@@ -144,15 +173,9 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     """Set in core (1,) all that may change at run time: the rule of decision, what is followed, what is withheld."""
     settings, rule = core["settings"], config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
-    settings["estimates"] = detector.takes_any
-    if not detector.takes_any:
-        # What another detector had found of the sensors is taken off no longer.
-        core["sample"]["estimate"], core["correction"] = 0, 0.0
+    settings["guard_declares"] = detector.name == GUARD
     settings["by_evidence"] = rule == "evidence" or (
-        rule == "auto" and detector.accumulates
-    )
-    settings["needs_acceleration"] = (
-        bool(detector.noise.timing_std.any()) or detector.accumulates
+        rule == "auto" and detector.name == GUARD
     )
 
 

@@ -31,10 +31,12 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import spans_space
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import (
+    GUARD,
     alarm_probability,
     build_core,
     build_detector,
     build_geometry,
+    build_guard,
     build_noise,
     suit_detector,
 )
@@ -73,7 +75,10 @@ class Pipeline:
         self._events = allocate(EventRow, EVENTS)
         self._last_stamp = self.core["last_stamp"]
         self._in_flight = False
+        self.guard: Detector
+        """Detector that keeps the estimator."""
         self.detector: Detector
+        """Detector whose alarms declare: the guard, or another method on the corrected values."""
         self.integrity: Integrity
         self._equip(config, None)
 
@@ -135,7 +140,8 @@ class Pipeline:
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias, counters and copies stay."""
         declared = clear_declarations(self.core)
-        self.detector.clear(declared)
+        for detector in self.detectors:
+            detector.clear(declared)
 
     def restart(self) -> None:
         """Forget all samples, as if the monitor had just been built with the settings that it has now."""
@@ -143,7 +149,8 @@ class Pipeline:
         self.core[:] = build_core(self.config, self.geometry, self.noise)
         self.core["excluded"] = excluded
         suit_detector(self.core, self.config, self.detector)
-        self.detector.reset()
+        for detector in self.detectors:
+            detector.reset()
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked and there is no rate."""
@@ -170,7 +177,12 @@ class Pipeline:
     def status(self) -> Status:
         """Snapshot after the last sample."""
         return status_of(
-            self.core[0], self.subsets, self.detector, self.integrity, self.config
+            self.core[0],
+            self.subsets,
+            self.guard,
+            self.detector,
+            self.integrity,
+            self.config,
         )
 
     def prepare(self) -> None:
@@ -189,13 +201,20 @@ class Pipeline:
         if core["copies"]["found"]:
             core["copies"]["found"] = False
             clear_declarations(self.core)
-            self.detector.reset()
+            for detector in self.detectors:
+                detector.reset()
             begin_bias(core)
         if core["now"]["waiting"]:
             self.detector.prepare(int(core["sample"]["mask"]))
         if core["wanted"]:
             self.integrity.fill(self.subsets, int(core["wanted"]))
             update_level(core, self.subsets)
+
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """The guard, and the method that declares where it is another one."""
+        own = self.detector is self.guard
+        return (self.guard,) if own else (self.guard, self.detector)
 
     def _equip(self, config: Config, before: Config | None) -> None:
         """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""
@@ -218,23 +237,32 @@ class Pipeline:
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
             with reported(f"the sample path and {config.detector.name}"):
-                detector = build_detector(config, self.geometry, self.noise)
-                _ = detector.bank
+                guard = build_guard(config, self.geometry, self.noise)
+                own = config.detector.name == GUARD
+                detector = (
+                    guard if own else build_detector(config, self.geometry, self.noise)
+                )
+                _ = guard.bank, detector.bank
         else:
-            detector = self.detector
+            guard, detector = self.guard, self.detector
         if before is None or alarm_probability(config) != alarm_probability(before):
             self.integrity = Integrity(
                 config.integrity, alarm_probability(config), self.geometry, self.noise
             )
             self.subsets["has_level"] = False
-        if self.core["samples"][0] and detector.takes_any and self.detector.takes_any:
+        if before is not None and guard is not self.guard:
             # What was learned of the sensors holds for another threshold as well.
-            detector.states[:] = self.detector.states
-            detector.clear()
-        elif before is not None:
-            detector.reset()
-        self.detector = detector
-        self.path: Path = (self.core, detector.bank, detector.memory, self.subsets)
+            guard.states[:] = self.guard.states
+            guard.clear()
+        self.guard, self.detector = guard, detector
+        self.path = Path(
+            self.core,
+            self.subsets,
+            guard.bank,
+            guard.memory,
+            detector.bank,
+            detector.memory,
+        )
         self.core["excluded"] = mask_of(np.flatnonzero(excluded))
         self.core["now"]["waiting"] = False
         suit_detector(self.core, config, detector)

@@ -20,6 +20,7 @@ from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.live import MORE, NEVER, process
 from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
+from fdi_ros.core.path import Path
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.core.sources import SOURCES, Source, source_of
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
@@ -213,14 +214,14 @@ class Receiver:
 
     def warm(self, kind: Source | type[Source]) -> None:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
-        path: Any = tuple(one.copy() for one in self.pipeline.path)
+        path = Path(*(one.copy() for one in self.pipeline.path))
         aside: Any = tuple(one.copy() for one in self._records)
         kind.receive(self.alignment.rows.copy(), self.live.copy(), 0, _NOTHING, 0)
         process(path, *aside)
-        self.encoder.fill(INTEGRITY, path[0][0]["last"])
+        self.encoder.fill(INTEGRITY, path.core[0]["last"])
         self.alignment.is_live(0)
         _ = self.alignment.are_parted
-        clear_declarations(path[0])
+        clear_declarations(path.core)
 
 
 _FEW = 5  # channels for a method that does not take six

@@ -77,7 +77,7 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
         "bias": dict(zip(names, bias["value"][: len(names)].tolist(), strict=True))
         if learned
         else None,
-        "errors": _errors(pipeline.detector) if learned else None,
+        "errors": _errors(pipeline.guard) if learned else None,
         "in_motion": bool(bias["outcome"] == IN_MOTION),  # biases as given
         "known": [names[i] for i in members(int(bias["known"]))],
         "declared": {
@@ -91,8 +91,8 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _errors(detector: Detector) -> dict[str, Array] | None:
-    """Return what a detector has estimated of ``ERROR_KINDS``, (N,), (N, N), and delays taken off, s; None: nothing."""
-    if not detector.takes_any or not detector.states[0]["begun"]:
+    """Return what the estimator knows of ``ERROR_KINDS``, (N,), (N, N), and delays taken off, s; None: nothing."""
+    if not detector.states[0]["begun"]:
         return None
     estimator, count = (
         detector.states[0]["estimator"],
@@ -129,7 +129,7 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
     """State from what a file holds, if it fits and is plausible; else a refusal, or one of `DAMAGED`."""
     names, detector, settings = (
         pipeline.channel_names,
-        pipeline.detector,
+        pipeline.guard,
         pipeline.config.bias,
     )
     faulty, ambiguous = (
@@ -157,20 +157,19 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
         raise ValueError
     state["bias"] = dict(zip(names, values.tolist(), strict=True))
     off, bound = values - np.array(settings.fixed or 0.0), settings.max_rest_rate
-    if detector.takes_any and saved["errors"] is not None:
+    if saved["errors"] is not None:
         state["errors"] = _parsed_errors(saved["errors"], detector)
     if (largest := float(np.abs(off).max())) > bound:
         raise RefusalError(
             f"a bias is {largest:.3g} rad/s off the one expected, at most {bound:g} (bias.max_rest_rate)"
         )
-    if detector.takes_any:
-        n = len(names)
-        _check(
-            state["errors"] or {"value": np.zeros(n), "covariance": np.zeros((n, n))},
-            detector,
-            off,
-            settings,
-        )
+    n = len(names)
+    _check(
+        state["errors"] or {"value": np.zeros(n), "covariance": np.zeros((n, n))},
+        detector,
+        off,
+        settings,
+    )
     return state
 
 
@@ -262,7 +261,7 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
     if state["errors"] is not None:
         # Known as well as their walk since then leaves them.
         detector, (value, covariance, late) = (
-            pipeline.detector,
+            pipeline.guard,
             state["errors"].values(),
         )
         detector.states["restored"] = True

@@ -182,11 +182,16 @@ class Status:
 def status_of(
     core: Any,
     subsets: NDArray[Any],
+    guard: Detector,
     detector: Detector,
     integrity: Integrity,
     config: Config,
 ) -> Status:
-    """Snapshot of a monitor after its last sample, from its record and what every set of channels can do, (2^n,)."""
+    """Snapshot of a monitor after its last sample.
+
+    ``subsets`` (2^n,): what every set of channels can do; ``guard``: detector that keeps the estimator; ``detector``:
+    the one that declares.
+    """
     geometry = detector.geometry
     names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
     begun, state = bool(core["samples"]), core["state"][:n]
@@ -200,7 +205,7 @@ def status_of(
     )
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
-    late, late_std = _delays(detector, begun)
+    late, late_std = _delays(guard, begun)
     return Status(
         config=config,
         stamp=int(last["stamp"]) if begun else 0,
@@ -225,23 +230,19 @@ def status_of(
         )
         if valid
         else NO_LEVEL,
-        units=_units(core, detector, late, late_std),
+        units=_units(core, guard, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
-        errors=_errors(detector, begun),
+        errors=_errors(guard, begun),
         names_rest_on=rests_on,
         copies=_copies(core, geometry, config),
-        apart=_apart(detector, core),
+        apart=_apart(guard, core),
     )
 
 
 def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     health, state = core["health"], ChannelState(core["state"][i])
-    count, begun, followed = (
-        health["counts"][:, i],
-        bool(core["samples"]),
-        bool(core["settings"]["estimates"]),
-    )
+    count, begun = health["counts"][:, i], bool(core["samples"])
     return ChannelStatus(
         name=names[i],
         state=state,
@@ -265,9 +266,9 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
         drift=float(core["sample"]["estimate"]["bias"][i]),
         start_bias=float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
-        bias_std=float(core["remaining"][i]) if followed else math.nan,
+        bias_std=float(core["remaining"][i]),
         noise=float(core["now"]["verdict"]["noise"][i]),
-        noisy=followed and is_in(i, int(core["now"]["noisy"])),
+        noisy=is_in(i, int(core["now"]["noisy"])),
     )
 
 
@@ -314,13 +315,13 @@ def _unit_names(geometry: Geometry) -> list[str]:
     return [geometry.unit_of[channels[0]] for channels in geometry.units]
 
 
-def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
+def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
     """How late each unit is against each other one, and its standard deviation, (units, units) s; (0, 1): not known."""
-    units = len(detector.geometry.units)
-    if units < 2 or not detector.takes_any or not begun:
+    units = len(guard.geometry.units)
+    if units < 2 or not begun:
         return np.zeros((0, 1)), np.zeros((0, 1))
-    estimator = detector.states[0]["estimator"]
-    places = [place for (place,) in places_of("delay", detector.geometry.n, units)]
+    estimator = guard.states[0]["estimator"]
+    places = [place for (place,) in places_of("delay", guard.geometry.n, units)]
     value, covariance = estimator["late"][:units].copy(), np.zeros((units, units))
     value[1:] += estimator["states"]["x"][places]
     covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
@@ -333,13 +334,13 @@ def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
 
 
 def _units(
-    core: Any, detector: Detector, late: Array, late_std: Array
+    core: Any, guard: Detector, late: Array, late_std: Array
 ) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
-    geometry, measured = detector.geometry, len(late) > 0
+    geometry, measured = guard.geometry, len(late) > 0
     names = _unit_names(geometry)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
-    off = detector.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
+    off = guard.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
     return tuple(
         UnitStatus(
             names[u],
@@ -369,13 +370,13 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     )
 
 
-def _errors(detector: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
-    if not detector.takes_any or not begun:
+def _errors(guard: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
+    if not begun:
         return ()
     estimator, layout, names = (
-        detector.states[0]["estimator"],
-        detector.constants[0]["layout"],
-        detector.geometry,
+        guard.states[0]["estimator"],
+        guard.constants[0]["layout"],
+        guard.geometry,
     )
     states, units, found = estimator["states"], _unit_names(names), []
     prior = np.sqrt(
@@ -407,19 +408,15 @@ def _errors(detector: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
     return tuple(found)
 
 
-def _apart(detector: Detector, core: Any) -> ApartStatus | None:
+def _apart(guard: Detector, core: Any) -> ApartStatus | None:
     """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
-    geometry, group = detector.geometry, set(members(int(core["group"])))
-    case, found, largest = (
-        detector.states[0]["case"] if detector.takes_any else None,
-        None,
-        0.0,
-    )
+    geometry, group = guard.geometry, set(members(int(core["group"])))
+    case, found, largest = guard.states[0]["case"], None, 0.0
     for a, b in lone_pairs(geometry) if group else ():
         if not group.issuperset((a, b)):
             continue
         size, std = abs(float(core["error"][b])), math.nan
-        if case is not None and case["open"]:
+        if case["open"]:
             # What the detector explains: the mean since the onset, with all that is not known of it.
             axes, mean, covariance = (
                 geometry.axes,

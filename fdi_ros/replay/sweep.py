@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
+from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import FAULT_KINDS
@@ -228,9 +229,8 @@ class Onset:
     at: float  # s from the first sample
     origin: int  # stamp of the first sample, ns
     core: NDArray[Any]  # (1,) `fdi_ros.core.records.Core`
-    states: dict[
-        int, NDArray[Any]
-    ]  # memory of the detector for each set of channels, by its bits
+    states: list[dict[int, NDArray[Any]]]
+    """Memory of each detector of the monitor for each set of channels, by its bits."""
     block: Block  # samples from some before the onset to the end of the watch
     row: int  # first sample of these that is faulty
 
@@ -253,18 +253,23 @@ def onsets_of(
     lead: int = LEAD,
 ) -> Iterator[Onset]:
     """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
-    walk, detector, done = Walk(pipeline), pipeline.detector, 0
+    walk, done = Walk(pipeline), 0
     for at in times:
         rows = _rows_at(block, at, watch)
         walk.take(block[done : rows.start])
         done, first = rows.start, max(0, rows.start - lead)
-        own = detector.bank["row"][0]
-        states = {
-            int(mask): detector.states[own[mask]].copy()
-            for mask in np.flatnonzero(own >= 0)
-        }
+        states = [_memory_of(detector) for detector in pipeline.detectors]
         part, row = block[first : rows.stop], rows.start - first
         yield Onset(at, int(block.stamp[0]), pipeline.core.copy(), states, part, row)
+
+
+def _memory_of(detector: Detector) -> dict[int, NDArray[Any]]:
+    """Memory of a detector for each set of channels that was met, by its bits."""
+    rows = detector.bank["row"][0]
+    return {
+        int(mask): detector.states[rows[mask]].copy()
+        for mask in np.flatnonzero(rows >= 0)
+    }
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
@@ -272,14 +277,14 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
 
     Returned is what it says of the samples from there on.
     """
-    detector = pipeline.detector
-    # Sets that were met later are as if they had just been prepared.
-    detector.states[: int(detector.bank["rows"][0])] = np.zeros(
-        (), dtype=detector.states.dtype
-    )
-    for mask, state in onset.states.items():
-        detector.prepare(mask)
-        detector.states[int(detector.bank["row"][0, mask])] = state
+    for detector, states in zip(pipeline.detectors, onset.states, strict=True):
+        # Sets that were met later are as if they had just been prepared.
+        detector.states[: int(detector.bank["rows"][0])] = np.zeros(
+            (), dtype=detector.states.dtype
+        )
+        for mask, state in states.items():
+            detector.prepare(mask)
+            detector.states[int(detector.bank["row"][0, mask])] = state
     pipeline.core[:] = onset.core
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(
         onset.block

