@@ -28,10 +28,16 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from fdi_ros.bag.flight_log import FlightLog, ImuSamples, Portion, Source, imu_samples
-from fdi_ros.bag.raw import MOST_SHOWN
+from fdi_ros.bag.raw import MOST_SHOWN, Damage
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
-from fdi_ros.system.files import CSV_LINE_BYTES, EARLIEST
+from fdi_ros.system.files import (
+    CSV_COLUMNS,
+    CSV_LINE_BYTES,
+    EARLIEST,
+    NAME,
+    open_regular,
+)
 from fdi_ros.system.text import shown
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -50,12 +56,12 @@ _RATE_UNITS = {
     "dps": _DEGREES,
 }
 _UNIT = re.compile(
-    r"[ _]*[\[(]([^\d\])][^\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
+    r"[\[(]([^\d\[(\])][^\[(\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
 )
 _TIME = re.compile(
     r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)"
 )
-_AXIS = re.compile(r"(.*?)[._ ]*(?:([xyz])|\[([012])\])[._ ]*(\d*)")
+_AXIS = re.compile(r"(?:([xyz])|\[([012])\])[._ ]*(\d*)$")
 _GYRO = re.compile(r"gyr|omega|angular_?vel|(^|[._ \d])[gw]\d*$")
 _OTHER = re.compile(
     r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$"
@@ -85,10 +91,11 @@ class CsvLog(FlightLog):
     )
     one_imu = "this table has one IMU ({}): nothing to compare it with"
     slowest = 5.0
+    first = 0  #: number of the first IMU
 
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
-        delimiter, columns = find_columns(self.file, self.note)
+        delimiter, columns = find_columns(self.file, self.note, self.first)
         offset, bad, rest = self.file.tell(), 0, b""
         while rest or offset < self.end:
             data = rest + self.file.read(
@@ -128,7 +135,7 @@ class CsvLog(FlightLog):
                         1.0,
                     )
                     columns = columns._replace(tick=tick)
-                samples = _samples(table[good], ends[used][good], columns)
+                samples = _samples(table[good], ends[used][good], columns, self.first)
             self.counts["lines"] += len(used)
             offset, rest = offset + size, b"" if final else data[size:]
             yield samples, offset / self.end
@@ -138,10 +145,36 @@ class CsvLog(FlightLog):
             self.note(f"{bad} lines without a time were left out")
 
 
-def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Columns]:
-    """Return what stands between columns, and those that are read, and go behind the line of names.
+class CsvUnit(CsvLog):
+    """An open table of one IMU, whose others are in other tables of the same folder."""
 
-    `BagError` if there is no such line, or it has no columns of gyros.
+    fewest_imus = 1
+
+    def __init__(self, path: Path, damage: Damage, most: int, number: int) -> None:
+        self.first = number
+        super().__init__(path, damage, most)
+        if len(self.topics) > 1:
+            self.close()
+            raise BagError(
+                f"{path} holds {len(self.topics)} IMUs, so it is a recording of its own:"
+                " name the file, or run fdi fleet on the folder"
+            )
+
+
+def unit_numbers(paths: Sequence[Path]) -> list[int]:
+    """Return a number for the IMU of each table: the last one in each name, if all differ."""
+    found = [re.findall(r"[0-9]{1,3}", path.stem)[-1:] for path in paths]
+    numbers = [int(one[0]) for one in found if one]
+    return numbers if len(set(numbers)) == len(paths) else list(range(len(paths)))
+
+
+def find_columns(
+    file: BinaryIO, note: Callable[[str], None], first: int = 0
+) -> tuple[str, Columns]:
+    """Return the delimiter and the columns to read; the file then stands behind the names.
+
+    ``first``: number of the first IMU. `BagError` if no line holds names, or none is of a
+    gyro.
     """
     file.seek(0)
     for _ in range(64):
@@ -155,18 +188,30 @@ def find_columns(file: BinaryIO, note: Callable[[str], None]) -> tuple[str, Colu
         name.strip().strip('"')
         for name in line.lstrip("\ufeff# ").strip().split(delimiter)
     ]
+    if len(names) > CSV_COLUMNS:
+        raise BagError(
+            f"{file.name} has {len(names)} columns, expected at most {CSV_COLUMNS}"
+        )
+    if (longest := max(map(len, names))) > NAME:
+        raise BagError(
+            f"{file.name} has a column name of {longest} characters, expected at most"
+            f" {NAME}"
+        )
     if np.isfinite([_number(names, k) for k in range(len(names))]).all():
         raise BagError(
             f"{file.name} has no names of columns: its first line holds numbers. Put a line of names before"
             f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
         )
-    return delimiter, _columns(file, names, note)
+    return delimiter, _columns(file, names, note, first)
 
 
 def _columns(
-    file: BinaryIO, names: Sequence[str], note: Callable[[str], None]
+    file: BinaryIO, names: Sequence[str], note: Callable[[str], None], first: int
 ) -> Columns:
-    """Choose the columns, and say which; `BagError` if there are none, or ``columns.yaml`` asks for others."""
+    """Choose the columns and note them.
+
+    `BagError` if there are none, or ``columns.yaml`` asks for others.
+    """
     path = Path(file.name).parent / COLUMNS
     told = read_yaml(path, "file", BagError) if path.exists() else {}
     if not isinstance(told, dict) or set(told) - {
@@ -176,7 +221,7 @@ def _columns(
         "imus",
     }:
         raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
-    imus = told.get("imus", _imus(names))
+    imus = told["imus"] if "imus" in told else _imus(names, note)
     if not isinstance(imus, list) or any(
         not isinstance(imu, list) or len(imu) != 3 for imu in imus
     ):
@@ -200,7 +245,9 @@ def _columns(
         _factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x)
         for x, _, _ in imus
     ]
-    said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
+    said = "; ".join(
+        f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus, first)
+    )
     stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
     unit = (
         " in deg/s"
@@ -225,12 +272,21 @@ def has_gyros(file: BinaryIO) -> bool:
     return True
 
 
+def is_table_of_gyros(path: Path) -> bool:
+    """Whether a file is a table with columns of gyros."""
+    try:
+        with open_regular(path) as file:
+            return has_gyros(file)
+    except OSError:
+        return False
+
+
 def _split(name: str) -> tuple[str, str]:
     """Return a name in small letters without its unit, and the unit, empty if there is none."""
     name = name.lower()
     unit = _UNIT.search(name)
     return (
-        (name[: unit.start()], next(filter(None, unit.groups())).strip())
+        (name[: unit.start()].rstrip(" _"), next(filter(None, unit.groups())).strip())
         if unit
         else (name, "")
     )
@@ -245,27 +301,39 @@ def _factor(unit: str, known: dict[str, float], default: float, name: str) -> fl
     return known.get(unit, default)
 
 
-def _imus(names: Sequence[str]) -> list[list[str]]:
-    """Return the columns of each three axes whose names are those of gyros; or of all that may be, if none say so."""
+def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
+    """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
+
+    A gyro that lacks an axis is noted and left out.
+    """
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
-        match = _AXIS.fullmatch(_split(name)[0])
-        if match and not _TIME.fullmatch(_split(name)[0]):
-            axis = match[2] or "xyz"[int(match[3])]
-            groups.setdefault((match[1], match[4]), {}).setdefault(axis, name)
+        plain = _split(name)[0]
+        match = _AXIS.search(plain)
+        if match and not _TIME.fullmatch(plain):
+            axis = match[1] or "xyz"[int(match[2])]
+            head = plain[: match.start()].rstrip("._ ")
+            groups.setdefault((head, match[3]), {}).setdefault(axis, name)
     whole = {
         key: [axes[axis] for axis in "xyz"]
         for key, axes in groups.items()
         if len(axes) == 3
     }
-    gyros = [
-        axes
-        for (head, _), axes in whole.items()
-        if _GYRO.search(head) and "cov" not in head
-    ]
+    for key, axes in groups.items():
+        if key not in whole and _is_gyro(key[0]):
+            note(
+                f"{' and '.join(axes.values())} {'is' if len(axes) == 1 else 'are'} left"
+                f" out: no column for {' and '.join(sorted(set('xyz') - set(axes)))}"
+            )
+    gyros = [axes for (head, _), axes in whole.items() if _is_gyro(head)]
     return gyros or [
         axes for (head, _), axes in whole.items() if not _OTHER.search(head)
     ]
+
+
+def _is_gyro(head: str) -> bool:
+    """Whether a name without its axis is that of a gyro."""
+    return _GYRO.search(head) is not None and "cov" not in head
 
 
 def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
@@ -303,7 +371,7 @@ def _number(cells: Sequence[str], column: int) -> float:
 
 
 def _samples(
-    table: Array, end: Int, columns: Columns
+    table: Array, end: Int, columns: Columns, first: int
 ) -> list[tuple[Source, ImuSamples]]:
     """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at places in the file (k,)."""
     # What no date is, no time is either; it is left out as impossible.
@@ -314,5 +382,7 @@ def _samples(
     for k, factor in enumerate(columns.factors):
         rate = table[:, 1 + 3 * k : 4 + 3 * k] * factor
         measured = ~np.isnan(rate).all(axis=1)
-        found.append((Source(KIND, k), imu_samples(stamp, rate, end=end)[measured]))
+        found.append(
+            (Source(KIND, first + k), imu_samples(stamp, rate, end=end)[measured])
+        )
     return found

@@ -37,6 +37,7 @@ SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
 FLU = np.array([1.0, -1.0, -1.0])  # from FRD
 _FEWEST = 20  # samples by which the rate of a source can be judged
+_FEWEST_COARSE = 3  # means of a coarse check: the shortest log has few
 _TOLERANCE = 0.95  # of that rate; clocks and loggers are not exact
 _MAX_INTERVAL_RATIO = 1.5
 """Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
@@ -49,7 +50,6 @@ _MAX_TIME_STEP = 10_000_000  # us; a sample that far from those logged before an
 _TOGETHER = (
     1 << 10
 )  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
-_FEWEST_IMUS = 2  # one has nothing to be compared with
 _MOST_COMPARED = 16  # instances of one kind, more than any autopilot has, that are looked at for copies
 _MOST_NAMES = 6  # messages that are named of a log without IMUs
 _MOST_TEXTS = 1000  # texts of a log that are kept: the first ones
@@ -95,6 +95,7 @@ class Track:
     """What was seen of one source: how fast it is logged, and where its time steps back for good."""
 
     slowest: float  # samples per second that it must be logged at
+    fewest: int = _FEWEST  # samples by which its rate can be judged
     count: int = 0
     fast: int = 0  # samples that follow the one before without a gap
     fast_time: int = 0  # us between these and the ones before
@@ -157,7 +158,7 @@ class Track:
     @property
     def fast_enough(self) -> bool:
         """Whether its rate can be judged and is high enough, in bursts at least."""
-        return self.count >= _FEWEST and self.rate >= _TOLERANCE * self.slowest
+        return self.count >= self.fewest and self.rate >= _TOLERANCE * self.slowest
 
     @property
     def usable(self) -> bool:
@@ -189,6 +190,7 @@ class FlightLog(BagFile):
     ]  # sentence for a log of a single IMU, with a place for what of it is logged
     slowest: ClassVar[float] = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+    fewest_imus: ClassVar[int] = 2  # one has nothing to be compared with
     coarse: ClassVar[str] = (
         ""  # kind of message with means of the rate, read where nothing better is there
     )
@@ -208,6 +210,8 @@ class FlightLog(BagFile):
             self.close()
             raise
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
+        if self.status:
+            self.note(self.status)
         self._shift = (
             0 if dated else self.start_utc or 0
         )  # added to stamps, us; 0: they are dates, or no date is known
@@ -226,6 +230,7 @@ class FlightLog(BagFile):
             str, str
         ] = {}  # messages of IMUs that are there and cannot be read, by name, and why
         self.counts: Counter[str] = Counter()  # records of every message, by name
+        self.status = ""  # what the log says of each IMU beside its samples, in words
         self.start_utc: int | None = (
             None  # UTC of the start of the autopilot, us since 1970; None: not known.
         )
@@ -326,8 +331,9 @@ class FlightLog(BagFile):
 
     def _track(self, source: Source) -> Track:
         """Return what was seen of a source so far."""
-        slowest = _COARSE_RATE if source.kind == self.coarse else self.slowest
-        return self._tracks.setdefault(source, Track(slowest))
+        coarse = source.kind == self.coarse
+        new = Track(_COARSE_RATE, _FEWEST_COARSE) if coarse else Track(self.slowest)
+        return self._tracks.setdefault(source, new)
 
     def _end_at(self, step: int) -> None:
         """Leave out what lies behind a place in the file."""
@@ -374,13 +380,13 @@ class FlightLog(BagFile):
 
         kind = max(self.kinds, key=merit)
         count = merit(kind)[0]
-        if count < _FEWEST_IMUS <= merit(self.coarse)[0]:
+        if count < self.fewest_imus <= merit(self.coarse)[0]:
             kind = self.coarse
             self.note(
                 f"A COARSE CHECK: no gyros are logged at {self.slowest:g} Hz or more, so {kind} is read, means at about"
                 " 1 Hz. They show biases and drifts; noise, vibration and short faults cannot be seen"
             )
-        elif count < _FEWEST_IMUS:
+        elif count < self.fewest_imus:
             raise BagError(f"{self.path}{self._refusal(sensors)}")
         for source, track in sensors.items():
             if source.kind == kind and not track.usable:
@@ -389,7 +395,7 @@ class FlightLog(BagFile):
                     f"is logged {track.figures}, expected at least {self.slowest:g} Hz"
                 )
                 self.note(
-                    f"{kind} {source.instance} {few if track.count < _FEWEST else slow}, and was left out"
+                    f"{kind} {source.instance} {few if track.count < track.fewest else slow}, and was left out"
                 )
         return sorted(
             source
@@ -428,6 +434,8 @@ class FlightLog(BagFile):
             for kind in self.kinds
         }
         there = [_logged(kind, tracks) for kind, tracks in kinds.items() if tracks]
+        if self.status:
+            there.append(self.status)
         unread = [
             f"{name}, which is not read ({why})"
             for name, why in sorted(self.unread.items())
@@ -449,7 +457,7 @@ class FlightLog(BagFile):
             )
             return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}: {setting}"
         has = ", ".join((*there, *unread))
-        if not unread and max(map(len, kinds.values())) < _FEWEST_IMUS:
+        if not unread and max(map(len, kinds.values())) < self.fewest_imus:
             return f": {self.one_imu.format(has)}"
         needed = f"two IMUs or more, each by itself, at {self.slowest:g} Hz or more, {_FEWEST} samples or more"
         return f" has {has}; needed: {needed}: {setting}"

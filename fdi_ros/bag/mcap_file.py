@@ -26,15 +26,26 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, Schema, Statistics
 
-from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, Topic
+from fdi_ros.bag.raw import (
+    NO_HORIZON,
+    BagFile,
+    Batch,
+    Damage,
+    Topic,
+    starts_with,
+    unpack_message,
+)
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
+from fdi_ros.core.sources import source_of_type
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import (
     CHANNELS,
     CHUNK_BYTES,
     DESCRIPTION_BYTES,
+    DESCRIPTIONS,
     NAME,
+    PORTION_BYTES,
     RECORD_BYTES,
     RECORDS,
 )
@@ -91,7 +102,7 @@ def walk(
     the data unless it is damaged, or another record stopped it.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
-    # How many there are is counted first.
+    # The first walk only counts.
     count, _ = find_records(buffer, outside, np.empty((5, 0), np.int64))
     found = np.empty((5, count), np.int64)
     _, end = find_records(buffer, outside, found)
@@ -110,12 +121,14 @@ def walk(
 
 @compiled
 def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
-    """Find the messages, schemas and channels in a run of bytes as `walk` does; return their number, and where it ends.
+    """Find messages, schemas and channels in a run of bytes, as `walk` does.
 
-    ``found`` (5, room) takes of each opcode, channel and log time (of a message), offset and length; those beyond the
-    room that is there are only counted.
+    Schemas and channels beyond the first `DESCRIPTIONS` are skipped: an empty record takes
+    9 bytes, and listing millions of them would take 40 bytes each. ``found`` (5, room)
+    receives per record: opcode, channel and log time (messages only), offset, length.
+    Returns the number of records, those beyond the room included, and where the walk ended.
     """
-    count = position = 0
+    count = position = descriptions = 0
     while position + _PREFIX <= len(data):
         opcode, length = data[position], read_bits(data, position + 1, 8, True)
         start = position + _PREFIX
@@ -125,7 +138,10 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
         if outside and opcode in (CHUNK, STATISTICS, FOOTER):
             break
         head = _HEAD if opcode == MESSAGE else 0
-        if length >= head and opcode in (MESSAGE, SCHEMA, CHANNEL):
+        described = opcode in (SCHEMA, CHANNEL)
+        descriptions += described
+        wanted = described and descriptions <= DESCRIPTIONS
+        if wanted or (opcode == MESSAGE and length >= head):
             if count < found.shape[1]:
                 found[0, count], found[3, count], found[4, count] = (
                     opcode,
@@ -225,7 +241,50 @@ class McapFile(BagFile):
             batch = replace(
                 found, topic=number[found.topic], horizon=horizon, progress=read / whole
             )
-            yield batch if (batch.topic >= 0).all() else batch.at(batch.topic >= 0)
+            if not (batch.topic >= 0).all():
+                batch = batch.at(batch.topic >= 0)
+            yield from self._unpacked(batch, topics)
+
+    def _unpacked(self, batch: Batch, topics: Sequence[str]) -> Iterator[Batch]:
+        """Unpack messages that were compressed one by one (``--compression-mode message``).
+
+        Only types that may carry gyros are unpacked; other messages are merely counted.
+        """
+        types = {one.name: one.type for one in self.topics}
+        gyros = [source_of_type(types.get(name, "")) is not None for name in topics]
+        packed = starts_with(batch, zstandard.FRAME_HEADER)
+        packed &= np.array(gyros, dtype=bool)[batch.topic]
+        if not packed.any():
+            yield batch
+            return
+        first = 0
+        while first < len(batch):
+            messages: list[bytes] = []
+            held = 0
+            for k in range(first, len(batch)):
+                message = batch.message(k)
+                if packed[k]:
+                    message = unpack_message(message, min(CHUNK_BYTES, self._left))
+                    self._left -= len(message)
+                messages.append(message)
+                held += len(message)
+                if held > PORTION_BYTES:
+                    break
+            end = first + len(messages)
+            later = batch.log_time[end:].min(initial=batch.horizon)
+            length = np.array([len(one) for one in messages])
+            yield replace(
+                batch,
+                buffer=np.frombuffer(b"".join(messages), dtype=np.uint8),
+                topic=batch.topic[first:end],
+                log_time=batch.log_time[first:end],
+                offset=np.cumsum(length) - length,
+                length=length,
+                horizon=int(later),
+            )
+            first = end
+        if self._left <= 0:
+            self.note("it unpacks to more bytes than it should: read up to there")
 
     def _scan(self) -> None:
         position, left = len(self.magic), RECORDS + self.size // RECORD_BYTES

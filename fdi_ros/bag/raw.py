@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from fdi_ros.errors import BagError
@@ -76,6 +77,27 @@ class Batch:
         """Return the bytes of message k."""
         start = int(self.offset[k])
         return self.buffer[start : start + int(self.length[k])].tobytes()
+
+
+def starts_with(batch: Batch, head: bytes) -> NDArray[np.bool_]:
+    """Return which of the k messages of a batch begin with some bytes, (k,)."""
+    size = len(head)
+    found = batch.length >= size
+    rows = np.flatnonzero(found)
+    first = batch.buffer[batch.offset[rows, None] + np.arange(size)]
+    found[rows] = (first == np.frombuffer(head, np.uint8)).all(axis=1)
+    return found
+
+
+def unpack_message(data: bytes, most: int) -> bytes:
+    """Unpack a message that is a zstd frame, to at most so many bytes.
+
+    A damaged one comes out empty, and is counted as malformed when it is decoded.
+    """
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(max(most, 0))
+    except (zstandard.ZstdError, MemoryError):
+        return b""
 
 
 @dataclass
@@ -184,6 +206,8 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
         return (path,)
     if not path.is_dir():
         raise BagError(f"no recording at {path}")
+    if tables := tables_of(path):
+        return tables[:FILES]
     about = _metadata(path, damage)
     # One that is named twice is read once.
     names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
@@ -197,18 +221,31 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
             for child in path.iterdir()
             if child.is_file() and child.name.endswith(SUFFIXES)
         ),
-        key=lambda child: [
-            int(part) if part.isdecimal() else part
-            for part in re.split(r"([0-9]+)", child.name)
-        ],
+        key=lambda child: natural_order(child.name),
     )
     if not paths:
-        raise BagError(f"{path} is a folder without .mcap or .db3 files")
+        raise BagError(f"{path} is a folder without .mcap, .db3 or .csv files")
     if len(paths) > FILES:
         damage.add(
             f"{len(paths)} files, expected at most {FILES}: the others were left out"
         )
     return tuple(paths[:FILES])
+
+
+def tables_of(folder: Path) -> tuple[Path, ...]:
+    """Return the tables (.csv) of a folder that holds no bag, by name; empty: it has none."""
+    names = sorted(os.listdir(folder), key=natural_order)
+    if any(name == "metadata.yaml" or name.endswith(SUFFIXES) for name in names):
+        return ()
+    tables = [folder / name for name in names if name.lower().endswith(".csv")]
+    return tuple(one for one in tables if one.is_file())
+
+
+def natural_order(name: str) -> list[int | str]:
+    """Return a key by which names sort, their numbers by value."""
+    return [
+        int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", name)
+    ]
 
 
 def is_made_by_fdi(folder: Path) -> bool:

@@ -8,8 +8,8 @@ Damaged, it is read as far as it goes.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,17 +17,19 @@ from pathlib import Path
 import zstandard
 
 from fdi_ros import __version__
-from fdi_ros.bag.csv_file import CsvLog
+from fdi_ros.bag.csv_file import CsvLog, CsvUnit, is_table_of_gyros, unit_numbers
 from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import (
     MADE_BY_FDI,
+    NO_HORIZON,
     BagFile,
     Batch,
     Damage,
     LogText,
     Topic,
     find_files,
+    tables_of,
 )
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
@@ -36,7 +38,13 @@ from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import CHANNELS, LATEST, max_unpacked_bytes, open_regular
+from fdi_ros.system.files import (
+    CHANNELS,
+    LATEST,
+    max_unpacked_bytes,
+    open_regular,
+    scratch_folder,
+)
 from fdi_ros.system.text import shown
 
 FORMATS: dict[str, type[BagFile]] = {
@@ -53,6 +61,24 @@ FORMATS: dict[str, type[BagFile]] = {
 """By the suffix of a file, in small letters."""
 
 
+class _FileWalk:
+    """The batches of one file, and how far they have come."""
+
+    def __init__(self, file: BagFile, topics: Sequence[str]) -> None:
+        self._batches = file.batches(topics)
+        self.horizon = file.start_time  #: no later batch has an earlier message, ns
+        self.progress = 0.0  #: share of the file read so far
+        self.done = False
+
+    def take(self) -> Batch | None:
+        """Return the next batch; None: the file has been read."""
+        batch = next(self._batches, None)
+        self.done = batch is None
+        self.horizon = NO_HORIZON if batch is None else batch.horizon
+        self.progress = 1.0 if batch is None else batch.progress
+        return batch
+
+
 class Recording:
     """An open recording; close it, or use it in a with statement.
 
@@ -64,16 +90,13 @@ class Recording:
         self.path = Path(path)
         self.damage = Damage()
         self._left = 0  # bytes that may still be unpacked
-        self._unpacked: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch = contextlib.ExitStack()
+        self._unpacked: Path | None = None  #: folder of files that were unpacked
         self._files: list[BagFile] = []
         paths = find_files(self.path, self.damage)
         try:
             self._left = max_unpacked_bytes(sum(path.stat().st_size for path in paths))
-            refused = [
-                error for path in paths if (error := self._open(path)) is not None
-            ]
-            if not self._files:
-                raise refused[0]
+            self._open_all(paths)
         except BaseException:
             self.close()
             raise
@@ -89,8 +112,7 @@ class Recording:
         """Close the files and remove what was unpacked."""
         for file in self._files:
             file.close()
-        if self._unpacked is not None:
-            self._unpacked.cleanup()
+        self._scratch.close()
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -137,26 +159,44 @@ class Recording:
                 )
 
     def batches(self, names: Sequence[str]) -> Iterator[Batch]:
-        """Read the messages of topics, the files in the order of time."""
+        """Read the messages of topics, all files in the order of time."""
         there = {topic.name for topic in self.topics}
         topics = [name if name in there else f"/{name}" for name in names]
-        for k, file in enumerate(self._files):
-            for batch in file.batches(topics):
-                progress = (k + batch.progress) / len(self._files)
-                horizon = min(
-                    [
-                        batch.horizon,
-                        *(later.start_time for later in self._files[k + 1 :]),
-                    ]
+        walks = [_FileWalk(file, topics) for file in self._files]
+        # The file that is farthest behind is read on: those of one time are read together.
+        while going := [walk for walk in walks if not walk.done]:
+            batch = min(going, key=lambda walk: walk.horizon).take()
+            if batch is None:
+                continue
+            batch = replace(
+                batch,
+                progress=sum(walk.progress for walk in walks) / len(walks),
+                horizon=min(walk.horizon for walk in walks),
+            )
+            possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
+            if not possible.all():
+                self.damage.add(
+                    "messages recorded before 1970 or after 2038, by their times, were left out"
                 )
-                batch = replace(batch, progress=progress, horizon=horizon)
-                possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
-                if not possible.all():
-                    self.damage.add(
-                        "messages recorded before 1970 or after 2038, by their times, were left out"
-                    )
-                    batch = batch.at(possible)
-                yield batch
+                batch = batch.at(possible)
+            yield batch
+
+    def _open_all(self, paths: Sequence[Path]) -> None:
+        """Open the files; a folder of tables holds one IMU in each.
+
+        `BagError` if none can be opened.
+        """
+        if self.path.is_dir() and paths == tables_of(self.path):
+            tables = [path for path in paths if is_table_of_gyros(path)]
+            for path in sorted(set(paths) - set(tables)) if tables else ():
+                self.damage.add(f"{path.name}: no columns of gyros, left out")
+            tables = tables or list(paths)
+            for path, number in zip(tables, unit_numbers(tables), strict=True):
+                self._files.append(CsvUnit(path, self.damage, self._left, number))
+            return
+        refused = [error for path in paths if (error := self._open(path)) is not None]
+        if not self._files:
+            raise refused[0]
 
     def _open(self, path: Path) -> BagError | None:
         """Open a file; why it cannot be is noted and returned: of several files the others are read."""
@@ -173,9 +213,9 @@ class Recording:
     def _unpack(self, path: Path) -> Path:
         """Unpack a file compressed as a whole into a temporary folder."""
         if self._unpacked is None:
-            self._unpacked = tempfile.TemporaryDirectory(prefix="fdi_bag_")
+            self._unpacked = self._scratch.enter_context(scratch_folder("fdi_bag"))
         # Files of the same name may lie in different folders.
-        plain = Path(self._unpacked.name) / str(len(self._files)) / path.stem
+        plain = self._unpacked / str(len(self._files)) / path.stem
         plain.parent.mkdir(exist_ok=True)
         most = min(self._left, shutil.disk_usage(plain.parent).free // 2)
         try:

@@ -24,7 +24,7 @@ from typing import Any
 import zstandard
 
 from fdi_ros.bag.library_bag import LibraryBag, Message
-from fdi_ros.bag.raw import NO_HORIZON, Damage, Topic
+from fdi_ros.bag.raw import NO_HORIZON, Damage, Topic, unpack_message
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
     CHANNELS,
@@ -32,6 +32,7 @@ from fdi_ros.system.files import (
     NAME,
     STEPS,
     STEPS_PER_BYTE,
+    scratch_folder,
 )
 
 _TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
@@ -104,9 +105,7 @@ class SqliteFile(LibraryBag):
 
     def _copied(self, log: Path) -> Path:
         """Copy the file and its write-ahead log into a temporary folder, where SQLite may write as it likes."""
-        folder = Path(
-            self._open.enter_context(tempfile.TemporaryDirectory(prefix="fdi_bag_"))
-        )
+        folder = self._open.enter_context(scratch_folder("fdi_bag"))
         room, size = (
             shutil.disk_usage(folder).free // 2,
             self.path.stat().st_size + log.stat().st_size,
@@ -226,7 +225,4 @@ class SqliteFile(LibraryBag):
             zstandard.FRAME_HEADER
         ):
             return content
-        try:
-            return zstandard.ZstdDecompressor().stream_reader(content).read(CHUNK_BYTES)
-        except (zstandard.ZstdError, MemoryError):
-            return b""
+        return unpack_message(content, CHUNK_BYTES)

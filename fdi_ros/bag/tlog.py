@@ -81,18 +81,17 @@ class Tlog(LibraryLog):
     together = 1 << 16
 
     def load(self, data: bytes) -> dict[Source, Columns]:
-        """Read the messages of IMUs of the first autopilot that says that it is one."""
+        """Read the messages of IMUs that one autopilot sent.
+
+        It is the first with a HEARTBEAT, else the first that sent a message of an IMU.
+        """
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
         texts: list[tuple[int, str]] = []
-        beats = (
-            beat
-            for _, _, beat in self._messages(data, (_HEARTBEAT,))
-            if beat.autopilot != NO_AUTOPILOT
-        )
-        if (beat := next(beats, None)) is None:
+        if (chosen := self._autopilot(data)) is None:
             return {}
+        system, autopilot = chosen
         for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
-            if message.get_srcSystem() != beat.get_srcSystem():
+            if message.get_srcSystem() != system:
                 continue
             came, number = (
                 int.from_bytes(data[at : at + _TIME], "big"),
@@ -102,7 +101,7 @@ class Tlog(LibraryLog):
                 texts.append((came, str(message.text)))
                 continue
             kind = MESSAGES[number].kind
-            if not understood(kind, beat.autopilot):
+            if not understood(kind, autopilot):
                 continue
             self.counts[kind] += 1
             start = at + _TIME
@@ -128,6 +127,20 @@ class Tlog(LibraryLog):
             source: {name: table[name] for name in _COLUMNS.names or ()}
             for source, table in tables.items()
         }
+
+    def _autopilot(self, data: bytes) -> tuple[int, int] | None:
+        """Return system and MAV_AUTOPILOT of the autopilot to read; None: there is none."""
+        for _, _, beat in self._messages(data, (_HEARTBEAT,)):
+            if beat.autopilot != NO_AUTOPILOT:
+                return beat.get_srcSystem(), beat.autopilot
+        for _, _, message in self._messages(data, tuple(MESSAGES)):
+            system = message.get_srcSystem()
+            self.note(
+                f"it has no HEARTBEAT of an autopilot: system {system} is read, which"
+                " sent the first message of an IMU"
+            )
+            return system, NO_AUTOPILOT
+        return None
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples:
         """Return the samples in messages of a kind."""

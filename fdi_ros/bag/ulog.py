@@ -66,6 +66,14 @@ _WRONG = (
 )
 """What pyulog raises of a damaged file."""
 _MEAN_TIME = 100_000  # us over which PX4 takes the means of vehicle_imu_status
+_COUNTED = ("gyro_error_count", "gyro_clipping")
+_HELD = {
+    "temperature_gyro": "{low:.1f} to {high:.1f} degC",
+    "gyro_vibration_metric": "vibration up to {high:.2g} rad/s",
+    "gyro_error_count": "{high:.0f} errors",
+    "gyro_clipping": "{high:.0f} samples clipped on an axis",
+}
+"""Fields of vehicle_imu_status that are said, and how; those counted only if not 0."""
 _FIX = 3  # fix_type from which on the time is known: a fix in three dimensions
 
 
@@ -150,13 +158,10 @@ class Ulog(LibraryLog):
             else set()
         )
         self.unread = dict.fromkeys(lacking | (announced & set(_KINDS)), _LACKS)
-        return found | _simultaneous(
-            {
-                source: columns
-                for source, columns in found.items()
-                if source.kind == _STATUS
-            }
-        )
+        status = {one: found[one] for one in sorted(found) if one.kind == _STATUS}
+        together = _simultaneous(status)
+        self.status = _status_words(status, together)
+        return found | together
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
         """Return the samples in messages of a kind; None: they lack a field, or have another form."""
@@ -275,6 +280,42 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
         }
         for source, k in nearest.items()
     }
+
+
+def _status_words(
+    topics: Mapping[Source, Columns], together: Mapping[Source, Columns]
+) -> str:
+    """Say what vehicle_imu_status holds of each IMU, and how far means are apart.
+
+    ``together``: the means at common stamps. Empty if nothing is held.
+    """
+    words = []
+    means = [(one, _array(columns, "mean_gyro")) for one, columns in together.items()]
+    for source, mean in means[1:]:
+        first, reference = means[0]
+        if len(mean):
+            apart = np.median(mean - reference, axis=0) * FLU
+            figures = ", ".join(f"{value:+.4f}" for value in apart)
+            words.append(
+                f"imu_{source.instance} less imu_{first.instance}, median of"
+                f" {len(mean)} means: {figures} rad/s"
+            )
+    for source, columns in topics.items():
+        held = []
+        for name, form in _HELD.items():
+            values = [column for key, column in columns.items() if _is_of(key, name)]
+            found = np.concatenate([np.empty(0), *values])
+            found = found[np.isfinite(found)]
+            if len(found) and (found.max() > 0.0 or name not in _COUNTED):
+                held.append(form.format(low=found.min(), high=found.max()))
+        if held:
+            words.append(f"imu_{source.instance} {', '.join(held)}")
+    return f"{_STATUS}: {'; '.join(words)}" if words else ""
+
+
+def _is_of(key: str, name: str) -> bool:
+    """Whether a column is the field of this name, or an element of it."""
+    return key == name or key.startswith(f"{name}[")
 
 
 def _nearest(stamp: Int, times: Int) -> Int:

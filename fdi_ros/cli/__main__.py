@@ -15,6 +15,7 @@ import time
 from types import FrameType
 
 from fdi_ros.cli import STOPPED
+from fdi_ros.signals import heeded
 
 PATIENCE = 2.0  # s in which further signals do not disturb the end: what is half written is removed
 
@@ -42,13 +43,8 @@ class Stop:
 def fdi() -> int:
     """Run the command line; return its exit code."""
     stop = Stop()
-    # A shell has what it starts in the background ignore the keyboard.
-    heeded = [
-        one
-        for one in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(one) is not signal.SIG_IGN
-    ]
-    for number in heeded:
+    stopping = heeded()
+    for number in stopping:
         signal.signal(number, stop)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
@@ -63,7 +59,7 @@ def fdi() -> int:
     except KeyboardInterrupt:
         return STOPPED
     finally:
-        for number in heeded:
+        for number in stopping:
             # While Python ends, it gives signals their first effect back; what is ignored stays so.
             signal.signal(number, signal.SIG_IGN)
 

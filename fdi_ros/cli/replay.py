@@ -28,7 +28,7 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
-from fdi_ros.inspection.degrees import refuse_degrees
+from fdi_ros.inspection.fitness import refuse_unfit
 from fdi_ros.inspection.starting_config import assumed_config
 from fdi_ros.mavlink.failover import failover_text
 from fdi_ros.model.geometry import Geometry
@@ -74,7 +74,7 @@ def run_replay(arguments: Namespace) -> int:
     outputs = Outputs(
         arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER
     )
-    refuse_degrees(arguments.bag, config)
+    refuse_unfit(arguments.bag, config)
     unit = unit_of(arguments.degrees)
     report = (
         Report(geometry, config.sample_rate, unit)

@@ -8,24 +8,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.config.config import (
-    Config,
-)
-from fdi_ros.errors import BagError
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.inspection.segments import LARGEST_BIAS, LENGTH
 from fdi_ros.inspection.topics import (
     FASTEST,
     TopicReport,
-    inspect,
 )
-from fdi_ros.inspection.turns import (
-    LEAST_ROTATION,
-)
+from fdi_ros.inspection.turns import LEAST_ROTATION, SHARED
+from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import DEGREES
 from fdi_ros.system.text import shown
 
@@ -41,10 +35,9 @@ FAST_SHARE, FAST_TIME = (
     0.01,
     0.5,
 )  # share of the time, or s, beyond every gyro's range: less is a shock or damage
-STILL, NOISIEST = (
-    0.3,
-    0.02,
-)  # share of a recording that lies still; noise there, rad/s, that no gyro at rest has
+STILL, ALWAYS_STILL = 0.3, 0.95  # share of a recording: much of it, and all of it
+LEAST_REST = 4.0  # s; less may be chance in a flight with vibration
+NOISIEST = 0.02  # noise of a sample at rest, rad/s, that no gyro has
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
@@ -66,7 +59,7 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
     if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
         largest = max(one.largest for one in chosen)
         why = f"{largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
-    elif chosen and all(map(_no_gyro_at_rest, chosen)):
+    elif chosen and _no_gyros_at_rest(chosen):
         noise = max(float(one.segments.noise().quiet.max()) for one in chosen)
         why = f"no gyro at rest has a bias and noise of {noise:.2g} rad/s"
     else:
@@ -85,28 +78,60 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
 
 
-def _no_gyro_at_rest(report: TopicReport) -> bool:
-    """Whether it lies still, and with more noise and bias than any gyro in rad/s has."""
-    noise, segments = (
-        report.segments.noise(largest_bias=FASTEST),
-        report.segments.all_segments(),
-    )
-    if (
-        noise.share >= 1.0 - STILL
-        or not (report.segments.noise().quiet > NOISIEST).all()
-    ):
-        return False
+class _Rest(NamedTuple):
+    """A unit at rest, if its values are rates in deg/s."""
+
+    seconds: float  #: time at rest
+    share: float  #: of the recording
+    noise: float  #: of its quietest axis, per sample, in the unit of the values
+    bias: Array  #: (3,) in the unit of the values
+
+
+def _rest_of(report: TopicReport) -> _Rest:
+    """Find the noise and the bias of a unit at rest."""
+    segments = report.segments.all_segments()
+    noise = report.segments.noise(largest_bias=FASTEST)
     still = [
         one.means.mean(axis=0)
         for one, lies in zip(segments, noise.rest, strict=True)
         if lies
     ]
-    return bool(np.abs(np.median(still, axis=0)).max() > LARGEST_BIAS)
+    quiet = float(report.segments.noise().quiet.min())
+    seconds = len(still) * report.segments.every * LENGTH
+    if not still:
+        return _Rest(0.0, 0.0, quiet, np.zeros(report.channels))
+    bias = np.median(still, axis=0)
+    return _Rest(seconds, 1.0 - noise.share, quiet, bias)
 
 
-def refuse_degrees(bag: Path, config: Config) -> list[TopicReport]:
-    """Return what was seen of the topics of a config; `BagError` if one is in deg/s, or the recording is damaged."""
-    chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
-    if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
-        raise BagError(f"{bag} needs {words}; mend the driver")
-    return chosen
+def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
+    """Whether all lie still, with more noise and bias than any gyro in rad/s has.
+
+    A steady turn, which all units share, is no bias: either units differ by more than
+    that, or they lie still for much of the recording and move in the rest of it.
+    """
+    rests = [_rest_of(one) for one in chosen]
+    for one in rests:
+        loud = one.noise > NOISIEST and np.abs(one.bias).max() > LARGEST_BIAS
+        if not loud or one.seconds < LEAST_REST:
+            return False
+    if all(STILL < one.share < ALWAYS_STILL for one in rests):
+        return True
+    apart = [
+        float(np.linalg.norm(one.bias - other.bias))
+        if _are_mounted_alike(first, second)
+        else abs(float(np.linalg.norm(one.bias) - np.linalg.norm(other.bias)))
+        for (first, one), (second, other) in itertools.combinations(
+            zip(chosen, rests, strict=True), 2
+        )
+    ]
+    return max(apart, default=0.0) > LARGEST_BIAS
+
+
+def _are_mounted_alike(first: TopicReport, second: TopicReport) -> bool:
+    """Whether two units show the same motion about the same axes."""
+    means = [one.segments.means for one in (first, second)]
+    size = min(map(len, means))
+    one, other = (each[:size] - np.median(each[:size], axis=0) for each in means)
+    power = float((one**2).sum() + (other**2).sum())
+    return float(((one - other) ** 2).sum()) < (1.0 - SHARED) * power

@@ -44,6 +44,7 @@ HEADLINES = {  # of verdicts, the first that is there decides
     "DO NOT USE": Severity.BAD,
     "NO BETTER THAN BEFORE": Severity.UNKNOWN,
     "USABLE, NOT CALIBRATED": Severity.UNKNOWN,
+    "USABLE FOR LARGE FAULTS ONLY": Severity.UNKNOWN,
     "USABLE, BUT LOOK": Severity.UNKNOWN,
     "READY, BUT LOOK": Severity.UNKNOWN,
     "USABLE": Severity.GOOD,

@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS
-from fdi_ros.config.config import (
-    is_plain_name,
-)
+from fdi_ros.config.config import Config, is_plain_name
 from fdi_ros.core.sources import SOURCES
+from fdi_ros.errors import BagError
 from fdi_ros.inspection.degrees import in_degrees
 from fdi_ros.inspection.findings import Finding, Role
 from fdi_ros.inspection.topics import (
     BELIEVED,
+    FASTEST,
     TopicReport,
+    burst_words,
+    inspect,
     troubles,
 )
 from fdi_ros.model.geometry import MIN_CHANNELS
@@ -49,9 +52,29 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
     possible = [report for report in reports if not _unusable(report)]
     for kind in _PREFERRED:
         alike = [report for report in possible if report.kind is kind]
-        if len(alike) >= kind.topic_counts.start:
-            return alike[: kind.topic_counts.stop - 1]
+        # Stamps in bursts spoil every sample that is formed at them.
+        steady = [report for report in alike if report.burst == 1]
+        for usable in (steady, alike):
+            if len(usable) >= kind.topic_counts.start:
+                return usable[: kind.topic_counts.stop - 1]
     return []
+
+
+def left_out(reports: Sequence[TopicReport]) -> list[tuple[str, str]]:
+    """Return each topic of gyros that `candidates` leaves out, and why."""
+    chosen = candidates(reports)
+    found = []
+    for report in reports:
+        if report in chosen or not chosen or report.kind is not chosen[0].kind:
+            continue
+        if report.topic.name.rpartition("/")[2] in _OF_A_MONITOR:
+            continue
+        why = _unusable(report)
+        if not why and report.burst > 1:
+            why = burst_words(report)
+        most = f"a config has at most {len(chosen)} units"
+        found.append((report.topic.name, why or most))
+    return found
 
 
 def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
@@ -78,6 +101,47 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
         f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
         " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
     )
+
+
+def no_common_time(reports: Sequence[TopicReport]) -> str:
+    """Say which units have no stamps in the time of the first one; empty: none is."""
+    spans = [(one.topic.name, *one.stamps) for one in reports if one.stamps is not None]
+    if not spans:
+        return ""
+    _, origin, end = spans[0]
+    apart = [one for one in spans if one[1] > end or one[2] < origin]
+    if not apart:
+        return ""
+    words = [
+        f"{shown(name)} from {(first - origin) * 1e-9:.6g} to {(last - origin) * 1e-9:.6g} s"
+        for name, first, last in (spans[0], *apart)
+    ]
+    return (
+        f"no common time, by the stamps of their samples: {', '.join(words)}; let the"
+        " clocks be one, or give all stamps the same origin"
+    )
+
+
+def one_clock(reports: Sequence[TopicReport]) -> str:
+    """Say why the stamps of these topics cannot be compared; empty: they can."""
+    stamped = [one for one in reports if one.kind is not None and one.kind.stamped]
+    if len(stamped) < 2:
+        return ""
+    return clocks_apart(stamped) or no_common_time(stamped)
+
+
+def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
+    """Return what was seen of the topics of a config.
+
+    `BagError` if one is in deg/s, their stamps are of several clocks, or the recording
+    cannot be read.
+    """
+    chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
+    if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
+        raise BagError(f"{bag} needs {words}; mend the driver")
+    if words := one_clock(chosen):
+        raise BagError(f"{bag} needs one clock: {words}")
+    return chosen
 
 
 def _unusable(report: TopicReport) -> str:
@@ -126,7 +190,7 @@ def recording_findings(
 ) -> Iterator[Finding]:
     """Say what a recording is fit for; refused: why no config can be made of it, where it needs nothing."""
     chosen = candidates(reports)
-    lacking, clocks = needs(reports) or refused, clocks_apart(chosen)
+    lacking, clocks = needs(reports) or refused, one_clock(chosen)
     if lacking or clocks:
         words = lacking or f"one clock: {clocks}"
         yield Finding(Role.WARNING, "needs", words, headline="NEEDS")
@@ -138,6 +202,12 @@ def recording_findings(
             f"{copies}; the copy is left out",
             headline="NEEDS A LOOK",
         )
+    for topic, why in left_out(reports):
+        if _NO_REDUNDANCY not in why:
+            words = f"{shown(topic)} is left out: {why}"
+            yield Finding(
+                Role.WARNING, "left out", words, (topic,), headline="READY, BUT LOOK"
+            )
     units = len(chosen) > 1
     names = [
         f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places

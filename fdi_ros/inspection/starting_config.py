@@ -25,10 +25,11 @@ from fdi_ros.config.config import (
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
 from fdi_ros.errors import BagError
-from fdi_ros.inspection.fitness import candidates, copy_words, needs
+from fdi_ros.inspection.fitness import candidates, left_out, needs, one_clock
 from fdi_ros.inspection.topics import (
     GAP,
     TopicReport,
+    burst_words,
     inspect,
 )
 from fdi_ros.inspection.turns import (
@@ -74,7 +75,16 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
     reports, _ = inspect(path)
     if words := needs(reports):
         raise BagError(f"{refused}: needs {words}")
-    return replace(starting_config(candidates(reports), path), look=copy_words(reports))
+    if words := one_clock(candidates(reports)):
+        raise BagError(f"{refused}: needs one clock: {words}")
+    chosen = candidates(reports)
+    look = [f"{shown(topic)} is left out: {why}" for topic, why in left_out(reports)]
+    look += [
+        f"{shown(one.topic.name)}: {burst_words(one)}"
+        for one in chosen
+        if one.burst > 1
+    ]
+    return replace(starting_config(chosen, path), look="; ".join(look))
 
 
 def assumed_config(path: Path) -> tuple[Config, str]:
@@ -94,7 +104,7 @@ def assumed_config(path: Path) -> tuple[Config, str]:
             f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes"
         )
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
-    copies = f"{found.look}, the second is left out; " if found.look else ""
+    copies = f"{found.look}; " if found.look else ""
     return config, (
         f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
         f" noise {low:.2g} to {high:.2g} rad/s,"

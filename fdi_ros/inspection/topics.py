@@ -33,6 +33,11 @@ from fdi_ros.system.text import date_of, shown
 
 GAP = 3.0  # intervals longer than this many usual ones are gaps
 FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
+SETTLED_STEPS = 100  # intervals by which the usual one is known
+BURST = (
+    2.0  # usual interval over the most frequent one: beyond, messages come in bursts
+)
+MOST_STEPS = 1_000_000  # messages of a topic whose intervals are kept
 RECENT = 256  # messages in a row in which copies are looked for
 BELIEVED = (
     1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
@@ -64,6 +69,10 @@ class TopicReport:
     intervals: list[Array] = field(
         default_factory=list
     )  # s, of the first million messages
+    stamp_steps: list[Array] = field(
+        default_factory=list
+    )  # s, from stamp to stamp, of the first million messages
+    stamps: tuple[int, int] | None = None  # first and last, ns; None: there are none
     copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
 
     def __post_init__(self) -> None:
@@ -86,6 +95,17 @@ class TopicReport:
     def rate(self) -> float:
         """Messages a second, usually."""
         return 1.0 / self.interval if self.interval > 0 else 0.0
+
+    @property
+    def burst(self) -> int:
+        """Number of stamps that come at once, usually; 1: they come one by one."""
+        steps = np.concatenate([np.empty(0), *self.stamp_steps])
+        if len(steps) < SETTLED_STEPS:
+            return 1
+        usual = usual_interval(steps)
+        if usual <= BURST * float(np.median(steps)):
+            return 1
+        return max(2, round(len(steps) / max(1, int((steps > usual).sum()))))
 
     @property
     def places(self) -> list[str]:
@@ -138,23 +158,14 @@ def inspect(
                 possible[second].copy_of = (
                     possible[second].copy_of or possible[first].topic.name
                 )
+        for report in reports:
+            _settle(report)
         return reports, recording.damage.report()
 
 
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
-    times, before = batch.log_time[rows], [report.last] if report.received else []
-    steps = np.diff(np.concatenate([before, times])) * 1e-9
-    report.first = report.first if report.received else int(times[0])
-    report.last = int(times[-1])
-    report.received += len(rows)
-    if len(steps):
-        report.interval = report.interval or float(np.median(steps))
-        report.gaps += (
-            int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
-        )
-        report.longest = max(report.longest, float(steps.max()))
-        if report.received - len(rows) < 1_000_000:
-            report.intervals.append(steps)
+    times = batch.log_time[rows]
+    _take_times(report, times)
     kind, messages = report.kind, (batch.buffer, batch.offset[rows], batch.length[rows])
     if kind is None or report.topic.encoding != "cdr":
         return
@@ -168,7 +179,7 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.malformed += int((~good).sum())
     stamp, values, times = decoded.stamp[good], decoded.values[good], times[good]
     if kind.stamped:
-        report.backward += int((np.diff(stamp) <= 0).sum())
+        _take_stamps(report, stamp)
         if math.isnan(report.ahead) and len(stamp):
             report.ahead = float(np.median((stamp - times) * 1e-9))
     with np.errstate(invalid="ignore"):
@@ -181,6 +192,58 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.recent = np.vstack([report.recent, values])[-RECENT:]
     whole = believed.all(axis=1)
     report.segments.add(values[whole], times[whole], report.rate)
+
+
+def usual_interval(steps: Array) -> float:
+    """Return the usual interval of messages, s, by the times (k,) between them, s.
+
+    It is the most frequent one; of messages that come in bursts it is that of longer runs.
+    """
+    median = float(np.median(steps))
+    run = min(SETTLED_STEPS // 2, len(steps))
+    ends = np.concatenate([[0.0], np.cumsum(steps)])
+    mean = float(np.median(ends[run:] - ends[:-run])) / run
+    return mean if mean > BURST * median else median
+
+
+def _take_times(report: TopicReport, times: Int) -> None:
+    """Take the times of recording (k,) of further messages, ns, k > 0."""
+    before = [report.last] if report.received else []
+    steps = np.diff(np.concatenate([before, times])) * 1e-9
+    report.first = report.first if report.received else int(times[0])
+    report.last = int(times[-1])
+    report.received += len(times)
+    if not len(steps):
+        return
+    report.longest = max(report.longest, float(steps.max()))
+    if report.received - len(times) < MOST_STEPS:
+        report.intervals.append(steps)
+    if report.interval > 0:
+        report.gaps += int((steps > GAP * report.interval).sum())
+    elif report.received > SETTLED_STEPS:
+        _settle(report)
+
+
+def _settle(report: TopicReport) -> None:
+    """Take the usual interval of the messages so far, and count the gaps among them."""
+    if report.interval > 0 or not report.intervals:
+        return
+    steps = np.concatenate(report.intervals)
+    report.interval = usual_interval(steps)
+    if report.interval > 0:
+        report.gaps = int((steps > GAP * report.interval).sum())
+
+
+def _take_stamps(report: TopicReport, stamp: Int) -> None:
+    """Take the stamps (k,) of further messages, ns."""
+    if not len(stamp):
+        return
+    first, *before = (int(stamp[0]),) if report.stamps is None else report.stamps
+    steps = np.diff(np.concatenate([before, stamp])) * 1e-9
+    report.backward += int((np.diff(stamp) <= 0).sum())
+    if report.received <= MOST_STEPS:
+        report.stamp_steps.append(steps)
+    report.stamps = first, int(stamp[-1])
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
@@ -319,6 +382,11 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     return ", ".join([*words, *troubles(report, unit)])
 
 
+def burst_words(report: TopicReport) -> str:
+    """Say how many stamps of a topic come at once."""
+    return f"stamps come in bursts of about {report.burst}, not when it measured"
+
+
 def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """Say what is wrong with the values of a topic, by their places in the message."""
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
@@ -336,4 +404,5 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
         )
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
+    words += [burst_words(report)] if report.burst > 1 else []
     return words

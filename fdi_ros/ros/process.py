@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any
 
 from fdi_ros.errors import ConfigError, FdiError
+from fdi_ros.signals import heeded
 from fdi_ros.system import BAGS, require
 
 TIMEOUT = 0.1  # of one turn of the executor, s, which a signal waits for; the EventsExecutor needs one to work
@@ -42,11 +43,11 @@ NO_ROS = "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or in a clone pip
 
 
 class Stop:
-    """Set by SIGINT or SIGTERM, once or many times; checked by the loop of the node."""
+    """Set by a stopping signal, once or many times; checked by the loop of the node."""
 
     def __init__(self) -> None:
         self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heeded(by_node=True):
             signal.signal(number, self._ask)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -142,7 +143,7 @@ def run(
     Arguments are those of ROS, by default those of the process. Something else may make the node.
     """
     # A signal ends the process until the node is up: while something is compiled, no handler in Python runs.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in heeded(by_node=True):
         signal.signal(number, signal.SIG_DFL)
     try:
         import rclpy

@@ -220,6 +220,8 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 LEAST_RATE = (
     LEAST_ROTATION / 5
 )  # rotation about some axis, root mean square, below which nothing turns, rad/s
+#: Standard error beyond which axes along axes are an assumption, rad.
+LARGEST_DOUBT = SQUARE
 LARGEST_ERROR = np.radians(
     2.0
 )  # a mount less certain than this, in any direction, is not shown
@@ -245,6 +247,11 @@ class Mount:
         False  # it turns, and not as the first unit does, however it may be mounted
     )
     mirrored: bool = False  # one of the two is no right-handed frame
+
+    @property
+    def shown(self) -> bool:
+        """Whether the recording shows it; if not, `rotation` is an assumption or `None`."""
+        return self.rotation is not None and self.error < LARGEST_DOUBT
 
 
 def find_mounts(data: Data) -> tuple[Mount, ...]:
@@ -314,6 +321,11 @@ def _against(first: Array, unit: Array) -> Mount:
         f"{body} is its {axis}"
         for body, axis in zip("xyz", _axes_of(nearest), strict=True)
     )
+    if error >= LARGEST_DOUBT:
+        # Without a better one, what a config starts from is kept.
+        words = f"NOT MEASURED, uncertain by {np.degrees(error):.0f} deg: vibration"
+        words += " hides the turns that would show it"
+        return Mount(words, shared, np.eye(3), off, error)
     turn = "as the first" if (nearest == np.eye(3)).all() else f"turned: body {along}"
     words = f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
     return Mount(words, shared, nearest, off, error)

@@ -23,6 +23,7 @@ from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
+from fdi_ros.replay.words import noisy_lines
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
@@ -41,10 +42,10 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.calibrate import UNMEASURED, Calibration
+from fdi_ros.setup.calibrate import UNMEASURED, Calibration, StampDelay
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, times_words
+from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, Tried, times_words
 from fdi_ros.system.text import LINE, shown
 
 SHOWN_AXES = (
@@ -60,6 +61,7 @@ LARGE_SWING, LARGE_BIAS = (
     0.2,
 )  # of biases, within a recording and at all, rad/s
 MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
+FLOOR, LEAST_NAMED = 0.1, 0.9  # rad/s; share of test faults of that size to be found
 LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
@@ -109,16 +111,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
-        side = (
-            "late (measured earlier than stamped)"
-            if delay.value > 0
-            else "early (measured later than stamped)"
-        )
-        taken = "taken off" if delay.shown else "not taken off: it may be none"
-        if "imus.delays" not in result.settings:
-            taken = "not taken off: one message"
-        words = f"{', '.join(names)}: stamps {1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms {side} against"
-        words += f" the first unit, {taken}"
+        words = f"{', '.join(names)}: {_delay_words(delay, 'imus.delays' in result.settings)}"
         yield Finding(
             Role.FOUND,
             "delay",
@@ -128,6 +121,22 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
             delay.error,
             SHOWN * delay.error,
         )
+
+
+def _delay_words(delay: StampDelay, taken_off: bool) -> str:
+    """Say by how much stamps are late, and whether that is taken off."""
+    if abs(delay.value) < delay.error:
+        return (
+            f"delay against the first unit not measured (+-{1e3 * delay.error:.2g} ms)"
+        )
+    side = "late (measured earlier than stamped)"
+    if delay.value < 0:
+        side = "early (measured later than stamped)"
+    taken = "taken off" if delay.shown else "not taken off: it may be none"
+    if not taken_off:
+        taken = "not taken off: one message"
+    size = f"{1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms"
+    return f"stamps {size} {side} against the first unit, {taken}"
 
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
@@ -212,26 +221,15 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
         yield Finding(
             Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}"
         )
-    moving = np.median(found.moment, axis=0)
-    for when, noise, headline in (
-        ("in motion", moving, "USABLE, BUT LOOK"),
-        ("at rest", found.floor.std, ""),
-    ):
-        if noisy := much_noisier(noise, result.units):
-            words = noisier_words(names, noise, result.units, unit.name, unit.factor)
-            words += f" {when}: loose, badly isolated, of another make, or faulty"
-            worst, beside = max(noisy, key=lambda one: noise[one[0]])
-            who = [names[i] for i, _ in noisy]
-            yield Finding(
-                Role.WARNING,
-                "noise",
-                words,
-                who,
-                float(noise[worst]),
-                None,
-                beside,
-                headline,
-            )
+    noise = found.floor.std
+    if noisy := much_noisier(noise, result.units):
+        words = noisier_words(names, noise, result.units, unit.name, unit.factor)
+        words += " at rest: loose, badly isolated, of another make, or faulty"
+        worst, beside = max(noisy, key=lambda one: noise[one[0]])
+        who = [names[i] for i, _ in noisy]
+        yield Finding(
+            Role.WARNING, "noise", words, who, float(noise[worst]), None, beside
+        )
     rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
     for what, values, bound, form, factor in (
         (
@@ -281,7 +279,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         f"{g.n} channels in {where} at {rate:.4g} Hz",
         value=rate,
     )
-    if known := sum(mount.rotation is not None for mount in found.mounts[1:]):
+    if known := sum(mount.shown for mount in found.mounts[1:]):
         words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
         yield Finding(Role.FOUND, "mounts", words, value=known)
     if result is not None:
@@ -294,6 +292,11 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     if words := copy_words(found.reports):
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
     yield from topic_findings(found.chosen, unit)
+    tried = found.proof.before if found.kept else found.proof.after
+    if tried.baseline is not None:
+        # What a replay with these settings says of their noise.
+        for line in noisy_lines(tried.baseline.judgement, unit):
+            yield Finding(Role.WARNING, "noise", line, headline="USABLE, BUT LOOK")
     limits = [
         line
         for line in pair_lines(mounting)
@@ -333,18 +336,7 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         words = f"on {proof.source}, {found.kept}; the settings before are written"
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
-        words, isolated, biases = (
-            "nothing is declared without a fault",
-            *tried.isolated_of,
-        )
-        if not found.mounting.losses[0].isolable:
-            words += "; a fault is detected, which channel it is not"
-        elif biases:
-            sizes = f"{SIZES[0] * unit.factor:.3g} to {SIZES[-1] * unit.factor:.3g} {unit.name}"
-            words += (
-                f"; {isolated} of {biases} biases of {sizes} isolated on {proof.source}"
-            )
-        yield Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
+        yield _usable(found, tried, unit)
     if found.calibration is None and not found.disagree and units:
         words = f"{found.refused}: axes, delays and noise in motion are not known"
         yield Finding(
@@ -352,13 +344,35 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         )
 
 
+def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
+    """Say what settings without a false alarm find."""
+    unused = " (not used for fitting)" if found.proof.apart else ""
+    words = f"no false alarm in {found.proof.source}{unused}."
+    isolated, biases = tried.isolated_of
+    if not found.mounting.losses[0].isolable:
+        words += " A fault is detected, but not the channel that has it."
+        return Finding(Role.WORTH, "proof", words, headline="USABLE")
+    if not biases:
+        return Finding(Role.WORTH, "proof", words, headline="USABLE")
+    low, high = (f"{size * unit.factor:.3g}" for size in (SIZES[0], SIZES[-1]))
+    words += f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
+    words += f" {isolated} were found."
+    named, of = tried.isolated[FLOOR]
+    if named < LEAST_NAMED * of:
+        words += f" Of {of} with {FLOOR * unit.factor:.3g} {unit.name}, {named} were"
+        words += f" found, fewer than {LEAST_NAMED:.0%}: expect large faults alone."
+        headline = "USABLE FOR LARGE FAULTS ONLY"
+        return Finding(
+            Role.WARNING, "proof", words, (), named, None, LEAST_NAMED * of, headline
+        )
+    return Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
+
+
 def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     """List what the recording does not show, what is taken instead, and how to get it."""
     yield from (Finding(Role.UNKNOWN, "damage", line) for line in found.damage)
     named = zip(found.config.imu_names, found.mounts, strict=False)
-    if unshown := {
-        name: mount.words for name, mount in named if mount.rotation is None
-    }:
+    if unshown := {name: mount.words for name, mount in named if not mount.shown}:
         words = "; ".join(f"{name} ({why})" for name, why in unshown.items())
         yield Finding(
             Role.UNKNOWN,
@@ -433,6 +447,14 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
     }
 
 
+def _beyond_error(values: Array, errors: Array, factor: float, form: str) -> list[str]:
+    """Write values (n,); one that is smaller than its standard error is not measured."""
+    return [
+        f"{value * factor:{form}}" if abs(value) > error else "not measured"
+        for value, error in zip(values, errors, strict=True)
+    ]
+
+
 def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
@@ -456,9 +478,17 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
         Column("scale_measured", result.measured),
         Column("", measured(result.factor, ".5f"), ("scale",)),
         Column("", measured(100 * result.factor_error, ".3f"), ("+-%",)),
-        Column("off_nominal_rad", result.angle, ("off nominal deg",), ".3f", degrees),
+        Column("off_nominal_rad", result.angle),
+        Column(
+            "",
+            _beyond_error(result.angle, result.angle_error, degrees, ".3f"),
+            ("off nominal deg",),
+        ),
         Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
-        Column("bias", found.bias, ("bias rad/s",), ".6f", rate),
+        Column("bias", found.bias),
+        Column(
+            "", _beyond_error(found.bias, result.bias_std, rate, ".6f"), ("bias rad/s",)
+        ),
         Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
         Column("noise_std", found.floor.std, ("noise rad/s",), ".5f", rate),
         Column("noise_std_error", found.floor.error, ("+-",), ".5f", rate),
@@ -479,7 +509,7 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
 def _mounts(found: SetupResult) -> list[Column]:
     """Figures of the mount of every unit."""
     mounts = found.mounts
-    known = [mount.rotation is not None for mount in mounts]
+    known = [mount.shown for mount in mounts]
     shared = [
         f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)
     ]

@@ -23,8 +23,14 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
-from fdi_ros.inspection.degrees import refuse_degrees
-from fdi_ros.inspection.fitness import candidates, clocks_apart, copy_words, needs
+from fdi_ros.inspection.fitness import (
+    candidates,
+    clocks_apart,
+    copy_words,
+    needs,
+    no_common_time,
+    refuse_unfit,
+)
 from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.inspection.topics import GAP, TopicReport, inspect
 from fdi_ros.model.samples import Block
@@ -258,7 +264,7 @@ def set_up(
     if (
         units
         and not np.isfinite(block.z).all(axis=1).any()
-        and (apart := clocks_apart(chosen, 0.0))
+        and (apart := clocks_apart(chosen, 0.0) or no_common_time(chosen))
     ):
         raise BagError(f"{bag}: {apart}")
 
@@ -282,7 +288,7 @@ def recalibrate(
 
     `FdiError` if it cannot be read, lacks a topic, or its channels contradict each other.
     """
-    if copies := copy_words(refuse_degrees(bag, config)):
+    if copies := copy_words(refuse_unfit(bag, config)):
         raise CalibrationError(
             f"{bag}: {copies}; look at topics and remappings, or leave one out of the config"
         )
@@ -342,7 +348,7 @@ def _proved(
     learned, apart, source = (
         block,
         proof is not None,
-        "the same recording: too short to keep a part of it aside",
+        "the same recording, too short to keep a part of it aside",
     )
     if proof is not None:
         bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
@@ -354,7 +360,7 @@ def _proved(
         start, apart, source = (
             start + since,
             True,
-            f"the last {seconds:.0f} s, kept aside",
+            f"the last {seconds:.0f} s",
         )
     before, found = learn(learned)
     if needed and found.why is not None:

@@ -46,6 +46,7 @@ RECORDS, RECORD_BYTES = 300_000, 4096
 CHANNELS = (
     4096  # topics of one recording, and descriptions of topics and of types in one file
 )
+DESCRIPTIONS = 4 * CHANNELS  # read from one chunk at most
 DESCRIPTION_BYTES = 1 << 20  # of the description of a topic or a type
 NAME = 255  # characters of the name of a topic or a type, as in DDS
 FILES = 800  # files of one recording; they are open together
@@ -69,6 +70,7 @@ makes an object of each, and of a topic one for each field."""
 ROS1_INDEX_BYTES = 48 << 20
 """Of the index of a bag of ROS 1, 12 for each message of any topic: an hour at 1100 messages a second."""
 CSV_LINE_BYTES = 1 << 20  # of the line of names of a table of text
+CSV_COLUMNS = 4096
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 
@@ -195,10 +197,13 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
     It is written under a name that nobody can foresee, and created there: what lies at a name is never written to.
     """
+    _remove_abandoned(path, path.parent, 16)
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     with open(os.open(part, flags, 0o644), "wb") as file:
         try:
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.fchmod(
                 file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS
             )
@@ -326,7 +331,7 @@ def _copy_to_stream(source: Path, path: Path) -> None:
 @contextlib.contextmanager
 def _scratch(path: Path, parent: Path) -> Iterator[Path]:
     """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
-    _remove_abandoned(path, parent)
+    _remove_abandoned(path, parent, 8)
     # Named before it is made: a signal at any moment leaves nothing behind.
     folder = parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
@@ -344,25 +349,40 @@ def _scratch(path: Path, parent: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _remove_abandoned(path: Path, parent: Path) -> None:
-    """Remove folders that runs that were killed have left of this result: nobody holds their lock."""
+def _remove_abandoned(path: Path, parent: Path, digits: int) -> None:
+    """Remove scratch files and folders of a path that killed runs have left.
+
+    Their names end with so many hexadecimal digits; a running process holds a lock on each.
+    """
+    pattern = f".{glob.escape(path.name)}.{'[0-9a-f]' * digits}"
     with contextlib.suppress(OSError):
-        for folder in parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}"):
-            with contextlib.suppress(OSError), _opened(folder) as descriptor:
+        for left in parent.glob(pattern):
+            with contextlib.suppress(OSError), _opened(left) as descriptor:
                 about = os.fstat(descriptor)
-                if (
-                    about.st_uid == os.geteuid()
-                    and time.time() - about.st_mtime > JUST_MADE
-                ):
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(folder, ignore_errors=True)
+                own = about.st_uid == os.geteuid()
+                if not own or time.time() - about.st_mtime <= JUST_MADE:
+                    continue
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if stat.S_ISDIR(about.st_mode):
+                    shutil.rmtree(left, ignore_errors=True)
+                elif stat.S_ISREG(about.st_mode):
+                    os.unlink(left)
 
 
 @contextlib.contextmanager
-def _opened(folder: Path) -> Iterator[int]:
-    """Open a folder; a lock on it ends with the process."""
+def scratch_folder(name: str) -> Iterator[Path]:
+    """Give a temporary folder; it is removed at the end, or by the next use after a kill."""
+    parent = Path(tempfile.gettempdir())
+    path = parent / name
+    with _scratch(path, parent) as folder:
+        yield folder
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """Open a file or folder; a lock on it ends with the process."""
     descriptor = os.open(
-        folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+        path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
     )
     try:
         yield descriptor

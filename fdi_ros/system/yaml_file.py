@@ -18,6 +18,7 @@ from fdi_ros.system.files import (
     YAML_NODES,
     open_regular,
 )
+from fdi_ros.system.text import shown
 
 try:
     from yaml import CSafeLoader as _SafeLoader
@@ -132,16 +133,41 @@ def _problem(refused: yaml.YAMLError) -> str:
     return " ".join(f"line {mark.line + 1}, column {mark.column + 1}: {why}".split())
 
 
+class _Collection:
+    """A sequence or mapping whose end has not been read yet."""
+
+    def __init__(self, event: yaml.CollectionStartEvent, before: int) -> None:
+        self.anchor: str | None = event.anchor
+        self.before = before  #: number of values that precede it
+        self._mapping = isinstance(event, yaml.MappingStartEvent)
+        self._keys: set[str] = set()
+        self._children = 0
+
+    def add(self, event: yaml.NodeEvent) -> None:
+        """Take the next child; a mapping has keys and values in turn, each key once."""
+        is_key = self._mapping and self._children % 2 == 0
+        self._children += 1
+        if not is_key or not isinstance(event, yaml.ScalarEvent):
+            return
+        if event.value in self._keys:
+            raise _Refused(
+                event.start_mark, f"the key {shown(event.value)!r} is given twice"
+            )
+        self._keys.add(event.value)
+
+
 def _check_size(text: str) -> None:
-    """Refuse what nests too deep, or comes to too many values once its aliases are followed."""
+    """Refuse deep nesting, too many values with aliases followed, and repeated keys."""
     sizes: dict[str, int] = {}
-    # Of the collections that are open: anchor, and the number of values before it.
-    outer: list[tuple[str | None, int]] = []
+    outer: list[_Collection] = []
     count = 0
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = outer.pop()
+            ended = outer.pop()
+            anchor, before = ended.anchor, ended.before
         elif isinstance(event, yaml.NodeEvent):
+            if outer:
+                outer[-1].add(event)
             anchor, before = event.anchor, count
             alias = isinstance(event, yaml.AliasEvent)
             if alias and event.anchor not in sizes:
@@ -153,7 +179,7 @@ def _check_size(text: str) -> None:
         else:
             continue
         if isinstance(event, yaml.CollectionStartEvent):
-            outer.append((anchor, before))
+            outer.append(_Collection(event, before))
         elif anchor:
             sizes[anchor] = count - before
         if len(outer) > YAML_DEPTH:

@@ -228,7 +228,8 @@ ULOG_FORMATS = {
     "uint8_t gyro_calibration_count;uint8_t[4] _padding0;",
     "sensor_gyro_fifo": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;"
     "int16_t[32] x;int16_t[32] y;int16_t[32] z;uint8_t samples;uint8_t[3] _padding0;",
-    "vehicle_imu_status": "uint64_t timestamp;uint32_t gyro_device_id;float[3] mean_gyro;",
+    "vehicle_imu_status": "uint64_t timestamp;uint32_t gyro_device_id;float[3] mean_gyro;"
+    "float temperature_gyro;uint32_t gyro_error_count;uint8_t[4] _padding0;",
     "sensor_gps": "uint64_t timestamp;uint64_t timestamp_sample;uint64_t time_utc_usec;uint8_t fix_type;"
     "uint8_t[7] _padding0;",
 }
@@ -318,7 +319,8 @@ def _ulog_samples(unit, number, kind):
         return _fifo(unit, number)
     if kind == "vehicle_imu_status":
         out = _data(kind, number, unit.stamp)
-        out["mean_gyro"] = unit.rate
+        out["mean_gyro"], out["temperature_gyro"] = unit.rate, 40.0 + number
+        out["gyro_error_count"] = 3 * number
         return out
     out = _data(kind, number, unit.stamp, late=300)
     if kind == "vehicle_imu":
@@ -366,13 +368,19 @@ SCALED = {26: 50.0, 116: 50.0, 129: 50.0}
 """Messages of IMUs and their rates, Hz."""
 
 
-def telemetry(*autopilots, seconds=6.0, version=2):
-    """What a ground station writes down: each message some ms after it was sent."""
+def telemetry(*autopilots, seconds=6.0, version=2, left_out=()):
+    """What a ground station writes down: each message some ms after it was sent.
+
+    Messages with the numbers left out are lost.
+    """
     out = b""
     for now in range(0, round(seconds * NS), 1_000_000):
         for autopilot in autopilots:
             for data in autopilot.step(now):
                 data = data if version == 2 else as_version_1(autopilot, data)
+                number = data[5] if data[0] == 0xFE else data[7] | data[8] << 8
+                if number in left_out:
+                    continue
                 late = 4000 + int(autopilot.random.integers(3000))
                 out += struct.pack(">Q", (UTC + now) // 1000 + late) + data
     return out

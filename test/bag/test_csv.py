@@ -8,6 +8,7 @@ import os
 import numpy as np
 import pytest
 from bag.logs import UTC, units
+from bag.recordings import bounded
 from bag.test_logs import messages, refusal
 
 from fdi_ros.bag.csv_file import CSV_LINE_BYTES
@@ -208,6 +209,26 @@ def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, wor
     said = refusal(path)
     assert words in said
     assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["time", "a", "b", "_" * 40_000], "column name of 40000 characters"),
+        (["time", *(f"g{k}_x" for k in range(100_000))], "100001 columns, expected at"),
+        (["time", *("_" * 250 + str(k) for k in range(4_000))], "no columns of gyros"),
+        (["time", *("(" * 250 + str(k) for k in range(4_000))], "no columns of gyros"),
+        (["time", *("x" * 250 + str(k) for k in range(4_000))], "no columns of gyros"),
+    ],
+    ids=["long", "many", "underscores", "brackets", "axes"],
+)
+def test_names_of_columns_are_matched_in_a_time_that_follows_from_their_size(
+    names, words, tmp_path
+):
+    path = tmp_path / "a.csv"
+    path.write_text(",".join(names) + "\n" + "0," * (len(names) - 1) + "0\n")
+    with bounded(10):
+        assert words in refusal(path)
 
 
 def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):

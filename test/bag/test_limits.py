@@ -105,8 +105,19 @@ def made(folder, records):
             "",
         ),
         (lambda: record(200, b"") * 320_000, 0, "more records than its size explains"),
+        (
+            lambda: (
+                chunk(SCHEMA + channel(0, "/a") + record(3, b"") * 7_000_000)
+                + message()
+            ),
+            1,
+            "a message definition is damaged",
+        ),
     ],
-    ids=["packed", "unknown records", "topics", "a long message", "empty records"],
+    ids=[
+        *("packed", "unknown records", "topics", "a long message", "empty records"),
+        "empty schemas in a chunk",
+    ],
 )
 def test_bombs_are_read_as_far_as_their_size_explains(
     tmp_path, records, received, words
@@ -345,6 +356,8 @@ YAML = {
     "x: !!bool maybe": "neither true nor false",
     "x" * (1 << 21): "longer than 1048576 bytes",
     "x: \x1b[2J": "not YAML",
+    "/**:\n  ros__parameters: {a: 1}\n/**:\n  ros__parameters: {a: 2}\n": r"line 3: the key '/\*\*' is given twice",
+    "x: {y: 1, z: {y: 2, w: 3}, 'y': 4}": "line 1: the key 'y' is given twice",
 }
 
 

@@ -24,6 +24,7 @@ from fdi_ros.cli import command_line
 from fdi_ros.cli.outputs import progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import FAULT_KINDS
+from fdi_ros.signals import STOPPING
 from fdi_ros.system import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -540,7 +541,7 @@ def test_outputs_may_be_closed_from_the_start(closed):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPPING)
 def test_a_replay_that_is_stopped_leaves_nothing_behind(
     number, flight, config, tmp_path
 ):
@@ -557,7 +558,8 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(
 
     def hear_it():
         # A shell lets what it starts in the background ignore SIGINT, and these tests may have been started so.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for one in STOPPING:
+            signal.signal(one, signal.SIG_DFL)
 
     # As plain Python it takes so long that it cannot be done before the signal comes.
     slow = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

@@ -5,6 +5,7 @@
 
 import fcntl
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -17,7 +18,12 @@ import pytest
 from fdi_ros.errors import FdiError
 from fdi_ros.fleet.tables import Tables
 from fdi_ros.mavlink.link import read_key
-from fdi_ros.system.files import JUST_MADE, write_json
+from fdi_ros.system.files import (
+    JUST_MADE,
+    replacing,
+    scratch_folder,
+    write_json,
+)
 
 LIMIT = 60
 """s, within which none of these waits for anything."""
@@ -138,6 +144,67 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
         other.name,
         held.name,
     }
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from fdi_ros.system.files import replacing
+with replacing(Path(sys.argv[1])) as file:
+    file.write(b"half")
+    file.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_file_half_written_by_a_killed_process_goes_with_the_next(tmp_path):
+    """As a state file is written; what another process writes at the moment stays."""
+    state = tmp_path / "state.json"
+    code = subprocess.run([sys.executable, "-c", KILLED, state], check=False).returncode
+    assert code == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    os.utime(left, (time.time() - 2 * JUST_MADE,) * 2)
+    with replacing(state) as file:
+        # Another writer of the same file begins and ends meanwhile.
+        with replacing(state) as other:
+            other.write(b"other")
+        file.write(b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["state.json"]
+    assert state.read_bytes() == b"whole"
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(flight, config, tmp_path):
+    """RLIMIT_FSIZE stands for it: the kernel refuses to write on in the same way."""
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    words = ["replay", flight, "--config", config, "--csv", tmp_path / "samples.csv"]
+    words = [sys.executable, "-m", "fdi_ros.cli", *map(str, words), "--quiet"]
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+        preexec_fn=limit,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert (
+        done.stderr == f"fdi: cannot write {tmp_path / 'samples.csv'}: File too large\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unpacked_files_of_a_killed_run_go_with_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    left = tmp_path / ".fdi_bag.0123abcd"
+    left.mkdir()
+    (left / "bag.mcap").write_bytes(bytes(1000))
+    os.utime(left, (time.time() - 2 * JUST_MADE,) * 2)
+    with scratch_folder("fdi_bag") as folder:
+        assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+    assert list(tmp_path.iterdir()) == []
 
 
 INTERRUPTED = """

@@ -46,6 +46,7 @@ from std_msgs.msg import Float64MultiArray
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.signals import STOPPING
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -125,7 +126,7 @@ for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
     assert again == first
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPPING)
 def test_a_signal_before_it_is_up_ends_it_at_once(tmp_path, number) -> None:
     process = Process("fdi_node", parameter_file(TWO_IMUS, tmp_path))
     maps = Path(f"/proc/{process.popen.pid}/maps")

@@ -334,7 +334,7 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     )
     code, out, _ = fdi(*words, "--output", output, "--report", report)
     assert code == 0
-    assert "kept aside" in out
+    assert "(not used for fitting)" in out
     assert re.search(r"^new +nothing +100% +18 of 18", out, re.MULTILINE)
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Proof</h2>" in report.read_text()

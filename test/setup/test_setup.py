@@ -113,7 +113,8 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     assert "<h2>Proof</h2>" in page
     assert "geometry:" in page
     assert re.match(
-        r"USABLE: .* biases of 1.72 to 17.2 deg/s isolated on the last 15 s, kept aside",
+        r"USABLE: no false alarm in the last 15 s \(not used for fitting\)\. Of 36 test faults added there"
+        r" \(1.72 to 17.2 deg/s\), \d+ were found\.",
         out,
     )
     assert "noise, deg/s" in page
@@ -238,14 +239,15 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
     assert (words in fdi("inspect", tmp_path / "bag.mcap").out) == (ahead != 0.0)
     made = (tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
     if not ahead:
-        assert fdi("setup", *made)[::2] == (0, "")
+        # One axis alone turns: a fault of 0.1 rad/s is not found in 9 of 10.
+        assert fdi("setup", *made)[::2] == (4, "")
         return
     assert words in refused("setup", *made)
     config = write_config(
         tmp_path / "two.yaml", {"input": "imus", "imus.topics": list(TOPICS)}
     )
     said = refused("calibrate", *made, "--config", config)
-    assert "fdi inspect says whether its topic is silent or of another clock" in said
+    assert words in said
 
 
 @pytest.mark.parametrize("odd", [0, 1, 2])
@@ -297,7 +299,7 @@ def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
     code, out, _ = fdi(*verb)
     assert code == 4
     assert out.startswith(
-        "NO BETTER THAN BEFORE: on the last 15 s, kept aside, 28 of 54 biases are isolated"
+        "NO BETTER THAN BEFORE: on the last 15 s, 28 of 54 biases are isolated"
     )
     assert "set: nothing" in out
     assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
@@ -428,3 +430,26 @@ def test_one_sensor_on_two_topics_is_no_redundancy(how, fdi, refused, tmp_path):
     assert code in (3, 4)
     assert f"/third gives the values of {TOPICS[0]}: one sensor on two topics" in out
     assert Config.from_file(tmp_path / "own.yaml").imus.topics == TOPICS
+
+
+@pytest.mark.parametrize("name", ["quad_good_prop_hover", "quad_25mm_cut_hover"])
+def test_settings_from_heavy_vibration_are_for_large_faults_only(
+    name, root, tmp_path, fdi
+):
+    """A tenth of a rad/s hides in it, and so do mounts, delays and scale factors."""
+    log = root.parent / "shared" / "data" / "logs" / f"{name}.bin"
+    if not log.exists():
+        pytest.skip(f"needs {log}, which is not here")
+    config = tmp_path / "made.yaml"
+    code, out, _ = fdi("setup", log, "--output", config)
+    first = out.splitlines()[0]
+    assert code == 4
+    assert first.startswith("USABLE FOR LARGE FAULTS ONLY: no false alarm in the last")
+    named = int(re.search(r"Of 18 with 0.1 rad/s, (\d+) were found", first)[1])
+    assert named <= 16
+    assert "mounts: 2 of 2" not in out
+    pairs = re.findall(r"(-?[0-9.]+(?:e-?\d+)?) \+- ([0-9.]+(?:e-?\d+)?)", out)
+    assert pairs
+    assert [pair for pair in pairs if abs(float(pair[0])) < float(pair[1])] == []
+    noisy = "is much noisier than the others"
+    assert (noisy in out) >= (noisy in fdi("replay", log, "--config", config).out)
