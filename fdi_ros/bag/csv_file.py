@@ -1,18 +1,19 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of text (.csv): a line of column names, then a line per sample, read in portions of bounded memory.
+"""Tables of text (.csv): a line of column names, then a line per sample.
 
-Names say which columns are the time and the rates about x, y and z of each IMU, and their units: ``time_us``,
-``gyro_1_x [deg/s]``, ``imu_0.x``. A file ``columns.yaml`` in the same folder says it where names do not:
+Names give the columns of time and of the rates about x, y and z of each IMU, with
+units: ``time_us``, ``gyro_1_x [deg/s]``, ``imu_0.x``. A file ``columns.yaml`` in the
+same folder replaces names that are not clear. All its entries are optional:
 
-    time: t                         # all are optional
+    time: t
     time_unit: ms                   # s, ms, us or ns
     rate_unit: deg/s                # rad/s or deg/s
     imus: [[wx1, wy1, wz1], [wx2, wy2, wz2]]
 
-Axes are taken as they are. An IMU without a value in a line has no message there. Times are read as doubles: of a date,
-they are exact to 0.3 us.
+Axes are not turned. An IMU without a value in a line has no message there. Times are
+doubles, so dates are exact to 0.3 us. Files are read in portions of bounded memory.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from fdi_ros.system.yaml_file import read_yaml
 COLUMNS = "columns.yaml"
 GUIDE = 'docs/flight_logs.md, "Tables of text"'
 KIND = "columns"
-_PORTION = 1 << 21  # bytes that are read at once
+#: bytes that are read at once
+_PORTION = 1 << 21
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _DEGREES = math.pi / 180.0
 _RATE_UNITS = {
@@ -66,18 +68,20 @@ _GYRO = re.compile(r"gyr|omega|angular_?vel|(^|[._ \d])[gw]\d*$")
 _OTHER = re.compile(
     r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$"
 )
-"""Heads of names of rates, and of what else has three axes."""
+"""Names of rates without their axis, and names of other quantities with three axes."""
 
 
 class Columns(NamedTuple):
     """Which columns of a table are read."""
 
-    time: int  # index of the column
-    tick: float  # seconds of one unit of it; 0: by the size of the first time
-    imus: tuple[
-        tuple[int, int, int], ...
-    ]  # indices of the rates about x, y and z of each
-    factors: tuple[float, ...]  # rates of each IMU are multiplied by this for rad/s
+    #: index of the column
+    time: int
+    #: seconds of one unit of time, 0 if the first time decides
+    tick: float
+    #: indices of the rates about x, y and z of each
+    imus: tuple[tuple[int, int, int], ...]
+    #: rates of each IMU are multiplied by this for rad/s
+    factors: tuple[float, ...]
 
 
 class CsvLog(FlightLog):
@@ -91,7 +95,8 @@ class CsvLog(FlightLog):
     )
     one_imu = "this table has one IMU ({}): nothing to compare it with"
     slowest = 5.0
-    first = 0  #: number of the first IMU
+    #: number of the first IMU
+    first = 0
 
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
@@ -162,7 +167,7 @@ class CsvUnit(CsvLog):
 
 
 def unit_numbers(paths: Sequence[Path]) -> list[int]:
-    """Return a number for the IMU of each table: the last one in each name, if all differ."""
+    """Return a number for the IMU of each table: the last in each name, if all differ."""
     found = [re.findall(r"[0-9]{1,3}", path.stem)[-1:] for path in paths]
     numbers = [int(one[0]) for one in found if one]
     return numbers if len(set(numbers)) == len(paths) else list(range(len(paths)))
@@ -171,10 +176,10 @@ def unit_numbers(paths: Sequence[Path]) -> list[int]:
 def find_columns(
     file: BinaryIO, note: Callable[[str], None], first: int = 0
 ) -> tuple[str, Columns]:
-    """Return the delimiter and the columns to read; the file then stands behind the names.
+    """Return the delimiter and the columns to read, and move the file behind the names.
 
-    ``first``: number of the first IMU. `BagError` if no line holds names, or none is of a
-    gyro.
+    ``first``: number of the first IMU. `BagError` if no line holds names, or no name is
+    of a gyro.
     """
     file.seek(0)
     for _ in range(64):
@@ -208,9 +213,9 @@ def find_columns(
 def _columns(
     file: BinaryIO, names: Sequence[str], note: Callable[[str], None], first: int
 ) -> Columns:
-    """Choose the columns and note them.
+    """Choose the columns and note the choice.
 
-    `BagError` if there are none, or ``columns.yaml`` asks for others.
+    `BagError` if no gyro is found, or ``columns.yaml`` names other columns.
     """
     path = Path(file.name).parent / COLUMNS
     told = read_yaml(path, "file", BagError) if path.exists() else {}
@@ -282,7 +287,7 @@ def is_table_of_gyros(path: Path) -> bool:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return a name in small letters without its unit, and the unit, empty if there is none."""
+    """Return a name in small letters and its unit, which may be empty."""
     name = name.lower()
     unit = _UNIT.search(name)
     return (
@@ -293,7 +298,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _factor(unit: str, known: dict[str, float], default: float, name: str) -> float:
-    """Return what a unit is multiplied by; `BagError` if it is not known."""
+    """Return the factor of a unit. `BagError` if the unit is unknown."""
     if unit and unit not in known:
         raise BagError(
             f"column {name!r} has the unit {unit!r}, expected one of {', '.join(known)}"
@@ -332,12 +337,12 @@ def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
 
 
 def _is_gyro(head: str) -> bool:
-    """Whether a name without its axis is that of a gyro."""
+    """Whether a name without its axis names a gyro."""
     return _GYRO.search(head) is not None and "cov" not in head
 
 
 def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
-    """Return the time and the rates of each line, (k, 1 + 3 IMUs); NaN: it has no number there."""
+    """Return time and rates of each line, (k, 1 + 3 IMUs); cells without a number are NaN."""
     chosen = [columns.time, *(column for imu in columns.imus for column in imu)]
     if not lines:
         return np.empty((0, len(chosen)))
@@ -373,8 +378,8 @@ def _number(cells: Sequence[str], column: int) -> float:
 def _samples(
     table: Array, end: Int, columns: Columns, first: int
 ) -> list[tuple[Source, ImuSamples]]:
-    """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at places in the file (k,)."""
-    # What no date is, no time is either; it is left out as impossible.
+    """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at bytes (k,)."""
+    # Impossible dates are left out later.
     stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(
         np.int64
     )

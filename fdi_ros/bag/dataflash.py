@@ -3,22 +3,27 @@
 
 """ArduPilot's dataflash logs (.bin).
 
-A record is A3 95, the number of its message, and values of a fixed size; FMT records say name, size, types and columns
-of each message (AP_Logger's README in ArduPilot's sources; columns and units: "Onboard Message Log Messages" of its
-documentation). There is no checksum: a record counts only where another one begins behind it.
+A record is A3 95, the number of its message, and values of fixed size. FMT records give
+name, size, types and columns of each message (README of AP_Logger; "Onboard Message Log
+Messages" in ArduPilot's documentation). Records have no checksum, so one counts only if
+another record follows directly.
 
-Rates are in IMU (what the autopilot uses: filtered, all units at one time, at the rate of its loop at most), in IMT
-(what its estimator is given: angles, and the time they were taken in) and, where raw logging is on, in GYR (all samples
-of each sensor with their own times); all are in the body frame. Before version 4.1 the instances were messages of their
-own: IMU, IMU2, IMU3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a sensor twice, before and
-after the filters: at the same SampleUS, as instance I and as I plus the number of gyros.
+Rates are in IMU (filtered, all units at one time, at most at the loop rate), in IMT
+(angles and the time that each took, input of the estimator), and with raw logging in
+GYR (all samples of each sensor with their own times). All are in the body frame. Before
+version 4.1 each instance is a message: IMU, IMU2, IMU3. Since then column I holds the
+instance. With INS_RAW_LOG_OPT, GYR may hold each sensor twice, before and after the
+filters: at the same SampleUS, as instance I and as I plus the number of gyros.
 
-Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
-TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
+Times are in TimeUS, before version 3.3 in TimeMS. In such old logs GPS holds the
+autopilot's time in T and the time of the week in TimeMS, and GYR the time of each
+sample in a TimeUS of 32 bits, which wraps every 72 minutes.
 
-FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted.
+FMTU, UNIT and MULT give unit and multiplier of each column, usually rad/s and 1. Other
+units are converted.
 
-An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
+An hour of three IMUs at 400 Hz takes 2.5 s here. pymavlink's DFReader, with one Python
+object per message, takes 72 s.
 """
 
 from __future__ import annotations
@@ -45,11 +50,14 @@ from fdi_ros.bag.flight_log import (
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
-Rows = NDArray[np.void]  # records of a log, by field
-_PORTION = 1 << 22  # bytes that are read at once, much more than the longest record
+#: records of a log, by field
+Rows = NDArray[np.void]
+#: bytes that are read at once, much more than the longest record
+_PORTION = 1 << 22
 _FMT = 128
 _FMT_SIZE = 89
-_HEAD = 3  # bytes of a record before its values
+#: bytes of a record before its values
+_HEAD = 3
 _TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
     | {
@@ -72,14 +80,16 @@ _TYPES = (
     }
 )
 """NumPy types of the letters of a FMT record."""
-_NUMBERS = "bBdfghHiIqQ"  # types that are the number itself
+#: types that are the number itself
+_NUMBERS = "bBdfghHiIqQ"
+#: columns that are read and may not be any number, and their types
 _TYPES_OF = {
     "Message": "Z",
     "Label": "Z",
     "UnitIds": "N",
     "MultIds": "N",
     "I": "B",
-}  # columns that are read and may not be any number, and their types
+}
 _SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
 _GPS = re.compile(r"GPS[2B]?")
 _VALUES = {
@@ -87,17 +97,20 @@ _VALUES = {
     "GYR": (("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")),
     "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
 }
-"""Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
+"""Columns of rate and acceleration; IMT holds angles and velocities over `DelaT`,
+`DelvT`.
+"""
+#: columns with texts of the autopilot
 _TEXTS = {
     "MSG": ("Message",),
     "ERR": ("Subsys", "ECode"),
-}  # columns of what the autopilot says
+}
 _UNITS = {
     "FMTU": ("FmtType", "UnitIds", "MultIds"),
     "UNIT": ("Id", "Label"),
     "MULT": ("Id", "Mult"),
 }
-"""Columns of messages that say units and multipliers of columns: of each, what is told of its first."""
+"""Columns of messages about units and multipliers, keyed by their first column."""
 _OPTIONAL = (
     "TimeUS",
     "TimeMS",
@@ -136,13 +149,14 @@ _SUBSYSTEMS: dict[Any, str] = (
 )
 """Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
-"""s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
-_FIX = 3  # GPS status from which on the time is known: a fix in three dimensions
+"""Start of GPS time since 1970, a week, and GPS ahead of UTC since 2017, s."""
+#: GPS status from which on the time is known: a fix in three dimensions
+_FIX = 3
 
 
 @compiled
 def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
-    """Return where the record at a position ends; 0: there is none; -1: the portion ends within it or just behind."""
+    """Return the end of the record at a position, 0 if none, -1 if the portion ends first."""
     if data[position] != 0xA3 or data[position + 1] != 0x95:
         return 0
     number = data[position + 2]
@@ -163,11 +177,12 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
 def find_records(
     data: Bytes, sizes: Int, final: bool, found: Int
 ) -> tuple[int, int, int]:
-    """Find the records in a portion of a log, with which the log ends if it is the final one.
+    """Find the records in a portion of a log, which is the last one if ``final``.
 
-    ``sizes`` (256,): bytes of a record of each message, 0 if not known; filled in from FMT records, of which the first
-    counts. ``found`` (2, room) takes the number of the message and the first byte of each record. Returned are the
-    number of records, where the walk ended, and how many bytes before that are in no record.
+    ``sizes`` (256,): bytes of a record of each message, 0 if unknown, updated from the
+    first FMT record of each. ``found`` (2, room) receives the message number and the
+    first byte of each record. Returns the number of records, the end of the walk, and
+    the number of bytes before that which belong to no record.
     """
     count = lost = position = 0
     while position + _HEAD <= len(data):
@@ -243,9 +258,9 @@ class DataflashLog(FlightLog):
     def _read(
         self, data: Bytes, begin: int, final: bool
     ) -> tuple[list[tuple[Source, ImuSamples]], int, int]:
-        """Read a portion that begins at a place in the file.
+        """Read the portion that begins at this byte of the file.
 
-        Returned are its samples, where its last record ends in it, and the bytes before that in no record.
+        Returns its samples, the end of its last record, and the bytes that belong to no record.
         """
         found = np.empty((2, len(data) // _HEAD + 1), dtype=np.int64)
         count, end, lost = find_records(data, self._sizes, final, found)
@@ -289,7 +304,7 @@ class DataflashLog(FlightLog):
         return samples, int(end), int(lost)
 
     def _describe(self, content: bytes) -> None:
-        """Take in a FMT record, if it is the first of its message."""
+        """Take a FMT record, unless an earlier one defined the same message."""
         number, size, *texts = struct.unpack("<BB4s16s64s", content)
         name, types, columns = (
             text.partition(b"\0")[0].decode("ascii", "replace") for text in texts
@@ -309,7 +324,7 @@ class DataflashLog(FlightLog):
                     self._lacking[number] = str(error)
 
     def _take_texts(self, name: str, rows: Rows) -> None:
-        """Take in what records (k,) say."""
+        """Take texts and times from records (k,)."""
         if name == "MSG":
             texts = [
                 text.decode("ascii", "replace") for text in rows["Message"].tolist()
@@ -323,7 +338,7 @@ class DataflashLog(FlightLog):
                 self.add_text(stamp, name, text)
 
     def _factors(self, number: int, source: Source) -> Iterator[Array]:
-        """Return what rate and acceleration of a message are to be multiplied by, (3,) each, for rad, m and s."""
+        """Return the factors of rate and acceleration, (3,) each, to rad, m and s."""
         units, multipliers = self._told["FMTU"].get(number, (b"", b""))
         for columns in _VALUES[source.kind]:
             factors = np.ones(3)
@@ -347,7 +362,7 @@ class DataflashLog(FlightLog):
 
 
 def _error_text(subsystem: float, code: float) -> str:
-    """Say what an ERR record says."""
+    """Return the text of an ERR record."""
     if subsystem == _EKF_PRIMARY:
         return f"EKF lane switched to {code:g}"
     name = _SUBSYSTEMS.get(subsystem, f"subsystem {subsystem:g}")
@@ -357,7 +372,7 @@ def _error_text(subsystem: float, code: float) -> str:
 def _layout(
     name: str, size: int, types: str, columns: Sequence[str]
 ) -> np.dtype[np.void]:
-    """Return what is read of the records of a message; `ValueError` says what it lacks."""
+    """Return the layout of a message. `ValueError` names the missing part."""
     if len(columns) != len(types) or set(types) - _TYPES.keys():
         raise ValueError("its FMT record is damaged")
     sensor = _SENSORS.fullmatch(name)
@@ -393,9 +408,9 @@ def _layout(
 def _samples(
     source: Source, rows: Rows, start: Int, of_rate: Array, of_acceleration: Array
 ) -> list[tuple[Source, ImuSamples]]:
-    """Return the samples of each instance in the records (k,) of one message, which begin at `start` (k,).
+    """Return the samples of each instance in records (k,) of one message.
 
-    ``of_rate``, ``of_acceleration`` (3,): what the values are multiplied by.
+    ``start`` (k,): their first bytes. ``of_rate``, ``of_acceleration`` (3,): factors.
     """
     columns = rows.dtype.names or ()
     rate, acceleration = (_vectors(rows, names) for names in _VALUES[source.kind])
@@ -421,21 +436,21 @@ def _samples(
 
 
 def _vectors(rows: Rows, columns: Sequence[str]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
+    """Return three columns of k rows as vectors, (k, 3), NaN where columns are missing."""
     if not set(columns) <= set(rows.dtype.names or ()):
         return np.full((len(rows), 3), np.nan)
     return np.column_stack([rows[column].astype(np.float64) for column in columns])
 
 
 def _stamp(rows: Rows) -> Int:
-    """Return the times of records (k,), us since the start of the autopilot: those of the samples if they are there."""
+    """Return the times of records (k,), us since the start, those of samples if logged."""
     columns = rows.dtype.names or ()
     if "TimeMS" not in columns:
         stamp = rows["TimeUS"].astype(np.int64)
     else:
         stamp = rows["TimeMS"].astype(np.int64) * 1000
         if "TimeUS" in columns:
-            # Of 32 bits: it is the time next to that of the record.
+            # A time of 32 bits is completed by the time of its record.
             stamp += (rows["TimeUS"].astype(np.int64) - stamp + 2**31) % 2**32 - 2**31
     if "SampleUS" in columns:
         sampled = rows["SampleUS"].astype(np.int64)

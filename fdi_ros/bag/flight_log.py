@@ -1,15 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Logs of flight stacks as recordings: what their formats have in common.
+"""Logs of flight stacks as recordings: the common part of all formats.
 
-A log is gone through twice, portion by portion: when it is opened, to find the IMUs, their sample rates and the time of
-day, and again to read it. A format reads samples out of a portion; here these become sensor_msgs/msg/Imu messages on
-``/imu_0``, ``/imu_1`` and so on: the instances of the log, whichever kind of message they were logged in.
+A log is walked twice in portions: first to find the IMUs, their sample rates and the
+date, then to read. A format turns a portion into samples. This module turns samples
+into sensor_msgs/msg/Imu messages on ``/imu_0``, ``/imu_1`` and so on, by the instances
+of the log, whatever the logged message.
 
-Flight stacks count body axes front, right, down (FRD); messages are in front, left, up (FLU, REP-103). Stamps are those
-of the samples: time since the start of the autopilot, and from a log with GPS time the UTC of that start is added. A
-log whose stamps are dates (a simulation by the clock of its computer) is read as it is.
+Flight stacks use body axes front, right, down (FRD), messages front, left, up (FLU,
+REP-103). Stamps count from the start of the autopilot. With GPS time in the log, the
+UTC of that start is added. Stamps that are dates (a simulation on its computer's clock)
+are kept.
 """
 
 from __future__ import annotations
@@ -35,24 +37,32 @@ from fdi_ros.system.text import shown
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
-FLU = np.array([1.0, -1.0, -1.0])  # from FRD
-_FEWEST = 20  # samples by which the rate of a source can be judged
-_FEWEST_COARSE = 3  # means of a coarse check: the shortest log has few
-_TOLERANCE = 0.95  # of that rate; clocks and loggers are not exact
+#: from FRD
+FLU = np.array([1.0, -1.0, -1.0])
+#: samples by which the rate of a source can be judged
+_FEWEST = 20
+#: means of a coarse check: the shortest log has few
+_FEWEST_COARSE = 3
+#: share of that rate which is enough, as clocks and loggers are inexact
+_TOLERANCE = 0.95
 _MAX_INTERVAL_RATIO = 1.5
-"""Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
-_MAX_STEP_BACK = (
-    1_000_000  # us; a log goes on as long as its times step back by no more
-)
-_BESIDE = 17  # samples whose median says where a log has come to: no few damaged times move it
-_COARSE_RATE = 0.5  # Hz; means may be logged no more seldom
-_MAX_TIME_STEP = 10_000_000  # us; a sample that far from those logged before and after it has a damaged time
-_TOGETHER = (
-    1 << 10
-)  # messages handed on at once: so few that in a bag made of them a chunk holds what is near in time
-_MOST_COMPARED = 16  # instances of one kind, more than any autopilot has, that are looked at for copies
-_MOST_NAMES = 6  # messages that are named of a log without IMUs
-_MOST_TEXTS = 1000  # texts of a log that are kept: the first ones
+"""Ratio to the longest expected interval: more is a gap, less may be jitter."""
+#: largest step back of time within one log, us
+_MAX_STEP_BACK = 1_000_000
+#: samples whose median time marks the progress of a log, robust to damaged times
+_BESIDE = 17
+#: lowest rate of logged means, Hz
+_COARSE_RATE = 0.5
+#: distance from neighbours at which a time is damaged, us
+_MAX_TIME_STEP = 10_000_000
+#: messages per batch, few enough that a chunk of a converted bag covers a short time
+_TOGETHER = 1 << 10
+#: instances of one kind, more than any autopilot has, that are looked at for copies
+_MOST_COMPARED = 16
+#: messages that are named of a log without IMUs
+_MOST_NAMES = 6
+#: texts of a log that are kept: the first ones
+_MOST_TEXTS = 1000
 
 
 class Source(NamedTuple):
@@ -63,20 +73,22 @@ class Source(NamedTuple):
 
 
 ImuSamples = NDArray[np.void]
-"""(k,) samples of one IMU, in FLU: ``stamp``, us since the start of the autopilot, or since 1970; ``rate`` (3,), rad/s;
-``acceleration`` (3,), m/s^2, NaN: not logged with the rate; ``end`` of its record in the file, bytes, 0: not known."""
+"""(k,) samples of one IMU in FLU. ``stamp``: us since the start of the autopilot or
+since 1970. ``rate`` (3,): rad/s. ``acceleration`` (3,): m/s^2, NaN if not logged.
+``end``: end of the record in the file, bytes, 0 if unknown.
+"""
 _SAMPLE = np.dtype(
     [("stamp", "i8"), ("rate", "f8", 3), ("acceleration", "f8", 3), ("end", "i8")]
 )
 
 Portion = tuple[list[tuple[Source, ImuSamples]], float]
-"""Samples in one portion of a log, and the share of the log that is read up to its end, 0 to 1."""
+"""Samples in one portion of a log, and the share of the log read so far, 0 to 1."""
 
 
 def imu_samples(
     stamp: Int, rate: Array, acceleration: Array | float = np.nan, end: Int | int = 0
 ) -> ImuSamples:
-    """Return samples (k,) with these stamps (k,), rates and accelerations (k, 3), and ends (k,)."""
+    """Return samples (k,) from stamps and ends (k,), rates and accelerations (k, 3)."""
     samples = np.empty(len(stamp), _SAMPLE)
     samples["stamp"], samples["end"] = stamp, end
     samples["rate"], samples["acceleration"] = rate, acceleration
@@ -84,7 +96,7 @@ def imu_samples(
 
 
 def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Concatenate samples: as bytes, since NumPy copies fields one by one, which takes 30 times as long."""
+    """Concatenate samples as bytes: NumPy copies fields singly and 30 times slower."""
     return np.concatenate([one.view(f"V{_SAMPLE.itemsize}") for one in parts]).view(
         _SAMPLE
     )
@@ -92,21 +104,24 @@ def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
 
 @dataclass
 class Track:
-    """What was seen of one source: how fast it is logged, and where its time steps back for good."""
+    """Rate of one source, and the progress of its time."""
 
-    slowest: float  # samples per second that it must be logged at
-    fewest: int = _FEWEST  # samples by which its rate can be judged
+    #: lowest acceptable rate, samples per second
+    slowest: float
+    #: samples by which its rate can be judged
+    fewest: int = _FEWEST
     count: int = 0
-    fast: int = 0  # samples that follow the one before without a gap
-    fast_time: int = 0  # us between these and the ones before
+    #: samples that follow the one before without a gap
+    fast: int = 0
+    #: us between these and the ones before
+    fast_time: int = 0
     first: int = 0
-    last: int = 0  # stamps of the first and the last, us
-    come: int | None = (
-        None  # stamp up to which the log has come, us; None: at its start.
-    )
-    recent: ImuSamples = field(
-        default_factory=lambda: np.empty(0, _SAMPLE)
-    )  # the last samples
+    #: stamps of the first and the last, us
+    last: int = 0
+    #: latest stamp so far, us, None at the start
+    come: int | None = None
+    #: the last samples
+    recent: ImuSamples = field(default_factory=lambda: np.empty(0, _SAMPLE))
 
     def add(self, stamp: Int) -> None:
         """Take in the stamps (k,) of further samples."""
@@ -121,9 +136,9 @@ class Track:
         self.count += len(stamp)
 
     def first_behind(self, samples: ImuSamples) -> int:
-        """Return where the record of the first sample behind a step of time ends, bytes; 0: there is none.
+        """Return the end of the first record behind a step back of time, bytes, 0 if none.
 
-        There a second log begins in the file.
+        A second log begins there.
         """
         samples = _joined([self.recent, samples])
         self.recent = samples[1 - _BESIDE :]
@@ -146,7 +161,7 @@ class Track:
 
     @property
     def rate(self) -> float:
-        """Samples per second: between gaps, or if there is little else than gaps, on average."""
+        """Samples per second: between gaps if most samples follow closely, else on average."""
         if self.steady:
             return self.fast * 1e6 / self.fast_time
         return (
@@ -162,12 +177,12 @@ class Track:
 
     @property
     def usable(self) -> bool:
-        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        """Whether the source is mostly logged fast enough. Gaps do not count."""
         return self.fast_enough and self.steady
 
     @property
     def figures(self) -> str:
-        """Words for how fast it is logged."""
+        """Words for the rate."""
         if self.count < 2:
             return "once"
         if self.last <= self.first:
@@ -176,28 +191,29 @@ class Track:
 
 
 class FlightLog(BagFile):
-    """An open log of a flight stack, read as a recording of Imu topics; each format derives from this.
+    """An open log of a flight stack; each format derives from this class.
 
-    `BagError` if it has no two IMUs that are logged fast enough.
+    `BagError` if fewer IMUs than needed are logged fast enough.
     """
 
-    kinds: ClassVar[tuple[str, ...]]  # messages that samples of every IMU are logged in
-    settings: ClassVar[
-        str
-    ]  # line of the documentation by which all IMUs are logged fast enough
-    one_imu: ClassVar[
-        str
-    ]  # sentence for a log of a single IMU, with a place for what of it is logged
+    #: messages that samples of every IMU are logged in
+    kinds: ClassVar[tuple[str, ...]]
+    #: line of the documentation by which all IMUs are logged fast enough
+    settings: ClassVar[str]
+    #: sentence for a log of a single IMU, with a place for its figures
+    one_imu: ClassVar[str]
     slowest: ClassVar[float] = 20.0
-    """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-    fewest_imus: ClassVar[int] = 2  # one has nothing to be compared with
-    coarse: ClassVar[str] = (
-        ""  # kind of message with means of the rate, read where nothing better is there
-    )
+    """Lowest usable rate of an IMU, Hz: fewer samples show too little of the motion."""
+    #: one has nothing to be compared with
+    fewest_imus: ClassVar[int] = 2
+    #: kind of message with means of the rate, read where nothing better is there
+    coarse: ClassVar[str] = ""
     counted_by: ClassVar[str] = ""
-    """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
+    """Kind of message with one instance per sensor. Other kinds may have further
+    instances.
+    """
     selected: ClassVar[str] = ""
-    """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
+    """Kind of message with samples of the selected IMU alone, which cannot be compared."""
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
         super().__init__(path, damage, most)
@@ -214,7 +230,7 @@ class FlightLog(BagFile):
             self.note(self.status)
         self._shift = (
             0 if dated else self.start_utc or 0
-        )  # added to stamps, us; 0: they are dates, or no date is known
+        )  # added to stamps, us; 0 for stamps that are dates, or without a date
         self.texts = tuple(
             one._replace(stamp=self._log_time(one.stamp)) for one in self.said
         )
@@ -225,25 +241,23 @@ class FlightLog(BagFile):
         self.start_time = self._log_time(self._starts[0])
 
     def begin(self) -> None:
-        """Begin a walk: what one before it has found counts no more."""
+        """Begin a walk and forget the findings of earlier ones."""
         self.unread: dict[
             str, str
         ] = {}  # messages of IMUs that are there and cannot be read, by name, and why
         self.counts: Counter[str] = Counter()  # records of every message, by name
-        self.status = ""  # what the log says of each IMU beside its samples, in words
+        self.status = ""  # further figures of each IMU, in words
         self.start_utc: int | None = (
-            None  # UTC of the start of the autopilot, us since 1970; None: not known.
+            None  # UTC of the start of the autopilot, us since 1970, or None
         )
-        self.said: list[
-            LogText
-        ] = []  # what the autopilot said up to the place that was read, us
+        self.said: list[LogText] = []  # texts of the autopilot up to here, stamps in us
 
     @abstractmethod
     def portions(self) -> Iterator[Portion]:
         """Read the log from its start up to `end`, in the order of the file."""
 
     def add_text(self, stamp: int, kind: str, text: str) -> None:
-        """Take in what the autopilot said at a time, us."""
+        """Take a text of the autopilot at a time, us."""
         if len(self.said) < _MOST_TEXTS and (line := " ".join(text.split())):
             self.said.append(LogText(stamp, kind, line))
 
@@ -291,7 +305,7 @@ class FlightLog(BagFile):
     # What a first walk finds -----------------------------------------------------------------------------------------
 
     def _survey(self) -> bool:
-        """Go through the log; False: it ends where the time steps back, and is to be gone through again up to there."""
+        """Walk the log; False if it must be walked again up to a step back of time."""
         self.begin()
         self._tracks: dict[Source, Track] = {}
         self._shared: Counter[tuple[Source, Source]] = Counter()
@@ -326,17 +340,19 @@ class FlightLog(BagFile):
                 )
             )
         self._starts: list[int] = np.minimum.accumulate(starts[::-1])[::-1].tolist()
-        """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
+        """Earliest stamp in each portion and all later ones, us; `NO_HORIZON` without
+        samples.
+        """
         return True
 
     def _track(self, source: Source) -> Track:
-        """Return what was seen of a source so far."""
+        """Return the track of a source."""
         coarse = source.kind == self.coarse
         new = Track(_COARSE_RATE, _FEWEST_COARSE) if coarse else Track(self.slowest)
         return self._tracks.setdefault(source, new)
 
     def _end_at(self, step: int) -> None:
-        """Leave out what lies behind a place in the file."""
+        """Leave out the rest of the file behind a byte."""
         self.note(
             f"the time steps back at byte {step}, as where a second log begins in the file: the {self.end - step}"
             f" bytes behind it ({100 * (self.end - step) / self.end:.3g} % of the file) were left out"
@@ -344,13 +360,13 @@ class FlightLog(BagFile):
         self.end = step
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
-        """Leave out samples at times that no log lasts to, and at times far from those beside them."""
+        """Leave out samples with impossible times, or times far from their neighbours."""
         stamp = samples["stamp"]
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | (
             (stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000)
         )
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
-            # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
+            # Most of five neighbours are right, and a gap has neighbours on both sides.
             good &= np.abs(stamp - _medians(stamp, 5)) <= _MAX_TIME_STEP
         if good.all():
             return samples
@@ -358,15 +374,16 @@ class FlightLog(BagFile):
         return samples[good]
 
     def _log_time(self, stamp: int) -> int:
-        """Time of recording, ns, of what happened at a stamp in us."""
+        """Return the time of recording, ns, for a stamp, us."""
         return NO_HORIZON if stamp == NO_HORIZON else (stamp + self._shift) * 1000
 
     # Which messages are then read ------------------------------------------------------------------------------------
 
     def _choose(self) -> list[Source]:
-        """Return the sources to read: of the kind of message with the most usable ones, else the most samples.
+        """Return the sources to read: the kind of message with most usable IMUs, then samples.
 
-        A sensor may be logged in several kinds of messages, and must not be its own witness.
+        A sensor may be logged in several kinds of messages, but must not confirm
+        itself.
         """
         sensors = self._sensors()
 
@@ -428,7 +445,7 @@ class FlightLog(BagFile):
         return tracks
 
     def _refusal(self, sensors: Mapping[Source, Track]) -> str:
-        """Say what the log has in place of IMUs that can be read, and which line of the documentation applies."""
+        """Describe the IMUs in the log and the setting of the logger that helps."""
         kinds = {
             kind: [track for source, track in sensors.items() if source.kind == kind]
             for kind in self.kinds
@@ -464,7 +481,7 @@ class FlightLog(BagFile):
 
 
 def _logged(kind: str, tracks: Sequence[Track]) -> str:
-    """Say how a kind of message is logged."""
+    """Describe how a kind of message is logged."""
     fastest = max(tracks, key=lambda track: (track.count >= _FEWEST, track.rate))
     few = f", {fastest.count} samples" if 1 < fastest.count < _FEWEST else ""
     return (
@@ -477,7 +494,7 @@ def _topic(source: Source) -> str:
 
 
 def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
-    """Fill in k messages of sensor_msgs/msg/Imu (k, size); stamp in ns."""
+    """Encode k messages of sensor_msgs/msg/Imu, (k, size), stamps in ns."""
     at = ImuTemplate("imu_0").at
     layout: Any = {
         "names": ("sec", "nanosec", "rate", "acceleration", "absent"),
@@ -490,13 +507,13 @@ def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
     fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
     fields["rate"], absent = samples["rate"], np.isnan(samples["acceleration"])
     fields["acceleration"] = np.where(absent, 0.0, samples["acceleration"])
-    # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
+    # Zero covariance means unknown, -1 as the first element absent (REP-145).
     fields["absent"] = -1.0 * absent.any(axis=1)
     return data
 
 
 def _medians(stamp: Int, window: int) -> Int:
-    """Return the median of so many stamps (k,) beside each; before the first and after the last they are mirrored."""
+    """Return the median of the stamps (k,) around each, mirrored at both ends."""
     beside = np.lib.stride_tricks.sliding_window_view(
         np.pad(stamp, window // 2, mode="reflect"), window
     )
@@ -506,10 +523,11 @@ def _medians(stamp: Int, window: int) -> Int:
 def _copies_of(
     sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]
 ) -> dict[Source, Source]:
-    """Return which sources are copies of which others: those with the same times, since sensors have their own.
+    """Return which sources are filtered copies of others: pairs with the same times.
 
-    A copy has the number of the sensor and that of all sensors in the sum. Where all have the same times, as in a
-    simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
+    A copy has the instance of its sensor plus the number of sensors. If all sources
+    share their times, as in a simulation, an even number is taken for sensors and
+    copies.
     """
     same: set[Source] = set()
     for pair, count in shared.items():
@@ -524,9 +542,9 @@ def _copies_of(
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:
-    """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
+    """Return the UTC of the start of the autopilot, us since 1970, by the first plausible fix.
 
-    ``utc`` (k,) us since 1970, ``stamp`` (k,) us since the start.
+    ``utc`` (k,): us since 1970. ``stamp`` (k,): us since the start.
     """
     good = (
         (stamp >= 0)
@@ -538,6 +556,6 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
 
 
 def per_time(change: Array, seconds: NDArray[Any]) -> Array:
-    """Divide changes (k, 3) by the times (k,) that they took, s; NaN: the log does not say how long."""
+    """Divide changes (k, 3) by their durations (k,), s, NaN for unknown durations."""
     seconds = seconds.astype(np.float64)
     return change / np.where(seconds > 0, seconds, np.nan)[:, None]

@@ -15,20 +15,21 @@ from fdi_ros.system.files import (
     PORTION_BYTES,
 )
 
-_TOGETHER = 4096  # messages handed on at once, at most
-Message = tuple[
-    int, int, bytes
-]  # number of its topic in the file, time of recording, ns, and content
+#: messages handed on at once, at most
+_TOGETHER = 4096
+#: number of its topic in the file, time of recording, ns, and content
+Message = tuple[int, int, bytes]
 
 
 class LibraryBag(BagFile):
     """An open bag that a library reads."""
 
-    _numbered: dict[int, Topic]  # by their numbers in the file
+    #: by their numbers in the file
+    _numbered: dict[int, Topic]
 
     @abstractmethod
     def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        """Yield the messages of one topic or more, in the order of recording, up to the first that cannot be read."""
+        """Yield the messages of some topics in the order of recording, up to the first error."""
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""

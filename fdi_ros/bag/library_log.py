@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Logs that a library reads whole; the samples are handed on portion by portion."""
+"""Logs that a library reads whole, with samples handed on in portions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ from fdi_ros.bag.flight_log import (
 from fdi_ros.errors import BagError
 
 Columns = Mapping[str, NDArray[Any]]
-"""(k,) values of each field of k messages; pyulog has those of an array as fields ``name[0]``, ``name[1]``, ..."""
+"""(k,) values of each field of k messages. Elements of an array are fields ``name[0]``."""
 
 
 class LibraryLog(FlightLog):
     """An open log, read whole."""
 
-    most: ClassVar[int]  # bytes that it may have
-    together: ClassVar[int]  # messages of a source handed on at once, about
+    #: largest size, bytes
+    most: ClassVar[int]
+    #: messages of a source handed on at once, about
+    together: ClassVar[int]
 
     def begin(self) -> None:
         """Begin a walk, and read the log up to `end`."""
@@ -40,11 +42,11 @@ class LibraryLog(FlightLog):
 
     @abstractmethod
     def load(self, data: bytes) -> dict[Source, Columns]:
-        """Return the messages of IMUs; what else is told is taken in."""
+        """Return the messages of IMUs, and take texts and counts."""
 
     @abstractmethod
     def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
-        """Return the samples in messages of a kind; None: they lack a field, or have another form."""
+        """Return the samples in messages of a kind, None if a field is missing or malformed."""
 
     def portions(self) -> Iterator[Portion]:
         """Return the samples, some of each source together."""

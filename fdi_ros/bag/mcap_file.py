@@ -3,9 +3,10 @@
 
 """One MCAP file, read in bounded memory, whole or damaged.
 
-The records are walked from the start, without trust in footer, summary or indexes: a recording cut off by a crash has
-none of them. The first walk reads the headers of the chunks and skips their contents: that gives their order in time.
-The second reads the chunks in that order. The layout of the records: https://mcap.dev/spec.
+Records are walked from the start. Footer, summary and indexes are not trusted: a
+recording that a crash cut off has none. The first walk reads only the headers of chunks
+and finds their order in time. The second one reads the chunks in that order. Layout of
+the records: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -51,17 +52,20 @@ from fdi_ros.system.files import (
 )
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
-_PREFIX = 9  # bytes of a record before its content: opcode, length of the content
-_HEAD = 22  # bytes of a message record before the message: channel, sequence, log time, publish time
+#: bytes of a record before its content: opcode, length of the content
+_PREFIX = 9
+#: bytes of a message record before the message: channel, sequence, log time, publish
+#: time
+_HEAD = 22
 
 
 def decompress(
     data: bytes, compression: str, size: int, crc: int, cut: bool
 ) -> tuple[bytes, str]:
-    """Decompress a chunk (``zstd``, ``lz4`` or empty) to ``size`` bytes; a ``crc`` of 0 is not checked.
+    """Decompress a chunk (``zstd``, ``lz4`` or empty) to ``size`` bytes.
 
-    Of one that is known to be cut off, what comes out is returned. With the bytes: what is wrong with them, empty if
-    nothing.
+    A ``crc`` of 0 is not checked. A chunk known to be cut off gives all that
+    decompresses. Returns the bytes and a description of the damage, which may be empty.
     """
     if max(size, len(data) if not compression else 0) > CHUNK_BYTES:
         return (
@@ -95,11 +99,12 @@ def decompress(
 def walk(
     data: bytes, outside: bool = False
 ) -> tuple[Batch, list[tuple[int, bytes]], int]:
-    """Find the records in a run of bytes; one that is incomplete ends the walk.
+    """Find the records in a run of bytes, up to the first incomplete one.
 
-    Outside chunks a chunk, the statistics and the footer end it, too. Returned are the messages, with the numbers of
-    their channels as topics; opcode and content of schema and channel records; and where the walk ended: the length of
-    the data unless it is damaged, or another record stopped it.
+    Outside chunks, a chunk, the statistics or the footer also end the walk. Returns the
+    messages with channel numbers as topics, opcode and content of schemas and channels,
+    and the end of the walk: the length of the data unless damage or another record
+    ended it.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     # The first walk only counts.
@@ -123,10 +128,11 @@ def walk(
 def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
     """Find messages, schemas and channels in a run of bytes, as `walk` does.
 
-    Schemas and channels beyond the first `DESCRIPTIONS` are skipped: an empty record takes
-    9 bytes, and listing millions of them would take 40 bytes each. ``found`` (5, room)
-    receives per record: opcode, channel and log time (messages only), offset, length.
-    Returns the number of records, those beyond the room included, and where the walk ended.
+    Schemas and channels beyond the first `DESCRIPTIONS` are skipped: an empty record
+    takes 9 bytes, and listing millions of them would take 40 bytes each. ``found`` (5,
+    room) receives per record: opcode, channel and log time (messages only), offset,
+    length. Returns the number of records, those beyond the room included, and the end
+    of the walk.
     """
     count = position = descriptions = 0
     while position + _PREFIX <= len(data):
@@ -159,22 +165,26 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
 T = TypeVar("T")
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-_RUN = 1 << 18  # messages outside chunks are read in runs of at most this many bytes
-_TOGETHER = (
-    1 << 16
-)  # pieces are handed on together until they hold so many bytes: each batch has its cost
+#: messages outside chunks are read in runs of at most this many bytes
+_RUN = 1 << 18
+#: bytes of pieces that form one batch, since each batch has a cost
+_TOGETHER = 1 << 16
 
 
 class Piece(NamedTuple):
-    """A chunk, or a run of messages outside chunks: what is read at once."""
+    """A unit of reading: a chunk, or a run of messages outside chunks."""
 
-    start_time: int  # ns
+    #: ns
+    start_time: int
     offset: int
-    size: int  # bytes in the file
-    raw_size: int  # bytes when decompressed
+    #: bytes in the file
+    size: int
+    #: bytes when decompressed
+    raw_size: int
     crc: int = 0
     compression: str = ""
-    cut: bool = False  # the file ends within it
+    #: whether the file ends inside
+    cut: bool = False
 
 
 class McapFile(BagFile):
@@ -232,7 +242,7 @@ class McapFile(BagFile):
                 continue
             found, waiting, held = Batch.joined(waiting), [], 0
             if len(self._channels) != known:
-                # Reading describes channels as it goes on.
+                # Reading may describe further channels.
                 known, number = len(self._channels), np.full(1 << 16, -1)
                 for channel in self._channels.values():
                     number[channel.id] = (
@@ -246,9 +256,9 @@ class McapFile(BagFile):
             yield from self._unpacked(batch, topics)
 
     def _unpacked(self, batch: Batch, topics: Sequence[str]) -> Iterator[Batch]:
-        """Unpack messages that were compressed one by one (``--compression-mode message``).
+        """Unpack messages compressed one by one (``--compression-mode message``).
 
-        Only types that may carry gyros are unpacked; other messages are merely counted.
+        Only types that may carry gyros are unpacked. Other messages are merely counted.
         """
         types = {one.name: one.type for one in self.topics}
         gyros = [source_of_type(types.get(name, "")) is not None for name in topics]
@@ -296,7 +306,7 @@ class McapFile(BagFile):
             end = position + _RECORD.size + length
             left -= 1
             if opcode == FOOTER:
-                # Bytes of damage may look like a footer: what is behind it is not left out without a word.
+                # Damaged bytes may look like a footer, so any rest behind one is noted.
                 if end + len(self.magic) != self.size:
                     self.note(
                         f"it has a footer at byte {position} of {self.size}: read up to there"
@@ -349,7 +359,7 @@ class McapFile(BagFile):
         self.note(f"the chunk at byte {offset} has a damaged header and was left out")
 
     def _scan_run(self, position: int, end: int) -> int:
-        """Note the run of messages outside chunks whose first one stands here; return where the run ends."""
+        """Note the run of messages outside chunks that begins here, and return its end."""
         if end - position > CHUNK_BYTES:
             self.note(f"the message at byte {position} is too long and was left out")
             return end
@@ -369,7 +379,7 @@ class McapFile(BagFile):
         return self.file.read(size)
 
     def _messages(self, piece: Piece) -> Batch:
-        """Read a piece, topics as numbers of channels; what is wrong is noted, what cannot be read left out."""
+        """Read a piece, with channel numbers as topics. Damage is noted and left out."""
         stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
         data, wrong = decompress(
             stored, piece.compression, piece.raw_size, piece.crc, piece.cut
@@ -384,7 +394,7 @@ class McapFile(BagFile):
         return found
 
     def _describe(self, opcode: int, content: bytes) -> None:
-        """Take in a description of a topic; the first of each number counts."""
+        """Take a description of a topic. The first one with each number counts."""
         what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(
             opcode, "summary"
         )
@@ -407,7 +417,7 @@ class McapFile(BagFile):
             self.note(f"a {what} is damaged and was left out")
 
     def _keep(self, known: dict[int, T], number: int, what: T, name: str) -> None:
-        """Keep a description, if it is the first of its number and within the limits."""
+        """Keep the first description with each number, within the limits."""
         if number in known:
             return
         if len(name) > NAME:

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all recordings have in common: their files, topics, and batches of messages as they were sent."""
+"""Common parts of all recordings: files, topics, and batches of raw messages."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ from fdi_ros.system.files import FILES, open_regular
 from fdi_ros.system.text import shown
 from fdi_ros.system.yaml_file import read_yaml
 
-MOST_SHOWN = 400  # characters of what is said of one place
+#: characters shown about one place
+MOST_SHOWN = 400
 _COLUMNS = ("topic", "log_time", "offset", "length")
-NO_HORIZON = 2**63 - 1  # horizon of the last batch: nothing comes after it
+#: horizon of the last batch, after which nothing follows
+NO_HORIZON = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -35,26 +37,34 @@ class Topic:
     name: str
     type: str
     encoding: str = "cdr"
-    count: int = 0  # number of messages
+    #: number of messages
+    count: int = 0
 
 
 @dataclass(frozen=True)
 class Batch:
     """k messages of the topics asked for, in the order in which they lie in the file."""
 
-    buffer: Bytes  # the bytes that the messages lie in, (B,)
-    topic: Int  # (k,) index into the topics asked for
-    log_time: Int  # (k,) time of recording, ns
-    offset: Int  # (k,) first byte of the message in the buffer
-    length: Int  # (k,) bytes
-    horizon: int  # no later batch brings a message recorded before this, ns
-    progress: float  # share of the recording read up to here, 0 to 1
+    #: the bytes that the messages lie in, (B,)
+    buffer: Bytes
+    #: (k,) index into the topics asked for
+    topic: Int
+    #: (k,) time of recording, ns
+    log_time: Int
+    #: (k,) first byte of the message in the buffer
+    offset: Int
+    #: (k,) bytes
+    length: Int
+    #: no later batch brings a message recorded before this, ns
+    horizon: int
+    #: share of the recording read up to here, 0 to 1
+    progress: float
 
     def __len__(self) -> int:
         return len(self.topic)
 
     def at(self, rows: NDArray[np.bool_]) -> Batch:
-        """Return some of the messages; rows (k,) says which."""
+        """Return the messages selected by rows (k,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _COLUMNS}
         return replace(self, **columns)
 
@@ -90,9 +100,9 @@ def starts_with(batch: Batch, head: bytes) -> NDArray[np.bool_]:
 
 
 def unpack_message(data: bytes, most: int) -> bytes:
-    """Unpack a message that is a zstd frame, to at most so many bytes.
+    """Unpack a message that is a zstd frame, to at most this many bytes.
 
-    A damaged one comes out empty, and is counted as malformed when it is decoded.
+    A damaged frame gives no bytes, which decoding counts as malformed.
     """
     try:
         return zstandard.ZstdDecompressor().stream_reader(data).read(max(most, 0))
@@ -102,15 +112,16 @@ def unpack_message(data: bytes, most: int) -> bytes:
 
 @dataclass
 class Damage:
-    """What of a recording could not be read, one line per place."""
+    """Unreadable parts of a recording, one line per place."""
 
     lines: list[str] = field(default_factory=list)
     more: int = 0
 
-    MOST = 20  # lines kept; the rest is counted
+    #: lines kept, while further ones are only counted
+    MOST = 20
 
     def add(self, line: str) -> None:
-        """Note one place, in words fit to be shown; a line already there is not repeated."""
+        """Note one place, escaped for display. Repeated lines are dropped."""
         line = shown(line, MOST_SHOWN)
         if line in self.lines:
             return
@@ -123,32 +134,35 @@ class Damage:
         return bool(self.lines)
 
     def report(self) -> tuple[str, ...]:
-        """Return the lines, and the number of those that were too many."""
+        """Return the lines, and the number of dropped ones."""
         return (*self.lines, *([f"{self.more} more places"] if self.more else []))
 
 
 class LogText(NamedTuple):
-    """What the autopilot of a flight log said of itself."""
+    """A text of the autopilot in a flight log."""
 
-    stamp: int  # time of recording, ns; while the log is read, us as of its samples
-    kind: str  # message it was logged in: MSG, ERR, or the severity
+    #: time of recording, ns; us of the samples while the log is being read
+    stamp: int
+    #: logged message (MSG, ERR) or severity
+    kind: str
     text: str
 
 
 class BagFile(ABC):
-    """One open file of a recording, which may unpack to ``most`` bytes; ``damage`` takes what cannot be read of it.
+    """One open file of a recording, which may unpack to ``most`` bytes.
 
-    `BagError` if it cannot be opened, is empty, or does not begin with `magic`.
+    Damage is noted in ``damage``. `BagError` if the file cannot be opened, is empty, or
+    does not begin with `magic`.
     """
 
-    magic: ClassVar[bytes]  # first bytes of a file
-    refusal: ClassVar[str]  # what is said of a file that begins with others
-    topics: tuple[
-        Topic, ...
-    ]  # one that several publishers wrote may come several times
-    start_time: (
-        int  # time of recording of the first message, ns; without messages `NO_HORIZON`
-    )
+    #: first bytes of a file
+    magic: ClassVar[bytes]
+    #: refusal of a file that begins otherwise
+    refusal: ClassVar[str]
+    #: one that several publishers wrote may come several times
+    topics: tuple[Topic, ...]
+    #: time of the first message, ns, or `NO_HORIZON`
+    start_time: int
     texts: tuple[LogText, ...] = ()
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
@@ -175,7 +189,7 @@ class BagFile(ABC):
         """Read the messages of the topics."""
 
     def note(self, line: str) -> None:
-        """Note what cannot be read, or what a reader must know."""
+        """Note damage, or a fact that readers must know."""
         self._damage.add(f"{self.path.name}: {line}")
 
     def close(self) -> None:
@@ -185,18 +199,20 @@ class BagFile(ABC):
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
-"""Of flight logs, tables and bags of ROS 1, in capitals too: each is a recording of its own, never part of a folder."""
+"""Suffixes, in any case, of flight logs, tables and ROS 1 bags: single-file recordings."""
 EXPECTED = (
     "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
 )
-LFS = b"version https://git-lfs."  # what a file begins with that git has put in the place of a large one
-MADE_BY_FDI = "fdi_ros"  # key in the custom data of the metadata.yaml of an output bag
+#: first bytes of the placeholder that git-lfs leaves for a large file
+LFS = b"version https://git-lfs."
+#: key in the custom data of the metadata.yaml of an output bag
+MADE_BY_FDI = "fdi_ros"
 
 
 def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
-    """Find the files of a recording, a folder or a file; ``damage`` takes what is wrong with metadata.yaml.
+    """Find the files of a recording, which is a folder or a file.
 
-    `BagError` if there is no recording.
+    ``damage`` receives the defects of metadata.yaml. `BagError` if nothing is found.
     """
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(
@@ -214,7 +230,7 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     there = [name for name in names if os.path.isfile(path / name)]
     for name in names.keys() - set(there):
         damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
-    # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
+    # metadata.yaml is written last. Without it, numbers in the names give the order.
     paths = [path / name for name in there] or sorted(
         (
             child
@@ -233,7 +249,7 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
 
 
 def tables_of(folder: Path) -> tuple[Path, ...]:
-    """Return the tables (.csv) of a folder that holds no bag, by name; empty: it has none."""
+    """Return the tables (.csv) of a folder without a bag, by name."""
     names = sorted(os.listdir(folder), key=natural_order)
     if any(name == "metadata.yaml" or name.endswith(SUFFIXES) for name in names):
         return ()
@@ -249,15 +265,15 @@ def natural_order(name: str) -> list[int | str]:
 
 
 def is_made_by_fdi(folder: Path) -> bool:
-    """Whether a rosbag2 folder is one that fdi has written."""
+    """Whether fdi wrote this rosbag2 folder."""
     custom = _metadata(folder, Damage()).get("custom_data")
     return isinstance(custom, dict) and MADE_BY_FDI in custom
 
 
 def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
-    """Return the files of a rosbag2 folder, none if they are lost; None: it is another folder.
+    """Return the files of a rosbag2 folder, empty if lost, None for other folders.
 
-    Other programs call their files metadata.yaml, too: without recordings such a folder is another one.
+    Other programs write metadata.yaml, too, so recordings must be present.
     """
     if not (folder / "metadata.yaml").is_file():
         return None

@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording: a rosbag2 folder with one or several files, one bare file of it, or a flight log; and its conversion.
+"""A recording of any format, and its conversion to a bag.
 
-Damaged, it is read as far as it goes.
+Damaged recordings are read as far as possible.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class _FileWalk:
         self.done = False
 
     def take(self) -> Batch | None:
-        """Return the next batch; None: the file has been read."""
+        """Return the next batch, or None at the end of the file."""
         batch = next(self._batches, None)
         self.done = batch is None
         self.horizon = NO_HORIZON if batch is None else batch.horizon
@@ -80,10 +80,11 @@ class _FileWalk:
 
 
 class Recording:
-    """An open recording; close it, or use it in a with statement.
+    """An open recording, to be closed or used in a with statement.
 
-    ``path``: a rosbag2 folder, or one file: .mcap, .db3, .bag (ROS 1), .csv, .bin (ArduPilot), .ulg (PX4) or .tlog
-    (ground stations). `BagError` if there is no such recording or nothing in it can be read.
+    ``path``: rosbag2 folder, folder of tables, or a file: .mcap, .db3, .bag (ROS 1),
+    .csv, .bin (ArduPilot), .ulg (PX4) or .tlog (ground stations). `BagError` if nothing
+    readable is found.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -109,7 +110,7 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the files and remove what was unpacked."""
+        """Close the files and remove unpacked ones."""
         for file in self._files:
             file.close()
         self._scratch.close()
@@ -132,11 +133,11 @@ class Recording:
 
     @property
     def texts(self) -> tuple[LogText, ...]:
-        """What the autopilot of a flight log said of itself, with times of recording, ns, in their order."""
+        """Texts of the autopilot in a flight log, in order, with times of recording, ns."""
         return tuple(sorted(text for file in self._files for text in file.texts))
 
     def require(self, names: Sequence[str], type_name: str) -> None:
-        """Check that topics are there, of the type and serialised as CDR; else `BagError`, with those there are."""
+        """Check that topics exist with this type and CDR encoding (`BagError`)."""
         there = {topic.name: topic for topic in self.topics}
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
@@ -182,7 +183,7 @@ class Recording:
             yield batch
 
     def _open_all(self, paths: Sequence[Path]) -> None:
-        """Open the files; a folder of tables holds one IMU in each.
+        """Open the files. A folder of tables holds one IMU in each.
 
         `BagError` if none can be opened.
         """
@@ -199,7 +200,7 @@ class Recording:
             raise refused[0]
 
     def _open(self, path: Path) -> BagError | None:
-        """Open a file; why it cannot be is noted and returned: of several files the others are read."""
+        """Open a file. An error is noted and returned, and the other files are still read."""
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
             # metadata.yaml may name files of any suffix.
@@ -240,12 +241,12 @@ class Recording:
 def convert(
     recording: Recording, path: Path, progress: Callable[[float], None]
 ) -> dict[str, int]:
-    """Write the messages of a recording that may be of gyros, byte for byte, with their times of recording.
+    """Copy the messages of possible gyros into a new bag, byte for byte.
 
-    ``path``: folder to be made, which must not exist; ``progress`` is told the share done, 0 to 1. Returns the number
-    of messages of each topic; `BagError` if the recording has none.
+    ``path``: folder to create. ``progress`` receives the share done, 0 to 1. Returns
+    the number of messages of each topic. `BagError` if no topic may hold gyros.
     """
-    # Imported lazily: readers do not need it.
+    # Only conversion needs the writer.
     from rosbags.rosbag2 import (
         CompressionFormat,
         CompressionMode,
@@ -267,7 +268,7 @@ def convert(
     store = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    # By this it may be replaced later: what anything else has recorded never is.
+    # This mark allows a later run to replace the bag.
     writer.set_custom_data(MADE_BY_FDI, __version__)
     with writer:
         connections = [

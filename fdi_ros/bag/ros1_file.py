@@ -38,7 +38,7 @@ _WRONG = (
     *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
     *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
 )
-"""What rosbags and the unpacking libraries raise of a damaged bag."""
+"""Exceptions of rosbags and of the unpacking libraries for a damaged bag."""
 _UNPACKERS = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
@@ -47,12 +47,12 @@ _UNPACKERS = {
 
 
 class _Bounded(io.BufferedReader):
-    """A file of which a reader reads so much in all, and so much at once."""
+    """A file that limits the bytes read in total and at once."""
 
     left = ROS1_INDEX_BYTES
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes."""
+        """Read at most this many bytes."""
         self.left -= size or 0
         if self.left < 0 or (size or 0) > PORTION_BYTES:
             raise ReaderError(
@@ -62,7 +62,7 @@ class _Bounded(io.BufferedReader):
 
 
 class Ros1File(LibraryBag):
-    """An open bag of ROS 1; it must have an index, of bounded size."""
+    """An open ROS 1 bag with an index of bounded size."""
 
     magic = b"#ROSBAG V2.0\n"
     refusal = "is not a bag of ROS 1"
@@ -110,7 +110,7 @@ class Ros1File(LibraryBag):
             self.note(f"it is damaged ({error}): read up to there")
 
     def _converted(self, data: bytes, kind: str) -> bytes:
-        """Return a message as ROS 2 has it; a damaged one comes out empty, and is counted as malformed later."""
+        """Convert a message to ROS 2. A damaged one becomes empty, which counts as malformed."""
         if source_of_type(kind) is None:
             return b""
         try:

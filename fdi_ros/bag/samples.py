@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording as a stream of samples: decoded, put into the order of recording, aligned."""
+"""A recording as a stream of samples: decoded, ordered by time of recording, aligned."""
 
 from __future__ import annotations
 
@@ -22,32 +22,37 @@ from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.building import build_geometry
 
-_TOGETHER = 16384  # messages handed on together: enough that calls do not count, little enough for the cache
-_HELD = 1 << 20  # messages that wait for earlier ones at most
+#: messages handed on together: enough that calls do not count, little enough for the
+#: cache
+_TOGETHER = 16384
+#: messages that wait for earlier ones at most
+_HELD = 1 << 20
 RATE_TOLERANCE = 0.2
-"""Share by which a recording may be faster or slower than configured: beyond, every threshold and time is wrong."""
+"""Relative error of a configured sample rate at which thresholds and times are wrong."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
-"""Samples from which the rate of a recording is told, and steps between samples that this takes at least."""
-Rows = NDArray[Any]  #: decoded messages, by field
-Tap = Callable[
-    [Batch, Int], None
-]  #: is shown each batch and the numbers of the messages in it that are used
+"""Samples that determine the rate of a recording, and the fewest intervals for that."""
+#: decoded messages, by field
+Rows = NDArray[Any]
+#: receives each batch and the numbers of its messages in use
+Tap = Callable[[Batch, Int], None]
 
 
 class Newest(NamedTuple):
     """How far a topic has come."""
 
     received: int = 0
-    log_time: int = 0  #: of its last message, ns; 0 before the first
+    #: time of recording of the last message, ns, 0 before the first
+    log_time: int = 0
     stamp: int = 0
 
 
 class Samples:
-    """The samples of a recording, block after block.
+    """The samples of a recording, block by block.
 
-    ``start``, ``end``: part to be read, s from the first message. ``taps`` are shown every batch of raw messages with
-    those that are used. ``period``: blocks are cut at multiples of this time of recording, ns; 0: where it is fastest.
-    `BagError` if a topic of the config is missing or of another type.
+    ``start``, ``end``: part to read, s from the first message. ``taps`` receive every
+    batch of raw messages and the rows in use. ``period``: blocks end at multiples of
+    this time of recording, ns; 0 chooses the fastest size. `BagError` if a topic of the
+    config is missing or has another type.
     """
 
     def __init__(
@@ -73,29 +78,35 @@ class Samples:
             ("values", "f8", (self._width,)),
         ]
         self._row = np.dtype(columns)
-        """Of a decoded message: index of the input topic, times, ns (the time of recording where it carries no stamp),
-        rates, rad/s."""
+        """Decoded message: index of the topic, times, ns (without a stamp the time of
+        recording), rates, rad/s.
+        """
         self._span = (start, end)
         self._taps = taps
         self.period = period
         self._configured = config.sample_rate
         self._first: (
             list[Int] | None
-        ) = []  # stamps of the first samples, ns; None: their rate was checked.
+        ) = []  # stamps of the first samples, ns; None after the check of the rate
         self._last = -1
         self.origin: int | None = None
-        """Stamp of the first message, ns: the times of faults, start and end count from here."""
+        """Stamp of the first message, ns, the origin of the times of faults, start and
+        end.
+        """
         self.messages = 0  #: used so far
         self.malformed = dict.fromkeys(
             self.topics, 0
-        )  #: messages of each topic that do not hold what they should
+        )  #: malformed messages of each topic
         self.disordered = 0  #: messages without a stamp recorded before one that was handed on already: left out
         self.progress = 0.0  #: share of the recording read so far
         self.newest = [Newest() for _ in self.topics]
-        """Last message of each topic in the blocks so far; kept only where blocks are cut by period."""
+        """Last message of each topic so far, if blocks are cut by period."""
 
     def blocks(self) -> Iterator[Block]:
-        """Read the recording; `BagError` if no message can be used, or the rate is another than configured."""
+        """Read the recording.
+
+        `BagError` if no message can be used, or the rate contradicts the config.
+        """
         for messages in self._portions():
             self.messages += len(messages)
             if self.period:
@@ -112,7 +123,7 @@ class Samples:
         self._check_rate(None)
 
     def _check_rate(self, stamp: Int | None) -> None:
-        """Take the stamps (k,) of a block, ns, None at the end, and check the rate once enough are there."""
+        """Collect stamps (k,), ns, and check the rate once enough arrived; None at the end."""
         if self._first is None:
             return
         self._first += [] if stamp is None else [stamp]
@@ -125,7 +136,7 @@ class Samples:
             self._first = None
 
     def _portions(self) -> Iterator[Rows]:
-        """Put messages together, or apart, into what becomes a block."""
+        """Join or split messages into blocks."""
         together = np.empty(0, self._row)
         for messages in self._ordered():
             together = np.concatenate([together, messages])
@@ -206,7 +217,7 @@ class Samples:
             yield held
 
     def _decoded(self, batch: Batch) -> Rows:
-        """Decode a batch; malformed messages are counted and left out, and so is what lies outside the span."""
+        """Decode a batch; malformed messages and those outside the span are left out."""
         decoded = self.source.decode(
             batch.buffer, batch.offset, batch.length, self._width
         )
@@ -228,10 +239,11 @@ class Samples:
 
 
 def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:
-    """Check that samples of a recording, stamped (k,) ns, come about as often as configured, Hz.
+    """Check that samples with stamps (k,), ns, have the configured rate, Hz.
 
-    `BagError` if both the median and the mean, gaps left out, are off by more than `RATE_TOLERANCE`: neither samples
-    that are lost nor samples that come in bursts are a wrong rate. Of fewer than 51 nothing is known.
+    `BagError` if both the median and the mean without gaps are off by more than
+    `RATE_TOLERANCE`: lost samples and bursts change only one of them. Fewer than 51
+    stamps are not checked.
     """
     steps = np.sort(np.diff(stamp)) * 1e-9
     if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
@@ -251,7 +263,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
 def read_block(
     bag: Path, config: Config, start: float = 0.0, end: float = math.inf
 ) -> Block:
-    """Read all samples of a part of a recording, aligned as in a replay; `BagError` as of `Recording` and `Samples`."""
+    """Read a part of a recording, aligned as in a replay (errors as `Recording`, `Samples`)."""
     with Recording(bag) as recording:
         return joined(list(Samples(recording, config, start, end).blocks()))
 

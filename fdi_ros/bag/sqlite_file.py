@@ -3,11 +3,11 @@
 
 """rosbag2 databases (.db3), read by SQLite.
 
-A database may hold more than values: views, virtual tables and computed columns run the
-code of their author. Only plain tables are read, within a number of steps that follows
-from the size of the file. SQLite writes beside a file that it reads, and a rollback
-journal may delete any file. The file is therefore opened as one that never changes. With
-a write-ahead log beside it, a copy of both is read.
+A database may hold code: views, virtual tables and computed columns run expressions of
+their author. Only plain tables are read, within a number of steps that follows from the
+size of the file. SQLite also writes beside a file, and a rollback journal may delete
+any file. The file is therefore opened as immutable. With a write-ahead log beside the
+file, a copy of both is read.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from fdi_ros.system.files import (
     scratch_folder,
 )
 
-_TICK = 10_000  # steps of SQLite from one look at the clock of signals and steps to the next
+#: steps of SQLite from one look at the clock of signals and steps to the next
+_TICK = 10_000
 
 
 class SqliteFile(LibraryBag):
@@ -50,7 +51,7 @@ class SqliteFile(LibraryBag):
         self.file.close()
         self._open = (
             contextlib.ExitStack()
-        )  # what is to be closed: the database, then the folder of its copy
+        )  # to be closed: the database, then the folder of its copy
         self._steps = STEPS + STEPS_PER_BYTE * self.size
         try:
             self._base = self._opened()
@@ -104,7 +105,7 @@ class SqliteFile(LibraryBag):
         return base
 
     def _copied(self, log: Path) -> Path:
-        """Copy the file and its write-ahead log into a temporary folder, where SQLite may write as it likes."""
+        """Copy the file and its write-ahead log to a temporary folder for SQLite."""
         folder = self._open.enter_context(scratch_folder("fdi_bag"))
         room, size = (
             shutil.disk_usage(folder).free // 2,
@@ -120,14 +121,14 @@ class SqliteFile(LibraryBag):
         return folder / self.path.name
 
     def _tick(self) -> bool:
-        """Count the steps of SQLite; a signal that arrives while it works is dealt with before this returns."""
+        """Count the steps of SQLite. A pending signal is handled before this returns."""
         self._steps -= _TICK
         return self._steps < 0
 
     def _query(
         self, text: str, values: Sequence[Any] = ()
     ) -> Iterator[tuple[Any, ...]]:
-        """Rows of a query; whatever goes wrong is an error of SQLite, or the user's wish to stop."""
+        """Yield the rows of a query. All failures become SQLite errors or KeyboardInterrupt."""
         try:
             yield from self._base.execute(text, values)
         except sqlite3.OperationalError as error:
@@ -136,7 +137,7 @@ class SqliteFile(LibraryBag):
                     "reading takes more steps than a file of its size needs"
                 ) from error
             if "interrupt" in str(error):
-                # What the signal raised inside the handler ends the query and goes no further.
+                # The exception of a signal handler only interrupts the query.
                 raise KeyboardInterrupt from error
             raise
         except (MemoryError, UnicodeError, OverflowError) as error:
@@ -185,9 +186,11 @@ class SqliteFile(LibraryBag):
 
     def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
         last = -1
-        # A damaged database may not be sorted by time any more and still be read in the order in which it was written.
+        # A damaged database may have lost its index by time and keep the order of
+        # writing.
         for order in ("timestamp", "id"):
-            # What is sorted is in memory, and so comes without the messages themselves.
+            # Sorting happens in memory, so the query leaves out the messages
+            # themselves.
             which = f"topic_id IN ({','.join('?' * len(numbers))}) AND timestamp > ? ORDER BY {order}"
             asked = f"SELECT rowid, topic_id, timestamp FROM messages WHERE {which}"
             try:
@@ -213,7 +216,7 @@ class SqliteFile(LibraryBag):
             return
 
     def _message(self, row: int) -> Any:
-        """Return a message as it was sent; a damaged one comes out empty, and is counted as malformed later."""
+        """Return a message as sent. A damaged one is empty, which counts as malformed."""
         one = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
         (content,) = next(self._query(one, (row, CHUNK_BYTES)), (None,))
         if content is None:

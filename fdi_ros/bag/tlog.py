@@ -3,12 +3,11 @@
 
 """Telemetry logs of ground stations (.tlog), decoded by pymavlink.
 
-A record is 8 bytes of time (us since 1970, big endian), which is when the message came
-over the link, and a message of MAVLink 1 or 2. A record counts only where another one
-begins behind it; its checksum is verified where its message is used. The messages of
-one autopilot are read, by the description that also serves a live link
-(`fdi_ros.mavlink.protocol`). Stamps are the autopilot's own; UTC is taken from the
-message with the least delay.
+A record is 8 bytes of time (us since 1970, big endian), when the message came over the
+link, and a message of MAVLink 1 or 2. A record counts only if another one follows
+directly. Messages in use also need a valid checksum. One autopilot is read, by the
+description that also serves a live link (`fdi_ros.mavlink.protocol`). Stamps are the
+autopilot's own. UTC comes from the message with the least delay.
 """
 
 from __future__ import annotations
@@ -46,12 +45,15 @@ from fdi_ros.system.files import (
 
 _HEARTBEAT, _STATUSTEXT = 0, 253
 _AUTOPILOT_COMPONENT = 1
-_MARKS = (0xFE, 0xFD)  # first bytes of messages of MAVLink 1 and 2
+#: first bytes of messages of MAVLink 1 and 2
+_MARKS = (0xFE, 0xFD)
 _TIME = 8
-_LEAST = _TIME + 8  # bytes of the shortest record
+#: bytes of the shortest record
+_LEAST = _TIME + 8
 _MAX_DELAY_SPREAD = 3_600_000_000
-"""us; a message that came by so much more or less late than half of the others has a damaged time."""
-_LATEST = 1 << 53  # us; no time is later
+"""Delay relative to the median at which the time of a message is damaged, us."""
+#: largest time, us
+_LATEST = 1 << 53
 _ROW = struct.Struct("=3q6d")
 _COLUMNS = np.dtype(
     [
@@ -76,14 +78,15 @@ class Tlog(LibraryLog):
         "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
         " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
     )
-    slowest = 5.0  # many ground stations ask for no more than 10 Hz
+    #: many ground stations ask for no more than 10 Hz
+    slowest = 5.0
     most = TLOG_BYTES
     together = 1 << 16
 
     def load(self, data: bytes) -> dict[Source, Columns]:
         """Read the messages of IMUs that one autopilot sent.
 
-        It is the first with a HEARTBEAT, else the first that sent a message of an IMU.
+        The first autopilot with a HEARTBEAT is chosen, or else the first with an IMU.
         """
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
         texts: list[tuple[int, str]] = []
@@ -129,7 +132,7 @@ class Tlog(LibraryLog):
         }
 
     def _autopilot(self, data: bytes) -> tuple[int, int] | None:
-        """Return system and MAV_AUTOPILOT of the autopilot to read; None: there is none."""
+        """Return system and MAV_AUTOPILOT of the autopilot to read, or None."""
         for _, _, beat in self._messages(data, (_HEARTBEAT,)):
             if beat.autopilot != NO_AUTOPILOT:
                 return beat.get_srcSystem(), beat.autopilot
@@ -149,7 +152,7 @@ class Tlog(LibraryLog):
         )
 
     def portions(self) -> Iterator[Portion]:
-        """Return the samples; at the end, say what was left out."""
+        """Return the samples, and note the bytes left out."""
         yield from super().portions()
         if self._lost:
             self.note(f"{self._lost} bytes belong to no whole record and were left out")
@@ -157,9 +160,9 @@ class Tlog(LibraryLog):
     def _messages(
         self, data: bytes, numbers: tuple[int, ...]
     ) -> Iterator[tuple[int, int, Any]]:
-        """Yield the messages with these ids that an autopilot has sent, and that pymavlink accepts; count what is lost.
+        """Yield the valid messages of autopilots with these ids, and count the lost bytes.
 
-        Of each: where its record begins and ends in the file, bytes, and the message as pymavlink decodes it.
+        Yields begin and end of the record in the file, bytes, and the decoded message.
         """
         codec = dialect()
         parser = codec.MAVLink(None)
@@ -189,7 +192,7 @@ class Tlog(LibraryLog):
 
 
 def record_end(data: bytes, at: int) -> int:
-    """Return where the record at a place ends; 0: there is none, or none behind it that proves it."""
+    """Return the end of the record at a byte, 0 if none, or if no record follows."""
     mark = data[at + _TIME]
     if data[at] != 0 or mark not in _MARKS:
         return 0
@@ -202,7 +205,7 @@ def record_end(data: bytes, at: int) -> int:
 
 
 def _start_utc_by(starts: Sequence[Int]) -> int | None:
-    """Return the UTC of the start of the autopilot by that of each message: of the one with the least delay."""
+    """Return the UTC of the start of the autopilot by the message with the least delay."""
     ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
     near = (
         ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD]

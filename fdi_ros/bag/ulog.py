@@ -3,16 +3,16 @@
 
 """PX4's ULog files (.ulg, .ulog), read whole by pyulog.
 
-Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and
+Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles and
 the time that each took) and sensor_gyro_fifo (board frame, all samples of the sensor,
-stamped with the last). By default these are logged at 1 to 2 Hz, and so is
-vehicle_imu_status (body frame, calibrated: the mean of the last 0.1 s). From a default
-log the means are read, for a coarse check. Times count from the start of the autopilot;
-a simulation on the clock of the computer stamps with dates.
+stamped with the last). By default these are logged at 1 to 2 Hz, as is
+vehicle_imu_status (body frame, calibrated: the mean of the last 0.1 s). The means of a
+default log serve a coarse check. Times count from the start of the autopilot. A
+simulation on the clock of its computer stamps with dates.
 
-pyulog keeps one object per message that is no sample and per field that a format
-announces, retries byte by byte where a file is damaged, and prints. The file that it
-gets therefore ends early when it holds more of these than any logger writes.
+pyulog keeps one object per message without samples and per announced field, retries
+byte by byte in damaged files, and prints. Its input is therefore cut off when a file
+holds more of these than any logger writes.
 """
 
 from __future__ import annotations
@@ -48,9 +48,11 @@ from fdi_ros.system.files import (
     ULOG_TOPIC_COST,
 )
 
-_HEAD = 3  # bytes of a message before its content: two of its size, one of its kind
+#: bytes of a message before its content: two of its size, one of its kind
+_HEAD = 3
 _SUBSCRIPTION, _DATA = b"AD"
-_DEEPEST = 16  # formats within formats
+#: formats within formats
+_DEEPEST = 16
 _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _GPS = ("sensor_gps", "vehicle_gps_position")
@@ -64,8 +66,9 @@ _WRONG = (
     TypeError,
     ValueError,
 )
-"""What pyulog raises of a damaged file."""
-_MEAN_TIME = 100_000  # us over which PX4 takes the means of vehicle_imu_status
+"""Exceptions of pyulog for a damaged file."""
+#: us over which PX4 takes the means of vehicle_imu_status
+_MEAN_TIME = 100_000
 _COUNTED = ("gyro_error_count", "gyro_clipping")
 _HELD = {
     "temperature_gyro": "{low:.1f} to {high:.1f} degC",
@@ -73,21 +76,22 @@ _HELD = {
     "gyro_error_count": "{high:.0f} errors",
     "gyro_clipping": "{high:.0f} samples clipped on an axis",
 }
-"""Fields of vehicle_imu_status that are said, and how; those counted only if not 0."""
-_FIX = 3  # fix_type from which on the time is known: a fix in three dimensions
+"""Fields of vehicle_imu_status to report, with their format; counters only if not 0."""
+#: fix_type from which on the time is known: a fix in three dimensions
+_FIX = 3
 
 
 class _Bounded(io.BytesIO):
-    """A file that ends where its messages that are no samples come to more than any logger writes."""
+    """A file that ends where messages without samples exceed those of any logger."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
         self.reached = 0  # up to there the file was read, bytes
-        self.cut = False  # it ends within a message
+        self.cut = False  # whether the file ends within a message
         self._left = ULOG_OTHER_BYTES
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes; a message begins with three."""
+        """Read bytes. A read of three bytes is the head of a message."""
         data = super().read(size) if self._left > 0 else b""
         if size == _HEAD and len(data) == _HEAD and data[2] != _DATA:
             cost = ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
@@ -114,7 +118,7 @@ class Ulog(LibraryLog):
     together = 1 << 14
 
     def load(self, data: bytes) -> dict[Source, Columns]:
-        """Read messages with pyulog, and tell what could not be read."""
+        """Read messages with pyulog, and note the damage."""
         require("reading PX4's logs (.ulg)", ("pyulog",))
         if (second := data.find(self.magic, 1)) > 0:
             self.note(
@@ -164,7 +168,7 @@ class Ulog(LibraryLog):
         return found | together
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
-        """Return the samples in messages of a kind; None: they lack a field, or have another form."""
+        """Return the samples in messages of a kind, None if a field is missing or malformed."""
         acceleration = None
         try:
             # Numbers of a damaged log may be anything.
@@ -182,7 +186,7 @@ class Ulog(LibraryLog):
                 elif kind == "sensor_gyro_fifo":
                     stamp, rate = _unpacked(stamp, columns)
                 elif kind == _STATUS:
-                    # Means of the last 0.1 s: at the middle of these.
+                    # The mean of 0.1 s belongs to the middle of that time.
                     stamp, rate = stamp - _MEAN_TIME // 2, _array(columns, "mean_gyro")
                 elif kind == _SELECTED:
                     rate = _array(columns, "gyro_rad")
@@ -201,7 +205,7 @@ class Ulog(LibraryLog):
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    """Return the messages of a topic: what was appended to a file begins with the topics anew."""
+    """Join the parts of a topic: data appended to a file repeats the topics."""
     if len(parts) == 1:
         return parts[0]
     common = set.intersection(*(set(part) for part in parts))
@@ -209,12 +213,12 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def _parsed(file: _Bounded, path: str) -> Any:
-    """Return a file as pyulog reads it; `BagError` if it does not."""
+    """Parse a file with pyulog. `BagError` if that fails."""
     from pyulog import ULog
     from pyulog.exceptions import ULogException, ULogIncompatibleFlagException
 
     try:
-        # pyulog prints what it thinks of a file.
+        # pyulog prints warnings.
         with contextlib.redirect_stdout(io.StringIO()):
             formats = ULog(
                 _Bounded(file.getvalue()), parse_header_only=True
@@ -238,7 +242,7 @@ def _parsed(file: _Bounded, path: str) -> Any:
 def count_fields(
     formats: Mapping[str, Any], name: str, known: dict[str, int], depth: int = 0
 ) -> int:
-    """Return the number of fields of a message with all that its formats nest, at most one more than is allowed."""
+    """Count the fields of a message with nested formats, up to one beyond the limit."""
     if name not in known:
         if depth > _DEEPEST:
             return ULOG_FIELDS + 1
@@ -254,9 +258,9 @@ def count_fields(
 
 
 def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
-    """Return the means of several IMUs at common stamps: those that were taken over mostly the same time.
+    """Return the means of several IMUs at common stamps, if taken over mostly the same time.
 
-    What is interpolated over a second of flight differs by more than any fault.
+    Interpolation over a second of flight differs by more than any fault.
     """
     stamps = {
         source: _stamp(columns)
@@ -285,9 +289,9 @@ def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
 def _status_words(
     topics: Mapping[Source, Columns], together: Mapping[Source, Columns]
 ) -> str:
-    """Say what vehicle_imu_status holds of each IMU, and how far means are apart.
+    """Describe each IMU in vehicle_imu_status, and the differences of the means.
 
-    ``together``: the means at common stamps. Empty if nothing is held.
+    ``together``: means at common stamps. Empty without such fields.
     """
     words = []
     means = [(one, _array(columns, "mean_gyro")) for one, columns in together.items()]
@@ -314,7 +318,7 @@ def _status_words(
 
 
 def _is_of(key: str, name: str) -> bool:
-    """Whether a column is the field of this name, or an element of it."""
+    """Whether a column is this field or an element of this field."""
     return key == name or key.startswith(f"{name}[")
 
 
@@ -330,13 +334,13 @@ def _nearest(stamp: Int, times: Int) -> Int:
 
 
 def _array(columns: Columns, name: str) -> NDArray[Any]:
-    """Return a field that is an array, (k, length); `ValueError` if there is none."""
+    """Return an array field, (k, length). `ValueError` if the field is missing."""
     there = takewhile(columns.__contains__, (f"{name}[{k}]" for k in count()))
     return np.stack([columns[one].astype(np.float64) for one in there], axis=1)
 
 
 def _stamp(columns: Columns) -> Int:
-    """Time of samples (k,), us since the start of the autopilot; before version 1.11 that of publication."""
+    """Return the times of samples (k,), us; before version 1.11 those of publication."""
     stamp = columns["timestamp"].astype(np.int64)
     if "timestamp_sample" not in columns:
         return stamp
@@ -345,7 +349,7 @@ def _stamp(columns: Columns) -> Int:
 
 
 def _unpacked(last: Int, columns: Columns) -> tuple[Int, Array]:
-    """Return all samples of k messages of sensor_gyro_fifo: equally spaced, the last (k,) of each at its time."""
+    """Return all samples of k FIFO messages, equally spaced up to their times (k,)."""
     raw = np.stack([_array(columns, axis) for axis in "xyz"], axis=-1)
     room = raw.shape[1]
     size = np.minimum(columns["samples"].astype(np.int64), room)
@@ -358,7 +362,7 @@ def _unpacked(last: Int, columns: Columns) -> tuple[Int, Array]:
 
 
 def _start_utc(columns: Columns) -> int | None:
-    """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
+    """Return the UTC of the start of the autopilot by GPS messages (k,), us since 1970."""
     if not {"timestamp", "time_utc_usec"} <= columns.keys():
         return None
     fixed = (

@@ -1,10 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings: frozen dataclasses, read from a ROS 2 parameter file, validated once, here.
+"""The settings of a monitor, read from a ROS 2 parameter file and validated once.
 
-The node and every offline command read the same file. Each field, here and in `settings.py`, is one ROS parameter,
-named ``<section>.<field>``; its unit, range and meaning stand beside it and are shown by ``ros2 param describe``.
+The node and all offline commands read the same file. Each field, here and in
+`settings.py`, is one ROS parameter ``<section>.<field>``. Unit, range and meaning are
+declared beside the field and appear in ``ros2 param describe``.
 """
 
 from __future__ import annotations
@@ -73,9 +74,10 @@ class Config:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> Config:
-        """Build from ``{"section.field": value}``; what is not given keeps its default.
+        """Build from ``{"section.field": value}``; missing parameters keep their defaults.
 
-        `ConfigError` if a parameter is unknown, of the wrong type or out of its range, or two contradict each other.
+        `ConfigError` if a parameter is unknown, has the wrong type, is out of range, or
+        contradicts another one.
         """
         sections: dict[str, dict[str, Any]] = {}
         for name, value in parameters.items():
@@ -97,10 +99,11 @@ class Config:
         path: str | Path | Sequence[str | Path],
         overrides: Mapping[str, Any] | None = None,
     ) -> Config:
-        """Read a ROS 2 parameter file; of several, later ones win, as with ``--params-file`` of ROS.
+        """Read one or more ROS 2 parameter files; later files win, as with ``--params-file``.
 
-        ``overrides``: ``{"section.field": value}``, which win over all of them. `ConfigError` if a file is missing, is
-        no parameter file, or holds a bad parameter.
+        ``overrides``: ``{"section.field": value}``, which win over all files.
+        `ConfigError` if a file is missing or is not a parameter file, or a parameter is
+        wrong.
         """
         files = [path] if isinstance(path, (str, Path)) else path
         given = {
@@ -131,7 +134,7 @@ class Config:
 
     @property
     def changed(self) -> dict[str, Value]:
-        """What is set to other than its default, as ``{"section.field": value}``."""
+        """Parameters that differ from their defaults, as ``{"section.field": value}``."""
         return {
             name: value
             for name, value in self.parameters().items()
@@ -139,7 +142,7 @@ class Config:
         }
 
     def __repr__(self) -> str:
-        """Say what is set to other than its default."""
+        """Describe the parameters that differ from their defaults."""
         return f"Config({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
 
     def _repr_html_(self) -> str:
@@ -155,7 +158,7 @@ class Config:
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels; for the channels input without names: empty, the geometry numbers them."""
+        """Names of the channels, empty if the geometry numbers them (input ``channels``)."""
         if self.channels.names or not self.has_units:
             return self.channels.names
         return tuple(f"{imu}.{axis}" for imu in self.imu_names for axis in "xyz")
@@ -172,7 +175,7 @@ class Config:
 
     @property
     def has_units(self) -> bool:
-        """Whether three-axis units arrive, each on a topic of its own, with the settings of ``imus``."""
+        """Whether the input is three-axis units, each on a topic of its own."""
         return INPUTS[self.input].section == "imus"
 
     @property
@@ -203,8 +206,8 @@ PARAMETERS: dict[str, Field] = {
 
 
 def unknown_parameter(name: str) -> str:
-    """Say that there is no such parameter, and which one may be meant."""
-    # What is much longer than any parameter is like none of them, and costs long to compare.
+    """Return the error line for an unknown parameter, with the most similar name."""
+    # Comparing very long names takes long and cannot succeed.
     close = (
         difflib.get_close_matches(name, PARAMETERS, n=1) if len(name) <= NAME else []
     )
@@ -216,7 +219,7 @@ def unknown_parameter(name: str) -> str:
 
 
 def check_lengths(config: Config, per: str, count: int) -> None:
-    """Check the lists that have values for each channel, or for each triad; `ConfigError` if one has another length."""
+    """Check the lengths of lists with values per channel or per triad (`ConfigError`)."""
     values: dict[str, Any] = config.parameters()
     for name, declared in PARAMETERS.items():
         lengths = (*declared.other_lengths, declared.each * count)
@@ -228,17 +231,18 @@ def check_lengths(config: Config, per: str, count: int) -> None:
             )
 
 
-LEAST_WAIT = (
-    4  #: samples: with fewer, a message that is late or lost looks like a silent unit
-)
-MIN_LEARNED = 10  #: samples that a bias is learned from at a start at rest
-MAX_SPAN = 1000  #: samples over which the angular acceleration is taken at most
+#: samples: with fewer, a message that is late or lost looks like a silent unit
+LEAST_WAIT = 4
+#: samples that a bias is learned from at a start at rest
+MIN_LEARNED = 10
+#: samples over which the angular acceleration is taken at most
+MAX_SPAN = 1000
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
 _TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
 
 
 def is_topic(name: str) -> bool:
-    """Whether a text is a topic name as ROS takes it, substitutions in braces included."""
+    """Whether a text is a valid ROS topic name, substitutions in braces included."""
     return len(name) <= NAME and _TOPIC.fullmatch(name) is not None
 
 
@@ -321,29 +325,29 @@ ROS_PARAMETERS = (
     *ALL_NODES,
     *MONITOR,
 )
-"""Parameters of the node itself: they may stand in the file, and are no settings of the pipeline."""
+"""Parameters of the node itself, which a file may hold beside those of the monitor."""
 
 
 def read_parameter_file(path: str | Path) -> dict[str, Any]:
-    """Parameters of the monitor in a ROS 2 parameter file, as ``{"section.field": value}``.
+    """Return the monitor's parameters in a ROS 2 parameter file, ``{"section.field": value}``.
 
-    Sections ``/**`` and then those of a node named fdi_node, in whatever namespace, are taken. `ConfigError` if the
-    file is missing or is no parameter file.
+    Sections ``/**`` are read first, then those of a node fdi_node in any namespace.
+    `ConfigError` if the file is missing or is not a parameter file.
     """
     return parameters_in(read_yaml(path, "config", ConfigError), f"config {path}")
 
 
 def parameters_in(document: Any, called: str, ros: bool = False) -> dict[str, Any]:
-    """Parameters of the monitor in what a ROS 2 parameter file holds, as `read_parameter_file` returns them.
+    """Return the monitor's parameters in a parsed parameter file.
 
-    ``called``: its name, for errors. ``ros``: those of ROS and of the node itself, instead of the settings.
-    `ConfigError` if it is no parameter file.
+    ``called``: name for errors. ``ros``: return the parameters of ROS and of the node
+    itself instead. `ConfigError` if the content is not a parameter file.
     """
     if not isinstance(document, dict):
         raise ConfigError(
             f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters"
         )
-    # Of what two give, the last wins.
+    # Later sections win.
     monitors = sorted(filter(is_monitor, document), key=lambda node: node != "/**")
     if not monitors:
         names = ", ".join(map(str, document))
@@ -364,7 +368,7 @@ def parameters_in(document: Any, called: str, ros: bool = False) -> dict[str, An
 
 
 def is_monitor(node: object) -> bool:
-    """Whether the parameters of a node, as named in a parameter file, are those of the monitor."""
+    """Whether a node name in a parameter file stands for the monitor."""
     return node == "/**" or str(node).rpartition("/")[2] == "fdi_node"
 
 
@@ -382,12 +386,13 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, flat: dict[str, Any]) -> None
 
 
 # Parameter files, written ---------------------------------------------------------------------------------------------
-# Each parameter in the order of its declaration, with unit and meaning from there. What a file is made from is carried
-# over by value; its comments are not.
+# Parameters appear in the order of their declaration, with unit and meaning. A file
+# made from another one keeps its values, but not its comments.
 
-WIDTH = 110  # columns of a file; a value without a comment beside it may be longer
+#: width of a file; a value without a comment may be longer
+WIDTH = 110
 _PLAIN = re.compile(r"[A-Za-z_/~][A-Za-z0-9_/~.*-]*")
-"""Texts that need no quotes, unless they are one of these words: the parser of ROS takes more of them than PyYAML."""
+"""Texts that need no quotes. The parser of ROS reads more words as values than PyYAML."""
 _WORDS = {
     "y",
     "n",
@@ -420,7 +425,7 @@ _Dumper.add_representer(str, _Dumper.text)
 
 
 def parameters_of(text: str) -> dict[str, Any]:
-    """Return the parameters in the text of a parameter file, ``{"section.field": value}``; `ConfigError` if none."""
+    """Return the parameters in the text of a parameter file (`ConfigError`)."""
     return parameters_in(parse_yaml(text, "config", ConfigError), "config")
 
 
@@ -431,10 +436,10 @@ def parameter_file(
     node: str = "/**",
     ros: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the text of a parameter file of a node with the parameters ``{"section.field": value}``.
+    """Return the text of a parameter file with the parameters ``{"section.field": value}``.
 
-    ``origin``: lines of comment at the top, where the values come from. ``remarks``: what is to be said of single
-    values besides unit and meaning, by parameter. ``ros``: parameters that are no settings.
+    ``origin``: comment lines at the top. ``remarks``: further comments by parameter.
+    ``ros``: parameters of ROS and of the node itself.
     """
     lines = textwrap.indent(_yaml(ros), " " * 4).splitlines() if ros else []
     section = ""
@@ -458,11 +463,11 @@ def with_parameters(
     remarks: Mapping[str, str],
     without: Sequence[str] = (),
 ) -> str:
-    """Return the text of a parameter file made from others, with the parameters of other nodes that they hold.
+    """Return the text of a parameter file made from others, other nodes included.
 
-    Later files win. ``changes``: ``{"section.field": value}`` that get other values; ``without``: those that are left
-    out, as the changes replace them; ``origin`` and ``remarks`` as of `parameter_file`. `ConfigError` if a file is no
-    parameter file.
+    Later files win. ``changes``: ``{"section.field": value}`` with new values.
+    ``without``: parameters that the changes replace. ``origin`` and ``remarks`` as in
+    `parameter_file`. `ConfigError` if a file is not a parameter file.
     """
     given: dict[str, Any] = {}
     ros: dict[str, Any] = {}
@@ -497,7 +502,7 @@ def _update(tree: dict[Any, Any], new: Mapping[Any, Any]) -> None:
 
 
 def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
-    """Lines of one parameter; a comment that does not fit beside it stands above it."""
+    """Return the lines of one parameter. A comment too long for the line goes above."""
     declared, margin = PARAMETERS[name], " " * indent
     meaning = (
         f"{declared.unit}: {declared.description}"
@@ -524,7 +529,7 @@ def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
 
 
 def _value(value: Any) -> Iterator[str]:
-    """Write a value; a long list has three on a line: an axis, a unit, or a row of a rotation."""
+    """Format a value; long lists have three numbers per line (an axis, a unit, a row)."""
     if (
         not isinstance(value, (list, tuple))
         or len(_flow(value)) <= WIDTH // 2

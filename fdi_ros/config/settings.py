@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fields: of what type and within what range a value may be; and the settings of a monitor, which are fields.
+"""Fields with type and range, and the settings of a monitor, which are such fields.
 
-Parameters of the node, settings of a Monte-Carlo study and options of a fault are all fields. On a dataclass a field
-is declared with `setting`; its type is the annotation.
+Parameters of the node, settings of a Monte-Carlo study and options of a fault are all
+declared on dataclasses with `setting`. The annotation is the type.
 """
 
 from __future__ import annotations
@@ -18,30 +18,34 @@ from fdi_ros.errors import FdiError
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
-REQUIRED = dataclasses.MISSING  # default of a field that must be given
+#: default of a field that must be given
+REQUIRED = dataclasses.MISSING
 
 
 @dataclass(frozen=True)
 class Field:
-    """What a value may be."""
+    """Type and range of a value."""
 
-    kind: str  # one of: bool, int, float, text, numbers, texts; or another one, which its reader checks
+    #: bool, int, float, text, numbers or texts; other types are checked by their reader
+    kind: str
     default: Any
     low: float = -math.inf
     high: float = math.inf
-    choices: tuple[str, ...] = ()  # of a text; empty: any text
+    #: choices of a text; empty allows any text
+    choices: tuple[str, ...] = ()
     unit: str = ""
     description: str = ""
-    runtime: bool = (
-        False  # of a parameter: whether it may be changed while the node runs
-    )
-    per: str = ""  # of a list: channel or triad, for each of which it has `each` values; empty: it may be of any length
+    #: whether the parameter may change while the node runs
+    runtime: bool = False
+    #: of a list: channel or triad, with `each` values for each; empty allows any length
+    per: str = ""
     each: int = 1
-    other_lengths: tuple[int, ...] = ()  # lengths that such a list may have besides
+    #: lengths that such a list may have besides
+    other_lengths: tuple[int, ...] = ()
 
     @property
     def unit_suffix(self) -> str:
-        """The unit as it follows a number."""
+        """The unit as written after a number."""
         return f" {self.unit}" if self.unit else ""
 
 
@@ -53,7 +57,7 @@ def setting(
     high: float = math.inf,
     **about: Any,
 ) -> Any:
-    """Declare a field of a dataclass; parameters as of `Field`."""
+    """Declare a field of a dataclass, arguments as in `Field`."""
     metadata = {
         "description": description,
         "unit": unit,
@@ -87,13 +91,13 @@ def fields_of(owner: Any) -> dict[str, Field]:
 
 
 def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
-    """Check a value, which errors (of class ``error``) call ``name``, and give it the type of its field.
+    """Check a value, called ``name`` in errors of class ``error``, and convert its type.
 
-    A list may be given as its only item, a number as text (PyYAML reads 1e-3, without a point, as text; ROS reads it as
-    the number it is).
+    A list with one item may be given as that item. A number may be given as text:
+    PyYAML reads 1e-3 as text, ROS reads a number.
     """
     if field.kind in ("numbers", "texts"):
-        # ROS hands an empty array over as an empty byte array: it has no type of its own.
+        # ROS passes an empty array as an empty byte array, since emptiness has no type.
         items = (
             list(value)
             if isinstance(value, (list, tuple)) or hasattr(value, "tolist")
@@ -138,16 +142,17 @@ def _check_number(field: Field, value: Any, name: str, error: type[FdiError]) ->
 # Sections of the settings: a frozen dataclass each, a ROS parameter a field -------------------------------------------
 
 
-LEAST_NOISE = 1e-9  # of a sample, rad/s: less is that of rounding, of a value that does not change
+#: noise of a sample below this is rounding of a constant value, rad/s
+LEAST_NOISE = 1e-9
 
 
 def _per_channel(*about: Any, lengths: tuple[int, ...] = (1,)) -> Any:
-    """Declare a list with one value per channel, or with another number of them (one: for all)."""
+    """Declare a list with one value per channel, another length, or one value for all."""
     return setting(*about, per="channel", other_lengths=lengths)
 
 
 def _per_triad(*about: Any, each: int = 1) -> Any:
-    """Declare a list with so many values per triad, or none."""
+    """Declare a list with a fixed number of values per triad, or none."""
     return setting(*about, per="triad", each=each, other_lengths=(0,))
 
 
@@ -160,8 +165,11 @@ class Input(NamedTuple):
     """One kind of input."""
 
     section: str
-    """Of its settings: ``channels`` for messages of all channels, ``imus`` for messages of three-axis units."""
-    source: str  # class in `fdi_ros.core.sources` that reads it
+    """Section of settings: ``channels`` for arrays of channels, ``imus`` for three-axis
+    units.
+    """
+    #: class in `fdi_ros.core.sources` that reads this input
+    source: str
 
 
 INPUTS = {
@@ -242,7 +250,7 @@ class GeometryConfig:
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Error of a healthy channel; one value, or one per channel."""
+    """Error of a healthy channel: one value, or one per channel."""
 
     noise_std: tuple[float, ...] = _per_channel(
         (0.0025,),
@@ -318,7 +326,7 @@ class BiasConfig:
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """The detector and its options; each detector takes its own."""
+    """The detector and its options. Each detector reads its own options."""
 
     name: str = _live("sequential", "name of the detector")
     false_alarms_per_hour: float = _live(
@@ -490,7 +498,7 @@ def _of_node(
     high: float = math.inf,
     **about: Any,
 ) -> Field:
-    """Declare a parameter, whose type is that of its default; the rest as of `Field`."""
+    """Declare a parameter with the type of its default, other arguments as in `Field`."""
     kind = "text" if isinstance(default, str) else type(default).__name__
     return Field(kind, default, low, high, description=description, **about)
 

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults to be injected: what strikes which channel and when, and their injection into a stream.
+"""Faults to inject, and their injection into a stream.
 
-The words of the command line and of scenario files are validated in one place, `fault_from`. Times are seconds from
-the first sample of the stream, so that a fault strikes at the same sample whatever part of a recording is replayed. The
-injection is the same to the last bit however the stream is cut into blocks; live it takes one sample at a time.
+`fault_from` validates the words of the command line and of scenario files. Times are
+seconds since the first sample of the stream, so the same sample is struck whatever part
+of a recording is replayed. The result does not depend on how the stream is cut into
+blocks; a live stream has one sample per block.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ from fdi_ros.system.yaml_file import read_yaml
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault; `FaultError` if a value is out of range."""
+    """One fault. `FaultError` if a value is out of range."""
 
-    channel: str  #: a channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas
-    kind: FaultKind  #: what it does, with its options
+    #: channel (``imu_2.y``), unit (``imu_2``: all channels), or several with commas
+    channel: str
+    #: kind of the fault with its options
+    kind: FaultKind
     start: float = setting(0.0, "from here on, since the first sample", "s", 0.0, 1e12)
     stop: float = setting(math.inf, "and before this", "s", 0.0)
     seed: int = setting(0, "of the random kinds", "", 0)
@@ -52,12 +55,15 @@ class Fault:
 
     @property
     def size(self) -> float | None:
-        """Size of the fault in the unit of its kind; None: it has none."""
+        """Size of the fault in the unit of its kind, None if the kind has no size."""
         size = getattr(self.kind, "size", None)
         return None if size is None else float(size)
 
     def channels(self, channel_names: Sequence[str]) -> tuple[int, ...]:
-        """Find the indices of the channels it strikes; `FaultError` if there is no such channel or unit."""
+        """Return the indices of the channels that the fault strikes.
+
+        `FaultError` if a channel or unit does not exist.
+        """
         struck: list[int] = []
         for name in self.channel.split(","):
             found = [
@@ -95,19 +101,21 @@ class Fault:
         )
 
 
+#: options of every fault, besides those of its kind
 _KEYS = (
     "channel",
     "kind",
     "start",
     "stop",
     "seed",
-)  # what every fault may be given, besides the options of its kind
+)
 
 
 def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
-    """Build a kind of fault by its name in `FAULT_KINDS`, with its options; None is the same as not given.
+    """Build a kind of fault from its name in `FAULT_KINDS` and its options.
 
-    `FaultError` if there is no such kind, or an option is missing, out of range or not taken by it.
+    None means that an option is not given. `FaultError` if the kind is unknown, or an
+    option is missing, unknown or out of range.
     """
     if name not in FAULT_KINDS:
         raise FaultError(
@@ -129,7 +137,7 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
 
 
 def fault_from(items: Mapping[str, Any]) -> Fault:
-    """Build a fault from names and values, as a scenario file or the command line gives them.
+    """Build a fault from names and values of a scenario file or the command line.
 
     `FaultError` if a name is unknown or a value does not fit.
     """
@@ -143,12 +151,12 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
 
 
 def parse_fault(text: str) -> Fault:
-    """Read a fault as `fault_from` does: ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``."""
+    """Parse a fault such as ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``."""
     return fault_from(key_values(text))
 
 
 def key_values(text: str) -> dict[str, str]:
-    """Read words of the form ``key=value``; `FaultError` if one is not of that form, or a key is given twice."""
+    """Parse words ``key=value``. `FaultError` if a word has another form or a key repeats."""
     items: dict[str, str] = {}
     for word in text.split():
         name, equals, value = word.partition("=")
@@ -163,7 +171,7 @@ def key_values(text: str) -> dict[str, str]:
 def load_scenario(path: str | Path) -> tuple[Fault, ...]:
     """Read the faults of a scenario file: a mapping with a list ``faults``.
 
-    `FaultError` if the file is missing, is no scenario, or a fault in it is wrong.
+    `FaultError` if the file is missing or is not a scenario, or a fault is wrong.
     """
     document = read_yaml(path, "scenario", FaultError)
     entries = document.get("faults") if isinstance(document, dict) else None
@@ -183,10 +191,11 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
 
 
 class Injector:
-    """Injects faults into a stream of blocks, in the order of the list, several on one channel one after the other.
+    """Injects faults into a stream of blocks, one after the other in the order of the list.
 
-    ``channel_names``: of the n channels of the stream; `FaultError` if a fault is on another. ``start_stamp``: what the
-    times of the faults count from, ns; None: that of the first sample.
+    ``channel_names``: names of the n channels of the stream. ``start_stamp``: origin of
+    the times of the faults, ns; None means the first sample. `FaultError` if a fault is
+    on a channel outside the stream.
     """
 
     def __init__(
@@ -224,14 +233,14 @@ class Injector:
         )
 
     def struck(self, stamp: NDArray[np.int64]) -> Mask:
-        """Ground truth: (N, n) whether each channel carries an active fault at stamps (N,) ns."""
+        """Return the ground truth (N, n): channels with an active fault at stamps (N,), ns."""
         truth = np.zeros((len(stamp), len(self.channel_names)), dtype=bool)
         for column, struck in zip(self.active(stamp).T, self.channels, strict=True):
             truth[:, struck] |= column[:, None]
         return truth
 
     def refuse_between(self, low: float, high: float, why: str) -> None:
-        """Refuse (`FaultError`) faults that begin after low and before high, s since the first sample."""
+        """Refuse faults that begin between two times, s (`FaultError`)."""
         allowed = [f"at most {low:.12g} s"] if low >= 0 else []
         allowed += [f"at least {high:.12g} s"] if high < math.inf else []
         for fault in self.faults:
@@ -242,7 +251,7 @@ class Injector:
                 )
 
     def apply(self, block: Block) -> Block:
-        """Return the next block of the stream with the faults in it; the block given is left as it is."""
+        """Return a copy of the next block with the faults applied."""
         if len(block) == 0 or not self.faults:
             return block
         if self.start_stamp is None:
@@ -262,7 +271,7 @@ class Injector:
             struck = ChannelSamples(
                 time, time - fault.start, active[:, k], z[:, index], received[:, index]
             )
-            # What is recorded may be infinite, and so may be what is added.
+            # Both the recorded value and the added one may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):
                 fault.kind.strike(struck, self._memories[k], self._random[k])
             z[:, index], received[:, index] = struck.z, struck.received

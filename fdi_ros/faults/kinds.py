@@ -1,12 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Kinds of faults: one class each, with the numbers it takes and what it does to the channels it strikes.
+"""Kinds of faults: one class per kind, with its options and its effect on channels.
 
-A new kind is a class here: its name makes it one of `FAULT_KINDS`. The first line of its docstring says what it does.
-Options are fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`,
-or, where it depends on the samples before or on chance, in `FaultKind.strike`. A random kind draws one number per
-active sample and channel, so that the cut of a stream into blocks changes no draw.
+The name of a class registers the kind in `FAULT_KINDS`. The first line of its docstring
+is the description for users. Options are fields declared with `setting` and checked
+against bounds. A kind implements `Memoryless.faulty` or, if earlier samples or chance
+matter, `FaultKind.strike`. A random kind draws one number per active sample and
+channel, so the cut of a stream into blocks does not change the draws.
 """
 
 from __future__ import annotations
@@ -23,22 +24,26 @@ from fdi_ros.model.samples import Array, Mask
 
 
 class ChannelSamples(NamedTuple):
-    """N samples of the c channels that a fault strikes; it changes z and received in place."""
+    """N samples of the c struck channels; a kind changes z and received in place."""
 
-    time: Array  #: (N,) since the first sample of the stream, s
-    since: Array  #: (N,) since the start of the fault, s
-    active: Mask  #: (N,) whether the fault is active
-    z: Array  #: (N, c) rad/s
-    received: Mask  #: (N, c)
+    #: (N,) since the first sample of the stream, s
+    time: Array
+    #: (N,) since the start of the fault, s
+    since: Array
+    #: (N,) whether the fault is active
+    active: Mask
+    #: (N, c) rad/s
+    z: Array
+    #: (N, c)
+    received: Mask
 
 
-Memory = dict[
-    str, Any
-]  #: what a fault keeps of the samples before; empty at the start of a stream
+#: values that a kind keeps between blocks; empty at the start of a stream
+Memory = dict[str, Any]
 
 
 def check_fields(owner: Any, called: str) -> None:
-    """Check (`FaultError`) the fields of a frozen dataclass declared with `setting`, and give them their types."""
+    """Check the `setting` fields of a frozen dataclass and convert them (`FaultError`)."""
     for name, field in fields_of(owner).items():
         value = getattr(owner, name)
         if value is REQUIRED:
@@ -51,18 +56,18 @@ def check_fields(owner: Any, called: str) -> None:
             )
 
 
-FAULT_KINDS: dict[str, type[FaultKind]] = {}  #: every kind of fault by name
+#: every kind of fault by name
+FAULT_KINDS: dict[str, type[FaultKind]] = {}
 
 
 class FaultKind(ABC):
-    """One kind of fault with its options, a frozen dataclass; `FaultError` if one is missing or out of range."""
+    """One kind of fault with its options. `FaultError` if one is missing or out of range."""
 
     name: ClassVar[str]
     study_size: ClassVar[float | None] = None
-    """Size in simulated flights unless they set one: well above the noise, well below what needs no monitor."""
-    whole_unit: ClassVar[bool] = (
-        False  #: whether it strikes the three channels of a unit, and nothing less
-    )
+    """Default size in simulated flights: well above the noise, too small to be obvious."""
+    #: whether the fault always strikes all three channels of a unit
+    whole_unit: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
         if "name" in vars(cls):
@@ -82,7 +87,7 @@ class FaultKind(ABC):
 
     @classmethod
     def has_signed_size(cls) -> bool:
-        """Whether a size must be given that may have either sign; 0 then changes nothing."""
+        """Whether the kind has a required size of either sign, where 0 changes nothing."""
         size = cls.options().get("size")
         return size is not None and size.default is REQUIRED and size.low < 0
 
@@ -90,11 +95,11 @@ class FaultKind(ABC):
     def strike(
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
-        """Change the next samples of a stream in place; the generator is for this fault alone."""
+        """Change the next samples in place, with a generator that only this fault uses."""
 
 
 class Memoryless(FaultKind):
-    """A kind whose output depends on the time since the start and on the true values alone."""
+    """A kind that depends only on the time since its start and on the true values."""
 
     def strike(
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
@@ -105,7 +110,10 @@ class Memoryless(FaultKind):
 
     @abstractmethod
     def faulty(self, since: Array, z: Array) -> Array:
-        """Return faulty values (k, c) rad/s from the time since the start (k, 1) s and true values (k, c) rad/s."""
+        """Return faulty values (k, c), rad/s.
+
+        ``since``: time since the start (k, 1), s. ``z``: true values (k, c), rad/s.
+        """
 
 
 @dataclass(frozen=True)
@@ -130,7 +138,7 @@ class Drift(Memoryless):
     size: float = setting(REQUIRED, "slope of what is added", "rad/s^2", -10.0, 10.0)
 
     def faulty(self, since: Array, z: Array) -> Array:
-        """Add what has grown since the start."""
+        """Add a ramp that grows since the start."""
         return z + self.size * since
 
 
@@ -176,7 +184,7 @@ class Stuck(FaultKind):
 
 @dataclass(frozen=True)
 class Dropout(FaultKind):
-    """Gives NaN; with missing=1 gives nothing."""
+    """Gives NaN, or no value at all with missing=1."""
 
     name = "dropout"
     missing: int = setting(0, "1: gives nothing", "", 0, 1)
@@ -236,7 +244,7 @@ class Spike(FaultKind):
     def strike(
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
-        """Let a spike fall on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
+        """Strike a sample with probability 1 - exp(-rate dt) for an interval dt."""
         time, active = samples.time, samples.active
         before = memory.get("last", time[0])
         probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[
@@ -275,7 +283,7 @@ class Sign(Memoryless):
 
 @dataclass(frozen=True)
 class Delay(FaultKind):
-    """Gives what it measured size samples ago."""
+    """Repeats the value measured size samples ago."""
 
     name = "delay"
     study_size = 10.0
@@ -286,7 +294,7 @@ class Delay(FaultKind):
     def strike(
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
-        """Give the last samples, which are kept; before there are enough of them repeat the first."""
+        """Return delayed samples; before enough are known, repeat the first one."""
         active = samples.active
         for name, now in (("z", samples.z), ("received", samples.received)):
             past = memory.get(name, np.repeat(now[:1], self.size, axis=0))

@@ -1,4 +1,4 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a recording holds, what it is fit for, and settings to start from."""
+"""The content of a recording, its fitness for a monitor, and settings to start from."""

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rates in deg/s where rad/s are expected: recognised by the rotation, the range and the bias of gyros."""
+"""Recognise rates in deg/s by the rotation, the range and the bias of gyros."""
 
 from __future__ import annotations
 
@@ -23,25 +23,34 @@ from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import DEGREES
 from fdi_ros.system.text import shown
 
-NEAR = 0.2  # a factor this close, relative, to that of a degree may be it: scale factors and vibration differ by less
+#: largest relative distance of a factor from that of a degree
+NEAR = 0.2
+#: of the rates of a unit, that are compared with those of another
 QUANTILES = (
     0.5,
     0.7,
     0.9,
     0.97,
     0.99,
-)  # of the rates of a unit, that are compared with those of another
+)
+#: share of the time, or s, beyond every gyro's range: less is a shock or damage
 FAST_SHARE, FAST_TIME = (
     0.01,
     0.5,
-)  # share of the time, or s, beyond every gyro's range: less is a shock or damage
-STILL, ALWAYS_STILL = 0.3, 0.95  # share of a recording: much of it, and all of it
-LEAST_REST = 4.0  # s; less may be chance in a flight with vibration
-NOISIEST = 0.02  # noise of a sample at rest, rad/s, that no gyro has
+)
+#: much of a recording, and all of a recording, as shares
+STILL, ALWAYS_STILL = 0.3, 0.95
+#: shortest rest, s: in a flight with vibration less may be chance
+LEAST_REST = 4.0
+#: noise of a sample at rest, rad/s, that no gyro has
+NOISIEST = 0.02
 
 
 def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
-    """Say which topics, of one body, are in deg/s, and what shows it, of gyros of a range; empty: nothing does."""
+    """Return why topics of one body are in deg/s, empty if nothing shows that.
+
+    ``largest_rate``: range of the gyros, rad/s.
+    """
     chosen = [one for one in chosen if one.complete]
     # The size of the rate: a bias is no rotation.
     apart = [
@@ -72,7 +81,7 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     """Whether rates are beyond the range of gyros for long."""
     largest = np.abs(report.segments.means).max(axis=1)
     beyond = largest > largest_rate
-    # Of what is deg/s no gyro shows more than twice its range.
+    # Values in deg/s stay below twice the range of the gyro.
     lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
     seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())
     return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
@@ -81,10 +90,14 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
 class _Rest(NamedTuple):
     """A unit at rest, if its values are rates in deg/s."""
 
-    seconds: float  #: time at rest
-    share: float  #: of the recording
-    noise: float  #: of its quietest axis, per sample, in the unit of the values
-    bias: Array  #: (3,) in the unit of the values
+    #: time at rest
+    seconds: float
+    #: of the recording
+    share: float
+    #: of its quietest axis, per sample, in the unit of the values
+    noise: float
+    #: (3,) in the unit of the values
+    bias: Array
 
 
 def _rest_of(report: TopicReport) -> _Rest:
@@ -105,10 +118,10 @@ def _rest_of(report: TopicReport) -> _Rest:
 
 
 def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
-    """Whether all lie still, with more noise and bias than any gyro in rad/s has.
+    """Whether all units rest with more noise and bias than gyros in rad/s have.
 
-    A steady turn, which all units share, is no bias: either units differ by more than
-    that, or they lie still for much of the recording and move in the rest of it.
+    A steady turn is common to all units and is not a bias. Biases must therefore differ
+    between units, or the units rest for much of the recording and move in between.
     """
     rests = [_rest_of(one) for one in chosen]
     for one in rests:

@@ -17,25 +17,36 @@ from fdi_ros.system.text import LINE, shown
 
 
 class Role(str, Enum):
-    """What a finding is to the reader; the value is its list in JSON."""
+    """Kind of a finding; the value names its list in JSON."""
 
-    FOUND = "found"  # what the settings are from
-    UNKNOWN = "not_found"  # what the recording does not show, what is taken instead, and how to get it
-    WARNING = "warnings"  # what to look at before the settings are trusted
-    WORTH = "worth"  # what it is good for: the verdict where nothing is wrong
+    #: basis of the settings
+    FOUND = "found"
+    #: not shown by the recording, with the assumption made and the remedy
+    UNKNOWN = "not_found"
+    #: to be checked before the settings are trusted
+    WARNING = "warnings"
+    #: usefulness, the verdict if nothing is wrong
+    WORTH = "worth"
 
 
 class Finding(NamedTuple):
     """One thing that was found."""
 
     role: Role
-    what: str  # the quantity or the trouble, in a word or two
-    words: str  # the whole of it in one line
-    who: Sequence[str] = ()  # channels, units or topics it is about; none: all
-    value: float | None = None  # of the quantity, SI; of several channels the worst
-    error: float | None = None  # standard error of the value
-    bound: float | None = None  # that the value keeps or breaks
-    headline: str = ""  # how the verdict begins where this decides it, one of `HEADLINES`; empty: it does not
+    #: the quantity or the trouble, in a word or two
+    what: str
+    #: complete sentence
+    words: str
+    #: channels, units or topics concerned, empty for all
+    who: Sequence[str] = ()
+    #: value of the quantity in SI units, the worst of several channels
+    value: float | None = None
+    #: standard error of the value
+    error: float | None = None
+    #: that the value keeps or breaks
+    bound: float | None = None
+    #: first words of a verdict that this finding decides, one of `HEADLINES`, or empty
+    headline: str = ""
 
 
 HEADLINES = {  # of verdicts, the first that is there decides
@@ -58,7 +69,7 @@ def lines_of(findings: Iterable[Finding], role: Role) -> list[str]:
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict: by the first headline that a finding has, with all that it is of."""
+    """Return the verdict: the first of `HEADLINES` in use, with all its findings."""
     words: dict[str, list[str]] = {}
     for one in findings:
         words.setdefault(one.headline, []).append(one.words)

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a recording is fit for: gyros enough, in rad/s, stamped by one clock, each a sensor of its own."""
+"""Fitness of a recording: enough gyros, in rad/s, on one clock, each an own sensor."""
 
 from __future__ import annotations
 
@@ -36,9 +36,8 @@ _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
     for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
 }
-_PREFERRED = sorted(
-    SOURCES.values(), key=lambda kind: not kind.stamped
-)  # kinds of input, first those with stamps
+#: kinds of input, first those with stamps
+_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
@@ -48,7 +47,7 @@ NEEDED = ", or ".join(
 
 
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
-    """Return the topics a config is made for: up to four units, else the first array that fits."""
+    """Return the topics for a config: up to four units, or else the first suitable array."""
     possible = [report for report in reports if not _unusable(report)]
     for kind in _PREFERRED:
         alike = [report for report in possible if report.kind is kind]
@@ -78,9 +77,10 @@ def left_out(reports: Sequence[TopicReport]) -> list[tuple[str, str]]:
 
 
 def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
-    """Say which units are stamped by clocks more than so many s off the first one's; empty: none is.
+    """Name the units whose clocks differ from that of the first by more than a limit, s.
 
-    Less than 1 s may be the time that messages take.
+    Differences below 1 s may be the transport time of messages. Empty if no clock
+    differs.
     """
     first = next((report for report in reports if math.isfinite(report.ahead)), None)
     off = (
@@ -104,7 +104,7 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
 
 
 def no_common_time(reports: Sequence[TopicReport]) -> str:
-    """Say which units have no stamps in the time of the first one; empty: none is."""
+    """Name the units whose stamps do not overlap with those of the first, may be empty."""
     spans = [(one.topic.name, *one.stamps) for one in reports if one.stamps is not None]
     if not spans:
         return ""
@@ -123,7 +123,7 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
 
 
 def one_clock(reports: Sequence[TopicReport]) -> str:
-    """Say why the stamps of these topics cannot be compared; empty: they can."""
+    """Return why the stamps of these topics cannot be compared, empty if they can."""
     stamped = [one for one in reports if one.kind is not None and one.kind.stamped]
     if len(stamped) < 2:
         return ""
@@ -131,10 +131,9 @@ def one_clock(reports: Sequence[TopicReport]) -> str:
 
 
 def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
-    """Return what was seen of the topics of a config.
+    """Return the reports on the topics of a config.
 
-    `BagError` if one is in deg/s, their stamps are of several clocks, or the recording
-    cannot be read.
+    `BagError` if a topic is in deg/s, stamps are of several clocks, or reading fails.
     """
     chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
     if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
@@ -145,7 +144,7 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
 
 
 def _unusable(report: TopicReport) -> str:
-    """Say why a topic cannot be used for gyros; empty: it can."""
+    """Return why a topic cannot serve as gyros, empty if it can."""
     kind, received = report.kind, report.received
     if kind is None:
         return "its type carries no gyros"
@@ -169,7 +168,10 @@ def _unusable(report: TopicReport) -> str:
 
 
 def needs(reports: Sequence[TopicReport]) -> str:
-    """Say what a recording needs, and what is wrong with each topic that could do; empty: a config can be made."""
+    """Return the needs of a recording, with the trouble of each topic.
+
+    Empty if a config can be made.
+    """
     if chosen := candidates(reports):
         return in_degrees(chosen)
     why = [
@@ -188,7 +190,10 @@ def needs(reports: Sequence[TopicReport]) -> str:
 def recording_findings(
     reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS
 ) -> Iterator[Finding]:
-    """Say what a recording is fit for; refused: why no config can be made of it, where it needs nothing."""
+    """Yield the findings on a recording.
+
+    ``refused``: reason why no config can be made, where the recording needs nothing.
+    """
     chosen = candidates(reports)
     lacking, clocks = needs(reports) or refused, one_clock(chosen)
     if lacking or clocks:
@@ -234,7 +239,7 @@ def recording_findings(
 def topic_findings(
     chosen: Sequence[TopicReport], unit: Unit = RADIANS
 ) -> Iterator[Finding]:
-    """Say what is wrong with the messages of each topic."""
+    """Yield the troubles in the messages of each topic."""
     for one in chosen:
         words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
         if words := words + troubles(one, unit):
@@ -250,6 +255,6 @@ _NO_REDUNDANCY = "one sensor on two topics is no redundancy"
 
 
 def copy_words(reports: Sequence[TopicReport]) -> str:
-    """Say which topics give the values of others; empty: none does."""
+    """Name the topics that repeat the values of others, may be empty."""
     copies = [f"{shown(one.topic.name)} {one.copied}" for one in reports if one.copy_of]
     return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values that repeat for so long that they are old: a gyro at work always shows noise."""
+"""Values that repeat for so long that they are old: working gyros always show noise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from fdi_ros.model.samples import Array, Mask
 
 
 def least_run(step: float) -> int:
-    """Return the samples from which a run of one value is no chance, of samples every `step` s; 0: not known."""
+    """Return the run of one value, in samples every `step` s, that chance cannot explain.
+
+    A step of 0 means that the rate is not known.
+    """
     return max(50, round(1.0 / step)) if step > 0 else 50
 
 
@@ -24,7 +27,7 @@ def run_lengths(values: Array) -> NDArray[np.int64]:
 
 
 def repeated(z: Array, step: float) -> Mask:
-    """Find samples of z (N, n), which come every `step` s, that are part of a long run of one value of a channel."""
+    """Mark samples of z (N, n), every `step` s, in a long run of one value of a channel."""
     found, least = np.zeros(z.shape, dtype=bool), least_run(step)
     for k, values in enumerate(z.T):
         lengths = run_lengths(values)
@@ -35,7 +38,7 @@ def repeated(z: Array, step: float) -> Mask:
                 others[: len(others) // least * least].reshape(-1, least), axis=1
             )
             different = (np.diff(spans, axis=1) > 0).sum(axis=1) + 1
-            # Where all values hardly change when it is quiet, one that stays is rest.
+            # In a coarse channel at rest a constant value is normal.
             coarse = len(spans) > 0 and np.percentile(different, 10.0) <= 3.0
             found[:, k] = long & (not coarse)
     return found
@@ -50,7 +53,7 @@ class Repeats:
         self._run = np.zeros(channels, dtype=np.int64)
 
     def add(self, values: Array, step: float) -> None:
-        """Take in the next values (N, c), which come every `step` s; 0: not known yet."""
+        """Take the next values (N, c), every `step` s, 0 if the rate is not known yet."""
         least = least_run(step)
         for k, column in enumerate(values.T if len(values) else ()):
             lengths, before = run_lengths(column), 0

@@ -1,9 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise of channels about which nothing is known yet, from segments of one second.
+"""Noise of channels before anything else is known, from segments of one second.
 
-The noise of a channel by itself is the lower envelope: segments about as quiet as the quietest.
+The noise of a channel alone is the lower envelope: segments about as quiet as the
+quietest.
 """
 
 from __future__ import annotations
@@ -18,36 +19,46 @@ from fdi_ros.estimator.noise import THREE_SIGMA
 from fdi_ros.estimator.rest import REST_STD, rests
 from fdi_ros.model.samples import Array, Int
 
-LENGTH = (
-    BLOCK_TIME * REST_BLOCKS
-)  # of a segment, s; longer where so few samples are in it that blocks were empty
+#: length of a segment, s; slow channels need longer ones to fill every block
+LENGTH = BLOCK_TIME * REST_BLOCKS
 SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
-"""Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
+"""Local parabola through seven values (Savitzky and Golay 1964). Its residual is noise."""
+#: ratio to the quietest noise that counts as quiet, and rounds to find such segments
 AS_QUIET, ROUNDS = (
     1.5,
     10,
-)  # noise this many times that of the quietest is as quiet; rounds in which these are found
-LOUDER = 2.0  # noise this many times that of rest is vibration, and slower noise no more than it of the other
-LARGEST_BIAS = 0.1  # rad/s, that a gyro at rest has
-MOST = 4096  # segments kept; of a longer recording every second one, and so on: memory does not grow with its length
+)
+#: ratio to the noise at rest that counts as vibration; bound of slow over fast noise
+LOUDER = 2.0
+#: rad/s, that a gyro at rest has
+LARGEST_BIAS = 0.1
+#: segments kept; longer recordings keep every second one, then every fourth
+MOST = 4096
 
 
 class NoiseSegment(NamedTuple):
     """Values of a segment."""
 
-    first: int  # time of its first sample, ns
-    means: Array  # (`REST_BLOCKS`, c) of blocks, rad/s
-    std: Array  # (c,) of the samples about their mean, rad/s: at rest their noise, also where a filter has smoothed it
-    noise: Array  # (c,) of a sample, rad/s: what no smooth motion reaches; 0: the values never change
-    block_noise: Array  # (c,) of the blocks, with slower noise that is no more than `LOUDER` times as large
+    #: time of its first sample, ns
+    first: int
+    #: (`REST_BLOCKS`, c) of blocks, rad/s
+    means: Array
+    #: (c,) standard deviation of the samples, rad/s: the noise at rest, even if
+    #: filtered
+    std: Array
+    #: (c,) noise of a sample beyond any smooth motion, rad/s, 0 if values never change
+    noise: Array
+    #: (c,) of the blocks, with slower noise that is no more than `LOUDER` times as
+    #: large
+    block_noise: Array
 
 
 class NoiseSegments:
-    """Segments of a recording, as its values of so many channels come."""
+    """Segments of a recording, from values that arrive in portions."""
 
     def __init__(self, channels: int) -> None:
         self.channels = channels
-        self.every = 1  # of so many segments one is kept
+        self.every = 1  # one segment in this many is kept
         self._kept: list[NoiseSegment] = []
         self._passed = 0
         # Values (K, c) that do not make a segment yet, and their times, ns.
@@ -57,7 +68,10 @@ class NoiseSegments:
         )
 
     def add(self, values: Array, times: Int, rate: float) -> None:
-        """Take in values (K, c) rad/s of a rate, Hz (0: not known yet), all finite, at times (K,) ns."""
+        """Take finite values (K, c), rad/s, at times (K,), ns.
+
+        ``rate``: sample rate, Hz; 0 if not known yet.
+        """
         values, times = (
             np.vstack([self._waiting, values]),
             np.concatenate([self._times, times]),
@@ -78,11 +92,11 @@ class NoiseSegments:
 
     @property
     def empty(self) -> bool:
-        """Whether there is not a single value."""
+        """Whether no value has arrived."""
         return not self._kept and not len(self._waiting)
 
     def all_segments(self) -> list[NoiseSegment]:
-        """Segments, with the values at the end if there is no other."""
+        """Segments; without any, a segment of the values so far."""
         whole = len(self._waiting) // REST_BLOCKS * REST_BLOCKS
         return self._kept or (
             [_segment(self._waiting[:whole], int(self._times[0]))] if whole else []
@@ -126,13 +140,15 @@ class NoiseSegments:
 
 
 class Noise(NamedTuple):
-    """Noise of a sample of each channel (c,), rad/s; NaN: not known."""
+    """Noise of a sample of each channel (c,), rad/s, NaN if not known."""
 
-    quiet: Array  # at rest, or else when quietest
-    moving: Array  # in motion, vibration included
-    rest: list[
-        bool
-    ]  # whether nothing moves in a segment: by the monitor's own test, and as quiet as the quietest
+    #: at rest, or else when quietest
+    quiet: Array
+    #: in motion, vibration included
+    moving: Array
+    #: whether nothing moves in a segment: by the monitor's own test, and as quiet as
+    #: the quietest
+    rest: list[bool]
 
     @property
     def share(self) -> float:
@@ -146,12 +162,12 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
         np.array([one.noise for one in segments]),
         np.array([one.block_noise for one in segments]),
     )
-    # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
+    # A unit with repeated values shows no noise; its usual noise stands in.
     for column in (*noise.T, *block.T):
         if column.any():
             column[column == 0.0] = np.median(column[column > 0.0])
     quiet = np.argsort((noise**2).sum(axis=1))[: max(3, len(noise) // 100)]
-    # The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
+    # The quietest few are biased by chance. All segments about as quiet are not.
     for _ in range(ROUNDS):
         alike = np.flatnonzero(
             (noise <= AS_QUIET * np.median(noise[quiet], axis=0)).all(axis=1)
@@ -179,7 +195,7 @@ def _noise(values: Array) -> Array:
         len(SMOOTH) // 2,
         np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T]),
     )
-    # Of white noise the parabola takes its share with it.
+    # The parabola absorbs a share of white noise.
     noise = np.sqrt(
         np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside])
     )

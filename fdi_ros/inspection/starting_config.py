@@ -42,26 +42,28 @@ from fdi_ros.inspection.turns import (
 )
 from fdi_ros.system.text import shown
 
-_NUMBERED = re.compile(
-    r"/imu_[0-9]{1,3}"
-)  # topics of flight logs, which name units as a config does
-_REST = 3.0  # time at the start over which the bias could be learned, s
-_TIMEOUT = float(
-    PARAMETERS["imus.timeout"].default
-)  # s; that of health.stale_timeout is the same
-_BRIDGED = (
-    1.1 / MAX_BRIDGE
-)  # message intervals in a timeout: so that alignment draws a line from one to the next
+#: topics of flight logs, which name units as a config does
+_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
+#: time at the start over which the bias could be learned, s
+_REST = 3.0
+#: default of imus.timeout and of health.stale_timeout, s
+_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
+#: message intervals in a timeout: so that alignment draws a line from one to the next
+_BRIDGED = 1.1 / MAX_BRIDGE
 
 
 @dataclass(frozen=True)
 class StartingConfig:
     """A config to start from."""
 
-    bag: str  # name of the recording
-    parameters: dict[str, Any]  # ``{"section.field": value}``
-    remarks: dict[str, str]  # how they were found, by parameter
-    look: str = ""  # what a person is to look at before they are used; empty: nothing
+    #: name of the recording
+    bag: str
+    #: ``{"section.field": value}``
+    parameters: dict[str, Any]
+    #: how they were found, by parameter
+    remarks: dict[str, str]
+    #: warnings before the settings are used, empty if none
+    look: str = ""
 
     @property
     def text(self) -> str:
@@ -71,7 +73,11 @@ class StartingConfig:
 
 
 def starting_config_of(path: Path, refused: str) -> StartingConfig:
-    """Return the config that ``fdi inspect`` writes; `BagError` in these words where there are no gyros in rad/s."""
+    """Return the config that ``fdi inspect`` writes.
+
+    ``refused``: first words of the `BagError` if there are no gyros in rad/s on one
+    clock.
+    """
     reports, _ = inspect(path)
     if words := needs(reports):
         raise BagError(f"{refused}: needs {words}")
@@ -88,9 +94,9 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
 
 
 def assumed_config(path: Path) -> tuple[Config, str]:
-    """Return settings to judge a recording by that came without any, and one line that says what they assume.
+    """Return settings for a recording without a config, and one line with the assumptions.
 
-    `BagError` if the recording shows no gyros, or they are not mounted alike: then axes have to be given.
+    `BagError` if the recording shows no gyros, or units that are not mounted alike.
     """
     refused = f"{shown(path.name)}: no config given, and none can be assumed"
     found = starting_config_of(path, refused)
@@ -113,7 +119,7 @@ def assumed_config(path: Path) -> tuple[Config, str]:
 
 
 def _turned_units(path: Path, config: Config) -> str:
-    """Say which units measure the motion of the first one along other axes; empty: none that the motion shows."""
+    """Name the units that measure the motion of the first one along other axes, may be empty."""
     size, names = max(1, round(WINDOW * config.sample_rate)), config.imus.names
     with Recording(path) as recording:
         means = [
@@ -219,7 +225,10 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
 
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
-    """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
+    """Return the noise for the config and a remark.
+
+    A mostly moving recording gives the noise in motion.
+    """
     noise = [report.segments.noise() for report in chosen]
     share, levels = (
         min(one.share for one in noise),
@@ -231,14 +240,17 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
         usable = np.isfinite(quiet) & (quiet > 0)
         if not usable.any():
             return [0.0025], "a guess: the recording is too short to tell"
-        # A value that never changes shows no noise: that of the noisiest is taken for it.
+        # A constant channel shows no noise; the noisiest one stands in.
         levels = np.where(usable, quiet, quiet[usable].max())
         words = "when quietest; in motion vibration, and axes that are not quite as given, add"
     return [_rounded_up(value) for value in levels.tolist()], words
 
 
 def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
-    """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
+    """Return a silence, s, longer than these intervals and nearly all gaps.
+
+    0 keeps the default.
+    """
     nearly_all = [
         float(np.quantile(np.concatenate(one.intervals), 0.999))
         for one in chosen

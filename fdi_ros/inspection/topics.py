@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is in a recording, which topics could be gyros, and how noisy they are at rest and in motion."""
+"""The topics of a recording: possible gyros, and their noise at rest and in motion."""
 
 from __future__ import annotations
 
@@ -31,62 +31,72 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.system.text import date_of, shown
 
-GAP = 3.0  # intervals longer than this many usual ones are gaps
-FASTEST = 36.0  # rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s
-SETTLED_STEPS = 100  # intervals by which the usual one is known
-BURST = (
-    2.0  # usual interval over the most frequent one: beyond, messages come in bursts
-)
-MOST_STEPS = 1_000_000  # messages of a topic whose intervals are kept
-RECENT = 256  # messages in a row in which copies are looked for
-BELIEVED = (
-    1e6  # values beyond are no rates but damage, rad/s; their squares must not overflow
-)
+#: intervals longer than this many usual ones are gaps
+GAP = 3.0
+#: largest range of vehicle gyros is 2000 deg/s, 34.9 rad/s
+FASTEST = 36.0
+#: intervals by which the usual one is known
+SETTLED_STEPS = 100
+#: usual interval over the most frequent one: beyond, messages come in bursts
+BURST = 2.0
+#: messages of a topic whose intervals are kept
+MOST_STEPS = 1_000_000
+#: messages in a row in which copies are looked for
+RECENT = 256
+#: larger values are damage, rad/s; their squares must not overflow
+BELIEVED = 1e6
 
 
 @dataclass
 class TopicReport:
-    """What was seen of one topic."""
+    """Observations on one topic."""
 
     topic: Topic
-    kind: (
-        type[Source] | None
-    )  # how gyros are read from messages of its type; None: they are not
+    #: reader of gyros for its type, or None
+    kind: type[Source] | None
     received: int = 0
     malformed: int = 0
-    first: int = 0  # time of recording of the first message, ns
-    last: int = 0  # the same of the last one
-    interval: float = 0.0  # usual interval, s; 0 before it is known
+    #: time of recording of the first message, ns
+    first: int = 0
+    #: the same of the last one
+    last: int = 0
+    #: usual interval, s, 0 while unknown
+    interval: float = 0.0
     gaps: int = 0
-    longest: float = 0.0  # longest interval, s
-    backward: int = 0  # stamps that do not increase
-    ahead: float = math.nan  # how far the first stamps are ahead of their times of recording, s; NaN: there are none
-    channels: int = 0  # values in a message, of what could be gyros; else 0
-    announced: int = 0  # values that a message says it has: whatever its bytes claim
-    largest: float = (
-        math.nan
-    )  # largest value that can be a rate, rad/s; NaN: there is none
-    intervals: list[Array] = field(
-        default_factory=list
-    )  # s, of the first million messages
-    stamp_steps: list[Array] = field(
-        default_factory=list
-    )  # s, from stamp to stamp, of the first million messages
-    stamps: tuple[int, int] | None = None  # first and last, ns; None: there are none
-    copy_of: str = ""  # topic of the same sensor: the same values to rounding, turned, scaled or some messages apart
+    #: longest interval, s
+    longest: float = 0.0
+    #: stamps that do not increase
+    backward: int = 0
+    #: lead of the first stamps over their times of recording, s, NaN if not stamped
+    ahead: float = math.nan
+    #: values in a message of possible gyros, else 0
+    channels: int = 0
+    #: values that a message announces, whatever its length
+    announced: int = 0
+    #: largest possible rate, rad/s, or NaN
+    largest: float = math.nan
+    #: s, of the first million messages
+    intervals: list[Array] = field(default_factory=list)
+    #: s, from stamp to stamp, of the first million messages
+    stamp_steps: list[Array] = field(default_factory=list)
+    #: first and last stamp, ns, or None
+    stamps: tuple[int, int] | None = None
+    #: topic of the same sensor: the same values to rounding, turned, scaled or some
+    #: messages apart
+    copy_of: str = ""
 
     def __post_init__(self) -> None:
         self.expect(0)
 
     def expect(self, channels: int) -> None:
-        """Take messages of so many values for gyros."""
+        """Expect messages with this number of values."""
         self.channels, self.repeats = channels, Repeats(channels)
         self.segments = NoiseSegments(
             channels
         )  # of messages in which every value can be a rate
         self.not_finite, self.beyond = np.zeros(
             (2, channels), dtype=np.int64
-        )  # (c,) values; beyond: all rates
+        )  # (c,) values that are not finite, and values beyond all rates
         self.recent = np.zeros(
             (0, channels)
         )  # (K, c) values of the last messages, at most `RECENT`
@@ -98,7 +108,7 @@ class TopicReport:
 
     @property
     def burst(self) -> int:
-        """Number of stamps that come at once, usually; 1: they come one by one."""
+        """Usual number of stamps in a burst, 1 for single stamps."""
         steps = np.concatenate([np.empty(0), *self.stamp_steps])
         if len(steps) < SETTLED_STEPS:
             return 1
@@ -116,28 +126,28 @@ class TopicReport:
 
     @property
     def copied(self) -> str:
-        """That it gives the values of another topic, in words."""
+        """Words for a topic that repeats the values of another."""
         return f"gives the values of {shown(self.copy_of)}"
 
     @property
     def could_be_gyros(self) -> bool:
-        """Whether it carries angular rates, or as many numbers as there may be channels."""
+        """Whether the topic carries rates, or as many numbers as channels are possible."""
         return self.channels > 0 and (
             self.complete or bool((self.not_finite + self.beyond).any())
         )
 
     @property
     def complete(self) -> bool:
-        """Whether there is a message in which every value can be a rate."""
+        """Whether some message holds possible rates only."""
         return not self.segments.empty
 
 
 def inspect(
     path: Path, topics: Sequence[str] = ()
 ) -> tuple[list[TopicReport], tuple[str, ...]]:
-    """Read a recording through: all topics, or those of these names, with or without the first slash.
+    """Read a recording once, all topics or those with these names (first slash optional).
 
-    Returns what was seen of each topic, and what of the recording is damaged. `BagError` if it cannot be read.
+    Returns one report per topic, and lines about damage. `BagError` if reading fails.
     """
     with Recording(path) as recording:
         wanted = {name.lstrip("/") for name in topics}
@@ -195,9 +205,9 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
 
 
 def usual_interval(steps: Array) -> float:
-    """Return the usual interval of messages, s, by the times (k,) between them, s.
+    """Return the usual interval of messages, s, from the times (k,) between them, s.
 
-    It is the most frequent one; of messages that come in bursts it is that of longer runs.
+    For single messages this is the median, for bursts the mean over longer runs.
     """
     median = float(np.median(steps))
     run = min(SETTLED_STEPS // 2, len(steps))
@@ -247,7 +257,7 @@ def _take_stamps(report: TopicReport, stamp: Int) -> None:
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
-    """Describe when it was recorded, how long it is and how large."""
+    """Describe date, duration and size."""
     figures = recording_figures(reports, bag, ())
     words = "no messages"
     if (first := figures["start_ns"]) is not None:
@@ -288,7 +298,7 @@ def recording_figures(
 
 
 def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
-    """Figures of every topic; those of values only where they could be of gyros."""
+    """Return columns of figures; those of values only for possible gyros."""
     gyros = [
         report.segments.noise() if report.could_be_gyros else None for report in reports
     ]
@@ -360,7 +370,7 @@ def topics_text(
 
 
 def _gyros(report: TopicReport, unit: Unit) -> str:
-    """Say whether gyros could be in a topic, and what is wrong with its values."""
+    """Describe a topic as possible gyros, with its troubles."""
     if not report.could_be_gyros:
         return "no"
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
@@ -383,12 +393,12 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
 
 
 def burst_words(report: TopicReport) -> str:
-    """Say how many stamps of a topic come at once."""
+    """Words for stamps that come in bursts."""
     return f"stamps come in bursts of about {report.burst}, not when it measured"
 
 
 def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
-    """Say what is wrong with the values of a topic, by their places in the message."""
+    """List the troubles with the values of a topic, by their places in the message."""
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words = []
     for why, counts in (

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How two units of one rigid body are turned against each other, by the rotation that both measure."""
+"""Rotation between two units of one rigid body, from the rates that both measure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import numpy as np
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
-LEAST_ROTATION = 0.05  # root mean square rotation about any axis while in motion, rad/s: biases are mostly less
+#: root mean square rotation about any axis while in motion, rad/s: biases are mostly
+#: less
+LEAST_ROTATION = 0.05
 #: Windows in motion: with fewer, units are not compared, and no mount is estimated.
 LEAST_WINDOWS = 20
 #: Time over which rates are averaged before units are compared, s: turns by hand stay,
@@ -21,17 +23,17 @@ WINDOW = 0.25
 #: Share of the rotation that two units of one body have in common at least. Vibration
 #: and late stamps take the rest.
 SHARED = 0.7
-SQUARE = np.radians(
-    10.0
-)  # a mount this close to axes along axes is taken for that: the rest is misalignment
+#: a mount this close to axes along axes is taken for that: the rest is misalignment
+SQUARE = np.radians(10.0)
 
 
 def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
-    """Find how a unit is turned against the first by the rates (W, 3) of both, rad/s (Kabsch 1976).
+    """Find the rotation between two units from rates (W, 3) of both, rad/s (Kabsch 1976).
 
-    Returns the rotation (3, 3) that takes its rates best into those of the first, v_first = R v_unit, and the same of
-    all mirrored frames; and the variance of the least certain direction, rad^2, over the mean square of what is left,
-    (rad/s)^2: infinite where the two never turn about two axes together.
+    Returns the rotation (3, 3) with v_first = R v_unit that fits best, the best
+    mirrored frame (3, 3), and the variance of the least certain direction, rad^2,
+    divided by the mean square residual, (rad/s)^2. That ratio is infinite if the
+    units never turn about two axes.
     """
     left, size, right = np.linalg.svd(first.T @ unit)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])

@@ -32,7 +32,9 @@ from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import Data
 
-LEAST_RESPONSE = 0.3  # share of the rotation that others see which a channel shows at least, and they of what it shows
+#: share of the rotation that others see which a channel shows at least, and they of
+#: what it shows
+LEAST_RESPONSE = 0.3
 #: Share of rotation in common from which two units show one rotation, along other axes
 #: or on another scale.
 SAME = 0.9
@@ -217,36 +219,35 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
     return found
 
 
-LEAST_RATE = (
-    LEAST_ROTATION / 5
-)  # rotation about some axis, root mean square, below which nothing turns, rad/s
+#: rotation about some axis, root mean square, below which nothing turns, rad/s
+LEAST_RATE = LEAST_ROTATION / 5
 #: Standard error beyond which axes along axes are an assumption, rad.
 LARGEST_DOUBT = SQUARE
-LARGEST_ERROR = np.radians(
-    2.0
-)  # a mount less certain than this, in any direction, is not shown
-SHOWN = 3.0  # standard errors from which what is measured is shown: a delay, or a mount that is not along axes
+#: a mount less certain than this, in any direction, is not shown
+LARGEST_ERROR = np.radians(2.0)
+#: standard errors from which what is measured is shown: a delay, or a mount that is not
+#: along axes
+SHOWN = 3.0
 
 
 @dataclass(frozen=True)
 class Mount:
     """How one unit is turned against the first."""
 
-    words: str  # what it is, or why it is not known
-    shared: float = (
-        0.0  # share of the rotation of the unit that is that of the first one
-    )
-    rotation: Array | None = (
-        None  # (3, 3) by rows: v_first = R v_unit; None: it is not shown
-    )
-    off: float = 0.0  # what it was measured to be away from `rotation`, rad
-    error: float = (
-        math.inf
-    )  # standard error in the least certain direction, rad; infinite: not shown at all
-    contradicts: bool = (
-        False  # it turns, and not as the first unit does, however it may be mounted
-    )
-    mirrored: bool = False  # one of the two is no right-handed frame
+    #: what it is, or why it is not known
+    words: str
+    #: share of the rotation of the unit that is that of the first one
+    shared: float = 0.0
+    #: (3, 3) by rows: v_first = R v_unit; None: it is not shown
+    rotation: Array | None = None
+    #: what it was measured to be away from `rotation`, rad
+    off: float = 0.0
+    #: standard error in the least certain direction, rad; infinite: not shown at all
+    error: float = math.inf
+    #: it turns, and not as the first unit does, however it may be mounted
+    contradicts: bool = False
+    #: one of the two is no right-handed frame
+    mirrored: bool = False
 
     @property
     def shown(self) -> bool:

@@ -22,22 +22,25 @@ from fdi_ros.inspection.turns import WINDOW
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
-SPIKE = 25.0  # usual sizes beyond which a value is a spike: vibration has tails, too
-SPIKE_PORTION = 256  # samples looked at at once
-MEDIAN_TO_RMS = (
-    1.4826  # of normal errors: standard deviation over median absolute deviation
-)
+#: usual sizes beyond which a value is a spike: vibration has tails, too
+SPIKE = 25.0
+#: samples looked at at once
+SPIKE_PORTION = 256
+#: of normal errors: standard deviation over median absolute deviation
+MEDIAN_TO_RMS = 1.4826
 
 
 @dataclass
 class Data:
     """A recording made ready."""
 
-    stamp: NDArray[np.int64]  # (N,) ns
-    z: Array  # (N, n) rad/s, NaN where not usable
-    unusable: dict[
-        str, Int
-    ]  # (n,) samples not usable, by the reason: missing, not_finite, out_of_range, repeated
+    #: (N,) ns
+    stamp: NDArray[np.int64]
+    #: (N, n) rad/s, NaN where not usable
+    z: Array
+    #: (n,) samples not usable, by the reason: missing, not_finite, out_of_range,
+    #: repeated
+    unusable: dict[str, Int]
 
     def __post_init__(self) -> None:
         self.seconds: Array = np.asarray(
@@ -112,24 +115,33 @@ def flag_runs(flags: Mask) -> Int:
     return np.flatnonzero(edges).reshape(-1, 2)
 
 
-POINTS = 6  # of the interpolation
-PRESENT = 0.8  # share of a window that a channel gives to count in it
-PORTION = 100_000  # samples worked on at once, about
-NOT_SHIFTED = 1e-6  # s; smaller delays are none: of 100 rad/s^2 they make 1e-4 rad/s
+#: of the interpolation
+POINTS = 6
+#: share of a window that a channel gives to count in it
+PRESENT = 0.8
+#: samples worked on at once, about
+PORTION = 100_000
+#: s; smaller delays are none: of 100 rad/s^2 they make 1e-4 rad/s
+NOT_SHIFTED = 1e-6
 
 
 @dataclass
 class Blocks:
     """Means of blocks, and windows of blocks."""
 
-    seconds: Array  # (B,) middle of each block, s from the first sample
-    mean: Array  # (B, n) rad/s; NaN where a channel lacks a sample
-    start: Int  # (W,) first block of each window
-    samples: Array  # (W, n, n) covariance of single samples in each window, (rad/s)^2; NaN: a channel is missing
-    white: (
-        Array  # (n,) what interpolation has left of the variance of white noise in them
-    )
-    count: Int  # (W,) samples that it is of
+    #: (B,) middle of each block, s from the first sample
+    seconds: Array
+    #: (B, n) rad/s; NaN where a channel lacks a sample
+    mean: Array
+    #: (W,) first block of each window
+    start: Int
+    #: (W, n, n) covariance of single samples in each window, (rad/s)^2; NaN: a channel
+    #: is missing
+    samples: Array
+    #: (n,) what interpolation has left of the variance of white noise in them
+    white: Array
+    #: (W,) samples that it is of
+    count: Int
 
     def __post_init__(self) -> None:
         self.windows = len(self.start)

@@ -45,44 +45,54 @@ from fdi_ros.setup.blocks import (
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.noise import projector
 
-UNKNOWN_MOUNT = (
-    0.58  # of each component of an axis that may point anywhere: the root of a third
-)
-UNMEASURED = (
-    SCALE_STD / 2
-)  # uncertainty of the axes along a direction of the body from which they are not measured
-UNKNOWN_AXES = 0.1  # the same of an array; axes from the motion alone are taken if they are off by more
-REFERENCE_STD = 1e-6  # of channels that are taken for as configured
+#: of each component of an axis that may point anywhere: the root of a third
+UNKNOWN_MOUNT = 0.58
+#: uncertainty of the axes along a direction of the body from which they are not
+#: measured
+UNMEASURED = SCALE_STD / 2
+#: the same of an array; axes from the motion alone are taken if they are off by more
+UNKNOWN_AXES = 0.1
+#: of channels that are taken for as configured
+REFERENCE_STD = 1e-6
+#: s, samples, and s from one to the next
 LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
     10.0,
     100,
     1.0,
-)  # s, samples, and s from one to the next
-LEAST_USABLE = 0.3  # share of its samples that a channel must give
-MOST_FAULTY = 0.35  # share of the recording; of a channel faulty for longer it cannot be said which is right
-MOST_LEFT_OUT = (
-    1 / 3
-)  # share of the channels of a set that is left out: of a larger one nobody knows which are right
+)
+#: share of its samples that a channel must give
+LEAST_USABLE = 0.3
+#: share of the recording; of a channel faulty for longer it cannot be said which is
+#: right
+MOST_FAULTY = 0.35
+#: share of the channels of a set that is left out: of a larger one nobody knows which
+#: are right
+MOST_LEFT_OUT = 1 / 3
 LOUDER = 4.0
 """A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
 would not believe, as the motion begins, that it is vibration."""
-LEAD = (
-    1.0  # s before a declaration that a fault may have begun: most are declared sooner
-)
-LEAST_SKEW = 5e-5  # what imus.max_skew is at least where delays smaller than it are to be taken off, s
-WAITS = 2.5  # what imus.timeout is at least, in differences of the delays of units
+#: s before a declaration that a fault may have begun: most are declared sooner
+LEAD = 1.0
+#: what imus.max_skew is at least where delays smaller than it are to be taken off, s
+LEAST_SKEW = 5e-5
+#: what imus.timeout is at least, in differences of the delays of units
+WAITS = 2.5
+#: parameters that say nothing any more beside geometry.axes
 REPLACED = (
     "imus.mounts",
     "geometry.cone_channels",
-)  # parameters that say nothing any more beside geometry.axes
+)
 
 
 class StampDelay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
-    value: float  # s; positive: their stamps are late, what they stand for was measured earlier; as imus.delays has it
-    error: float  # s
+    #: s; positive: their stamps are late, what they stand for was measured earlier; as
+    #: imus.delays has it
+    value: float
+    #: s
+    error: float
 
     @property
     def shown(self) -> bool:
@@ -103,21 +113,23 @@ class Calibration:
     """Result for the channels in use; all that is per channel is in their order."""
 
     names: tuple[str, ...]
-    nominal: Array  # (n, 3) as configured
+    #: (n, 3) as configured
+    nominal: Array
     estimate: StateEstimate
-    timing: float  # what is not known of the sampling instants, s, as written
-    delays: tuple[StampDelay, ...]  # of all units but the first
+    #: what is not known of the sampling instants, s, as written
+    timing: float
+    #: of all units but the first
+    delays: tuple[StampDelay, ...]
     faults: tuple[Span, ...]
-    unusable: dict[
-        str, Int
-    ]  # (n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes
-    duration: float  # of the recording, s
-    settings: dict[
-        str, object
-    ]  # parameters to be changed, ``{"section.field": value}``
-    spectrum: (
-        Spectrum  # of what channels differ by from the fused rate with these settings
-    )
+    #: (n,) samples of each channel that were not used, by the reason: as of `Data`, and
+    #: spikes
+    unusable: dict[str, Int]
+    #: of the recording, s
+    duration: float
+    #: parameters to be changed, ``{"section.field": value}``
+    settings: dict[str, object]
+    #: of what channels differ by from the fused rate with these settings
+    spectrum: Spectrum
 
     def __post_init__(self) -> None:
         found, n = self.estimate, len(self.names)

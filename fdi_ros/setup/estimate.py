@@ -57,33 +57,45 @@ from fdi_ros.setup.smoother import (
     smooth,
 )
 
-SCALE_STD = 0.008  # of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg
+#: of scale error and misalignment before anything is shown, in each component: 0.5 %
+#: and 0.5 deg
+SCALE_STD = 0.008
 PASSES = 12
 TRUSTING = PASSES // 3
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
 off look like vibration."""
-SETTLED = (
-    2e-5  # s of delays, and share of the rate of axes: what changes less has settled
-)
-SHOWN_DELAY = 0.001  # s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that moves no bias
-LARGEST_DELAY = PARAMETERS["imus.delays"].high  # s
-STEP_DELAY = (
-    2.0 * UNIT_DELAY
-)  # by how much a delay changes in one pass at most, s: a slope is that of the motion near
-MOST_STEPS = 400  # windows are joined until there are no more than this
-ABSENT = 1e12  # variance of a channel that is not there, (rad/s)^2
-ALIKE = 5.0  # means of the windows at rest are at most so many of their standard deviations apart: hardly one by chance
-USUAL_WALK = 2e-5  # rad/s/sqrt(s); of biases that show none
-WIDER = 1.5  # axes that are farther off than expected by so much are known less: once in 60 by chance, of two units
-LEAST_BLOCKS = SUBS = (
-    5  # of a window that tells its noise, and of windows that tell its colour by longer means
-)
-BASE = 7  # one, the rate, the angular acceleration
+#: s of delays, and share of the rate of axes: what changes less has settled
+SETTLED = 2e-5
+#: s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that
+#: moves no bias
+SHOWN_DELAY = 0.001
+#: s
+LARGEST_DELAY = PARAMETERS["imus.delays"].high
+#: by how much a delay changes in one pass at most, s: a slope is that of the motion
+#: near
+STEP_DELAY = 2.0 * UNIT_DELAY
+#: windows are joined until there are no more than this
+MOST_STEPS = 400
+#: variance of a channel that is not there, (rad/s)^2
+ABSENT = 1e12
+#: means of the windows at rest are at most so many of their standard deviations apart:
+#: hardly one by chance
+ALIKE = 5.0
+#: rad/s/sqrt(s); of biases that show none
+USUAL_WALK = 2e-5
+#: axes that are farther off than expected by so much are known less: once in 60 by
+#: chance, of two units
+WIDER = 1.5
+#: of a window that tells its noise, and of windows that tell its colour by longer means
+LEAST_BLOCKS = SUBS = 5
+#: one, the rate, the angular acceleration
+BASE = 7
+#: kinds of error states, whose signals are linear in these
 ESTIMATED = (
     "bias",
     "scale",
     "delay",
-)  # kinds of error states, whose signals are linear in these
+)
 (BIAS_RATE,) = (kind for kind in ERROR_KINDS if kind.feeds == "bias")
 
 
@@ -91,32 +103,53 @@ ESTIMATED = (
 class Priors:
     """What is estimated, and what is known of it before."""
 
-    axes: Array  # (n, 3) as configured
-    unit: Int  # (n,) number of the unit of each channel
-    units: int  # number of units
-    scale_std: Array  # (n,) of scale error and misalignment
-    bias_std: float  # rad/s
-    delay_std: float  # s
+    #: (n, 3) as configured
+    axes: Array
+    #: (n,) number of the unit of each channel
+    unit: Int
+    #: number of units
+    units: int
+    #: (n,) of scale error and misalignment
+    scale_std: Array
+    #: rad/s
+    bias_std: float
+    #: s
+    delay_std: float
 
 
 @dataclass(frozen=True)
 class StateEstimate:
     """All states, estimated."""
 
-    axes: Array  # (n, 3)
-    axes_covariance: Array  # (3 n, 3 n) of all of them
-    delay: Array  # (n,) by how much the stamps of each channel's unit are late against those of the first, s
-    delay_std: Array  # (n,) s
-    bias: Array  # (n,) mean over the recording, rad/s
-    bias_covariance: Array  # (n, n) (rad/s)^2
-    curve: Array  # (K, n) biases over time, rad/s
-    times: Array  # (K,) s
-    bias_walk: RandomWalk  # of the biases
-    floor: Floor  # noise that channels have by themselves
-    moment: Array  # (W, n) standard deviation of a sample in every window, vibration included, rad/s
-    blocks: Blocks  # what it is from
-    rest: Mask  # (W,) windows at rest
-    rate: Array  # (B, 3) of the body, rad/s
+    #: (n, 3)
+    axes: Array
+    #: (3 n, 3 n) of all of them
+    axes_covariance: Array
+    #: (n,) by how much the stamps of each channel's unit are late against those of the
+    #: first, s
+    delay: Array
+    #: (n,) s
+    delay_std: Array
+    #: (n,) mean over the recording, rad/s
+    bias: Array
+    #: (n, n) (rad/s)^2
+    bias_covariance: Array
+    #: (K, n) biases over time, rad/s
+    curve: Array
+    #: (K,) s
+    times: Array
+    #: of the biases
+    bias_walk: RandomWalk
+    #: noise that channels have by themselves
+    floor: Floor
+    #: (W, n) standard deviation of a sample in every window, vibration included, rad/s
+    moment: Array
+    #: what it is from
+    blocks: Blocks
+    #: (W,) windows at rest
+    rest: Mask
+    #: (B, 3) of the body, rad/s
+    rate: Array
 
     @property
     def rest_seconds(self) -> float:

@@ -42,9 +42,14 @@ from fdi_ros.report.layout import (
     told,
 )
 
-WAITS = (0.02, 0.1, 0.5, 2.0)  # times within which a fault may be found, s
-VIBRATION = 5.0  # times by which vibration raises the noise, where noise_std is that at rest: an example
-ALIKE = 0.9  # above this |rho| telling two channels apart takes an error twice as large as seeing it
+#: times within which a fault may be found, s
+WAITS = (0.02, 0.1, 0.5, 2.0)
+#: times by which vibration raises the noise, where noise_std is that at rest: an
+#: example
+VIBRATION = 5.0
+#: above this |rho| telling two channels apart takes an error twice as large as seeing
+#: it
+ALIKE = 0.9
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
@@ -106,10 +111,10 @@ class Loss(NamedTuple):
     """What is left after some channels are lost."""
 
     lost: tuple[int, ...]
-    gdop: float = math.inf  # infinite where the rest does not span space
-    std: Array = np.full(
-        3, np.inf
-    )  # (3,) of the rate about each body axis at rest, rad/s
+    #: infinite where the rest does not span space
+    gdop: float = math.inf
+    #: (3,) of the rate about each body axis at rest, rad/s
+    std: Array = np.full(3, np.inf)
     detectable: tuple[int, ...] = ()
     isolable: tuple[int, ...] = ()
 
@@ -120,12 +125,15 @@ class Mounting:
 
     geometry: Geometry
     noise: NoiseModel
-    false_alarm_probability: float  # per sample
-    smallest: Array  # (n,) error that one sample shows with probability DETECTION, rad/s; infinite: never
-    waiting: dict[
-        str, Array
-    ]  # errors (waits, n), rad/s, that an optimal test finds on average within WAITS
-    losses: tuple[Loss, ...]  # of nothing, of each channel in turn, of each pair
+    #: per sample
+    false_alarm_probability: float
+    #: (n,) error that one sample shows with probability DETECTION, rad/s; infinite:
+    #: never
+    smallest: Array
+    #: errors (waits, n), rad/s, that an optimal test finds on average within WAITS
+    waiting: dict[str, Array]
+    #: of nothing, of each channel in turn, of each pair
+    losses: tuple[Loss, ...]
 
     def __post_init__(self) -> None:
         rho = np.triu(np.abs(self.geometry.rho), 1)

@@ -22,17 +22,23 @@ from fdi_ros.estimator.noise import QUIETEST
 from fdi_ros.inspection.segments import AS_QUIET, ROUNDS
 from fdi_ros.model.samples import Array, Int, Mask
 
-LEAST_VARIANCE = LEAST_NOISE**2  # (rad/s)^2; of what shows no noise at all
-MEMORY = 2  # windows on both sides that the noise of the moment is averaged over: 5 s, in which vibration stays
+#: (rad/s)^2; of what shows no noise at all
+LEAST_VARIANCE = LEAST_NOISE**2
+#: windows on both sides that the noise of the moment is averaged over: 5 s, in which
+#: vibration stays
+MEMORY = 2
 
 
 @dataclass(frozen=True)
 class Floor:
     """Noise that channels have by themselves, as far as the recording shows it."""
 
-    std: Array  # (n,) of one sample, rad/s
-    error: Array  # (n,) its standard error, rad/s
-    windows: Mask  # (W,) that it is from
+    #: (n,) of one sample, rad/s
+    std: Array
+    #: (n,) its standard error, rad/s
+    error: Array
+    #: (W,) that it is from
+    windows: Mask
 
     @property
     def share(self) -> float:

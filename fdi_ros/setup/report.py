@@ -48,21 +48,27 @@ from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, Tried, times_words
 from fdi_ros.system.text import LINE, shown
 
-SHOWN_AXES = (
-    UNMEASURED / 2
-)  # uncertainty of the axes along a direction of the body from which they are not well shown
-LEAST_SHARE = 0.2  # part of a recording that supports its noise
+#: uncertainty of the axes along a direction of the body from which they are not well
+#: shown
+SHOWN_AXES = UNMEASURED / 2
+#: part of a recording that supports its noise
+LEAST_SHARE = 0.2
+#: of axes against nominal, that are worth a look
 LARGE_ANGLE, LARGE_SCALE = (
     float(np.radians(5.0)),
     0.05,
-)  # of axes against nominal, that are worth a look
+)
+#: of biases, within a recording and at all, rad/s
 LARGE_SWING, LARGE_BIAS = (
     float(np.radians(0.03)),
     0.2,
-)  # of biases, within a recording and at all, rad/s
-MANY = 0.01  # share of the samples that are missing or spikes, which is worth a look
-FLOOR, LEAST_NAMED = 0.1, 0.9  # rad/s; share of test faults of that size to be found
-LEAST_JUDGED = 0.5  # share of the samples that a monitor should judge
+)
+#: share of the samples that are missing or spikes, which is worth a look
+MANY = 0.01
+#: rad/s; share of test faults of that size to be found
+FLOOR, LEAST_NAMED = 0.1, 0.9
+#: share of the samples that a monitor should judge
+LEAST_JUDGED = 0.5
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"

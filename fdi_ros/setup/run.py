@@ -52,28 +52,32 @@ from fdi_ros.setup.calibrate import (
 from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.system.text import shown
 
-SIZES = (0.03, 0.1, 0.3)  # biases tried, rad/s
+#: biases tried, rad/s
+SIZES = (0.03, 0.1, 0.3)
+#: s in which they are to be isolated, and how often each is tried
 WITHIN, TIMES = (
     4.0,
     2,
-)  # s in which they are to be isolated, and how often each is tried
+)
+#: part kept aside, and its bounds, s: all biases have room
 KEPT, LEAST_KEPT, MOST_KEPT = (
     0.25,
     TIMES * WITHIN,
     120.0,
-)  # part kept aside, and its bounds, s: all biases have room
-LEAST_LEFT = 2 * LEAST_DURATION  # s that must be left to calibrate on
+)
+#: s that must be left to calibrate on
+LEAST_LEFT = 2 * LEAST_DURATION
 
 
 @dataclass
 class Tried:
     """One config on the recording of a proof."""
 
-    baseline: Baseline | None  # as it is; None: the monitor judges nothing
+    #: as it is; None: the monitor judges nothing
+    baseline: Baseline | None
     note: str
-    isolated: dict[
-        float, tuple[int, int]
-    ]  # by size, rad/s: biases isolated, and tried; empty: too short
+    #: by size, rad/s: biases isolated, and tried; empty: too short
+    isolated: dict[float, tuple[int, int]]
 
     def __post_init__(self) -> None:
         self.judged = (
@@ -99,8 +103,10 @@ def times_words(declared: Mapping[str, float]) -> str:
 class Proof:
     """What a recording, or a part of one, says of the settings."""
 
-    source: str  # which, in words
-    apart: bool  # whether it was not used for the settings
+    #: which, in words
+    source: str
+    #: whether it was not used for the settings
+    apart: bool
     seconds: float
     before: Tried
     after: Tried
@@ -163,13 +169,14 @@ Parameters = dict[str, object]
 class LearnedSettings:
     """A config, and the calibration that it is from; without one as it was before it."""
 
-    parameters: Parameters  # ``{"section.field": value}`` of the config
+    #: ``{"section.field": value}`` of the config
+    parameters: Parameters
     config: Config
     calibration: Calibration | None = None
-    why: FdiError | None = None  # for which there is no calibration
-    mounts: tuple[
-        Mount, ...
-    ] = ()  # of each unit; empty: channels in one array, or mounts that were given
+    #: for which there is no calibration
+    why: FdiError | None = None
+    #: of each unit; empty: channels in one array, or mounts that were given
+    mounts: tuple[Mount, ...] = ()
 
     @property
     def refused(self) -> str:
@@ -186,12 +193,17 @@ class LearnedSettings:
 class SetupResult(LearnedSettings):
     """The config that a recording gives, and what it is from."""
 
-    kept: str  # by what the calibration is no better than the settings before, which are kept then; empty: it is taken
+    #: by what the calibration is no better than the settings before, which are kept
+    #: then; empty: it is taken
+    kept: str
     mounting: Mounting
-    proof: Proof  # what it is worth
-    reports: Sequence[TopicReport] = ()  # of all topics
+    #: what it is worth
+    proof: Proof
+    #: of all topics
+    reports: Sequence[TopicReport] = ()
     damage: tuple[str, ...] = ()
-    chosen: Sequence[TopicReport] = ()  # the topics of the gyros
+    #: the topics of the gyros
+    chosen: Sequence[TopicReport] = ()
 
     @property
     def remarks(self) -> dict[str, str]:
@@ -315,9 +327,8 @@ def recalibrate(
     )
 
 
-Learn = Callable[
-    [Block], tuple[LearnedSettings, LearnedSettings]
-]  # settings before, and those of a recording
+#: settings before, and those of a recording
+Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]
 
 
 def _kept_from(block: Block) -> tuple[float, float] | None:

@@ -18,10 +18,15 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from fdi_ros.model.samples import Array
 
-WALKS = np.geomspace(1e-6, 4e-3, 13)  # tried, rad/s/sqrt(s)
-NO_WALK = 1e-7  # rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
-SHOWN_GAIN = 4.0  # log-likelihood that a walk must gain over none to be shown: one of 200 without a walk does
-POSSIBLE = 2.0  # what one may lose against the best and be possible: one of 20 true ones loses more
+#: tried, rad/s/sqrt(s)
+WALKS = np.geomspace(1e-6, 4e-3, 13)
+#: rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
+NO_WALK = 1e-7
+#: log-likelihood that a walk must gain over none to be shown: one of 200 without a walk
+#: does
+SHOWN_GAIN = 4.0
+#: what one may lose against the best and be possible: one of 20 true ones loses more
+POSSIBLE = 2.0
 
 
 class NormalEquations:
@@ -53,18 +58,25 @@ class NormalEquations:
 class Smoothed:
     """Estimate of all states."""
 
-    constant: Array  # (m,) the states that stay
-    constant_covariance: Array  # (m, m) of them
-    curve: Array  # (K, n) biases over time, rad/s
-    mean: Array  # (n,) their mean over the recording
-    mean_covariance: Array  # (n, n) of it
+    #: (m,) the states that stay
+    constant: Array
+    #: (m, m) of them
+    constant_covariance: Array
+    #: (K, n) biases over time, rad/s
+    curve: Array
+    #: (n,) their mean over the recording
+    mean: Array
+    #: (n, n) of it
+    mean_covariance: Array
 
 
 class RandomWalk(NamedTuple):
     """How the biases walk, rad/s/sqrt(s)."""
 
-    value: float  # 0: none shown
-    possible: float  # the largest that the recording does not rule out
+    #: 0: none shown
+    value: float
+    #: the largest that the recording does not rule out
+    possible: float
 
 
 def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:

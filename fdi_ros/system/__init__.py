@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The computer around: files and their limits, text from outside, processes that share the work.
+"""The computer around the package: installation, files and their limits, text, jobs.
 
-Here: what an installation brings, the files of ``config/``, wherever they lie, and libraries that live nodes do
-without. pip installs all that setup.py requires. ROS packages of a distribution bring no more than has a rosdep key;
-what reads recordings has none.
+This module finds the files of ``config/`` and checks for libraries that live nodes do
+without. pip installs everything that setup.py requires. ROS packages depend on rosdep
+keys only, and the libraries that read recordings have none.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def shipped_folder() -> Path | None:
-    """Return the folder ``config`` of the clone or of the installation; None if there is none.
+    """Return the folder ``config`` of the clone or of the installation, or None.
 
-    pip and colcon put it into ``share/fdi_ros`` below the prefix that the package lies in.
+    pip and colcon install the folder as ``share/fdi_ros`` below the prefix of the
+    package.
     """
     clone = _PACKAGE.parent
     places = [clone / "config"] if (clone / "package.xml").is_file() else []
@@ -44,9 +45,10 @@ def shipped_files() -> list[Path]:
 
 
 def resolve(path: str) -> Path:
-    """Return a path as given; if nothing is there, the shipped file that it names, and say so.
+    """Return an existing path unchanged, or else the shipped file with this name.
 
-    A name alone, and ``config/...`` as in a clone, names a shipped file.
+    Shipped files are named alone, or as ``config/...`` in a clone. The choice is
+    printed.
     """
     given = Path(path)
     if given.exists():
@@ -61,13 +63,15 @@ def resolve(path: str) -> Path:
     return given
 
 
-BAGS = ("mcap", "rosbags", "lz4", "zstandard")  # what reads and writes recordings
+#: libraries that read and write recordings
+BAGS = ("mcap", "rosbags", "lz4", "zstandard")
 PROGRESS = ("tqdm",)
-POOL = (*PROGRESS, "joblib")  # what shares work among processes
-REQUIRED = (*BAGS, *POOL)  # of setup.py, for every installation by pip
-PACKAGES = {
-    "serial": "pyserial"
-}  # what pip calls a library that it calls otherwise than Python does
+#: libraries that share work among processes
+POOL = (*PROGRESS, "joblib")
+#: of setup.py, for every installation by pip
+REQUIRED = (*BAGS, *POOL)
+#: names on PyPI, where they differ from the names to import
+PACKAGES = {"serial": "pyserial"}
 
 
 def require(who: str, libraries: Sequence[str]) -> None:
@@ -94,7 +98,7 @@ def there(library: str) -> bool:
 
 
 def _pip() -> str:
-    """Return the command by which pip installs here: the Python of a distribution refuses the plain one (PEP 668)."""
+    """Return the pip command for this Python, which a distribution may manage (PEP 668)."""
     managed = Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED"
     own = sys.prefix != sys.base_prefix
     return (

@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files: how large what is read may be, which are believed, and results that appear whole or not at all.
+"""Files: limits for reading, files that are trusted, results written whole or not at all.
 
-What is kept between two starts is taken over as it is found: compiled code is run, a state decides what is monitored.
-So such a file must belong to this user or to root, nobody else may be able to write it, and no link is followed,
-neither on reading nor on writing.
+Files kept between two starts are trusted: compiled code is executed, a state decides
+which channels are monitored. Such a file must belong to this user or to root, and
+nobody else may have write access. Links are followed neither on reading nor on writing.
 """
 
 from __future__ import annotations
@@ -32,75 +32,88 @@ from typing import Any, BinaryIO
 from fdi_ros.errors import BagError
 
 # Limits ---------------------------------------------------------------------------------------------------------------
-# Far above what gyros need, and such that nothing read takes 1 GB of memory or runs on without end; docs/security.md
-# says what happens beyond each.
+# All limits are far above the needs of gyros. No input takes 1 GB of memory or runs
+# without end. docs/security.md describes the effect of each limit.
 
-CHUNK_BYTES = 1 << 26  # of one chunk or message of a recording, decompressed
-PORTION_BYTES = 1 << 24  # messages of a database are handed on when they hold so much
+#: of one chunk or message of a recording, decompressed
+CHUNK_BYTES = 1 << 26
+#: messages of a database are handed on when they hold so much
+PORTION_BYTES = 1 << 24
+#: bytes that any recording may unpack to, plus this multiple of its size
 FREE_BYTES, FREE_RATIO = (
     1 << 28,
     50,
-)  # a recording may unpack to so many bytes, and so many times its own size more
-RECORDS, RECORD_BYTES = 300_000, 4096
-"""An MCAP file may hold so many records outside chunks, and one for each so many of its bytes more."""
-CHANNELS = (
-    4096  # topics of one recording, and descriptions of topics and of types in one file
 )
-DESCRIPTIONS = 4 * CHANNELS  # read from one chunk at most
-DESCRIPTION_BYTES = 1 << 20  # of the description of a topic or a type
-NAME = 255  # characters of the name of a topic or a type, as in DDS
-FILES = 800  # files of one recording; they are open together
-LATEST = (
-    2**31 * 10**9 - 1
-)  # ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say
+RECORDS, RECORD_BYTES = 300_000, 4096
+"""Records outside chunks in an MCAP file, and bytes of the file for each further
+record.
+"""
+#: topics of one recording, and descriptions of topics and of types in one file
+CHANNELS = 4096
+#: read from one chunk at most
+DESCRIPTIONS = 4 * CHANNELS
+#: of the description of a topic or a type
+DESCRIPTION_BYTES = 1 << 20
+#: characters of the name of a topic or a type, as in DDS
+NAME = 255
+#: files of one recording, all open together
+FILES = 800
+#: latest time of recording, ns: the largest stamp of ROS 2, in 2038
+LATEST = 2**31 * 10**9 - 1
 EARLIEST = 946_684_800 * 10**9
-"""ns: a time before this, the year 2000, is no date: it counts from a start (of an autopilot, of a simulation)."""
+"""Earliest date, the year 2000, ns. Earlier times count from the start of a system."""
 LOG_SPAN = 10**13
-"""us: times of a flight log lie between 0, the start of the autopilot, and this, 115 days; or they are dates."""
+"""Longest time of a flight log, us: 115 days since the start of the autopilot."""
 ULOG_BYTES, TLOG_BYTES = 1 << 28, 1 << 27
-"""Of a log that a library reads whole: PX4's, hours of it, and that of a ground station, a day of it."""
+"""Size of a log that a library reads whole: hours of PX4, a day of telemetry."""
 ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = (
     1000,
     1 << 26,
     1 << 8,
     1 << 16,
 )
-"""Of PX4's: fields of a message; bytes of messages that are no samples, each counted as so many more, for a library
-makes an object of each, and of a topic one for each field."""
+"""Limits of ULog: fields of a message, bytes of messages without samples, and the cost
+in bytes of the objects that pyulog makes of each message and of each topic.
+"""
 ROS1_INDEX_BYTES = 48 << 20
-"""Of the index of a bag of ROS 1, 12 for each message of any topic: an hour at 1100 messages a second."""
-CSV_LINE_BYTES = 1 << 20  # of the line of names of a table of text
+"""Index of a ROS 1 bag, 12 bytes per message: an hour at 1100 messages per second."""
+#: of the line of names of a table of text
+CSV_LINE_BYTES = 1 << 20
 CSV_COLUMNS = 4096
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
-"""A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
+"""SQLite steps that any query may take, plus this number per byte of the file."""
 
 YAML_BYTES = 1 << 20
-YAML_NODES = 50_000  # values of a YAML file, those behind aliases counted each time
+#: values of a YAML file, those behind aliases counted each time
+YAML_NODES = 50_000
 YAML_DEPTH = 50
-YAML_DIGITS = 64  # characters of a number
+#: characters of a number
+YAML_DIGITS = 64
 
 
 def max_unpacked_bytes(size: int) -> int:
-    """Bytes that a recording of so many bytes may unpack to."""
+    """Return the bytes that a recording of this size may unpack to."""
     return FREE_BYTES + FREE_RATIO * size
 
 
 # What is believed -----------------------------------------------------------------------------------------------------
 
-OTHERS = stat.S_IWGRP | stat.S_IWOTH  # bits of the mode by which others can write
+#: bits of the mode by which others can write
+OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 class DistrustError(OSError):
-    """A file or folder that somebody else may have written; `strerror` says why."""
+    """Raised for a path that another user may have written; `strerror` gives the reason."""
 
     def __init__(self, path: Path | str, why: str) -> None:
         super().__init__(0, why, str(path))
 
 
 def check_trusted(path: Path | str, about: os.stat_result | None = None) -> None:
-    """Check that a file or folder can have been written by this user and root alone; links are not followed.
+    """Check that only this user and root can have written a path. Links are not followed.
 
-    ``about``: what is known of it already. `DistrustError` if that is not so, `OSError` if there is no such file.
+    ``about``: the result of `os.lstat`, if known. `DistrustError` if others can have
+    written the path, `OSError` if nothing exists there.
     """
     about = about or os.lstat(path)
     if stat.S_ISLNK(about.st_mode):
@@ -114,9 +127,10 @@ def check_trusted(path: Path | str, about: os.stat_result | None = None) -> None
 
 
 def close_to_others(folder: Path | str) -> None:
-    """Take from others the right to write a folder of this user, and check it; what lies in it must be checked still.
+    """Remove the write permission of others from a folder of this user, and check the folder.
 
-    `DistrustError` if it belongs to another user, or is a link; `OSError` if there is none, or it cannot be changed.
+    Its contents are not checked. `DistrustError` if the folder belongs to another user
+    or is a link, `OSError` if the folder is missing or cannot be changed.
     """
     about = os.lstat(folder)
     if (
@@ -130,9 +144,10 @@ def close_to_others(folder: Path | str) -> None:
 
 
 def check_ancestor(folder: Path | str) -> None:
-    """Check that in a folder above ours nobody else can put another in place of ours.
+    """Check that nobody else can replace our folder inside this one.
 
-    `DistrustError` if others can write it, and it is not sticky; `OSError` if there is none.
+    `DistrustError` if others can write here and the sticky bit is not set, `OSError` if
+    the folder is missing.
     """
     mode = os.stat(folder).st_mode
     # That a group can is usual where every user has one of their own.
@@ -144,9 +159,9 @@ def check_ancestor(folder: Path | str) -> None:
 
 @contextlib.contextmanager
 def lock(path: str) -> Iterator[None]:
-    """Hold a lock file alone; where the file system has no locks there is nothing better.
+    """Hold an exclusive lock on a file; without effect on file systems that have no locks.
 
-    `OSError` if it cannot be opened, or is a link; nothing is ever written to it.
+    Nothing is written to the file. `OSError` if it is a link or cannot be opened.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(path, flags, 0o600), "rb", buffering=0) as file:
@@ -156,9 +171,10 @@ def lock(path: str) -> Iterator[None]:
 
 
 def read_trusted(path: Path, most: int) -> bytes:
-    """Read a regular file that only this user or root can have written, so many bytes of it at most.
+    """Read at most this many bytes of a regular file that only this user or root can write.
 
-    `DistrustError` if somebody else may have, or it is no regular file; `OSError` if it cannot be read.
+    `DistrustError` if others can write it or the file is not regular, `OSError` if
+    reading fails.
     """
     with open_regular(path, links=False) as file:
         check_trusted(path, os.fstat(file.fileno()))
@@ -166,15 +182,16 @@ def read_trusted(path: Path, most: int) -> bytes:
 
 
 def open_regular(path: Path | str, links: bool = True) -> BinaryIO:
-    """Open a regular file for reading, whoever has written it: no pipe, device or socket is opened or waited for.
+    """Open a regular file for reading. Pipes, devices and sockets are refused without waiting.
 
-    `DistrustError` if it is another thing, or a link and these are not followed; `OSError` if it cannot be opened.
+    `DistrustError` if the path is not a regular file, or a link and links are not
+    allowed. `OSError` if opening fails.
     """
     _check_regular(path, os.stat(path) if links else os.lstat(path))
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if links else os.O_NOFOLLOW)
     file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115, it is given to the caller
     try:
-        # What was there may have become another thing since.
+        # The path may have been replaced since the first check.
         _check_regular(path, os.fstat(file.fileno()))
     except OSError:
         file.close()
@@ -193,9 +210,10 @@ def _check_regular(path: Path | str, about: os.stat_result) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file that takes its place when all is written and on the disk, or is gone if something fails: `OSError`.
+    """Write a file that replaces the path once all is on the disk; on failure nothing remains.
 
-    It is written under a name that nobody can foresee, and created there: what lies at a name is never written to.
+    The scratch file has an unpredictable name and is created exclusively, so no
+    existing file is written to. `OSError` if writing fails.
     """
     _remove_abandoned(path, path.parent, 16)
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
@@ -218,18 +236,18 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 # Results --------------------------------------------------------------------------------------------------------------
-# The one writer of results, for every command. `-` is standard output. What is no file (a device, a pipe) is written
-# through, once all that goes there is known.
+# The only writer of results. `-` is standard output. Devices and pipes receive their
+# content at the end, in one go.
 
 STANDARD_OUTPUT = Path("-")
-MADE_BY = {
-    "generator": "fdi_ros"
-}  # first in every file of figures: a mark by which a former result is recognised
+#: first in every file of figures: a mark by which a former result is recognised
+MADE_BY = {"generator": "fdi_ros"}
 _OPEN_DESCRIPTOR = re.compile(
     r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+"
 )
-"""Names of what is open already, by whatever name it lies on the disk."""
-JUST_MADE = 1.0  # s; so young a folder may not be locked yet by who has made it
+"""Names of descriptors that are already open."""
+#: age below which a scratch folder may not be locked yet by its maker, s
+JUST_MADE = 1.0
 
 
 def is_open_already(path: Path) -> bool:
@@ -238,7 +256,7 @@ def is_open_already(path: Path) -> bool:
 
 
 def is_stream(path: Path) -> bool:
-    """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""
+    """Whether a path is standard output, a pipe, a terminal or another device."""
     if is_open_already(path):
         return True
     try:
@@ -249,15 +267,15 @@ def is_stream(path: Path) -> bool:
 
 
 def real_path(path: Path) -> Path:
-    """Return where a path leads; a circle of links leads to itself."""
+    """Resolve all links of a path. A circle of links resolves to itself."""
     return Path(os.path.realpath(path))
 
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Give a path to write a file or make a folder at; it takes its place when all is written, or is gone.
+    """Give a path for a file or folder that replaces the target once complete.
 
-    `BagError` if it cannot be written.
+    On failure nothing remains. `BagError` if writing fails.
     """
     if is_stream(path):
         with _scratch(path, Path(tempfile.gettempdir())) as folder:
@@ -268,7 +286,8 @@ def whole(path: Path) -> Iterator[Path]:
     with _scratch(path, path.parent) as folder:
         new, before = folder / path.name, folder / f"{path.name}.before"
         yield new
-        # A file takes the place of another in one step, a folder only that of nothing.
+        # os.replace exchanges files in one step, but a folder only replaces a missing
+        # path.
         if new.is_dir() and path.exists():
             os.replace(path, before)
         try:
@@ -280,13 +299,16 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text file, whole or not at all; `BagError` if it cannot be written."""
+    """Write a text file, whole or not at all. `BagError` if writing fails."""
     with whole(target) as path:
         path.write_text(text, encoding="utf-8", errors="replace")
 
 
 def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write figures as JSON, marked as of this package; None: not asked for. `BagError` if it cannot be written."""
+    """Write figures as JSON with the mark of this package, without a target do nothing.
+
+    `BagError` if writing fails.
+    """
     if target is not None:
         write_text(
             target,
@@ -295,9 +317,10 @@ def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value in the types of JSON: arrays as lists, what is not finite as null.
+    """Convert a value to the types of JSON: arrays to lists, NaN and infinity to null.
 
-    A dataclass becomes an object of its fields, unless it has a method ``as_json`` that gives another form.
+    A dataclass becomes an object of its fields, unless its method ``as_json`` returns
+    another form.
     """
     if hasattr(value, "as_json"):
         return plain(value.as_json())
@@ -308,7 +331,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(name): plain(one) for name, one in value.items()}
     if hasattr(value, "tolist"):
-        # An array of NumPy, or one number of it.
+        # An array or a scalar of NumPy.
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [plain(one) for one in value]
@@ -316,28 +339,28 @@ def plain(value: Any) -> Any:
 
 
 def _copy_to_stream(source: Path, path: Path) -> None:
-    """Write what a file holds to where a path leads."""
+    """Copy the content of a file to a stream."""
     with source.open("rb") as file:
         if path == STANDARD_OUTPUT:
             sys.stdout.flush()
             shutil.copyfileobj(file, sys.stdout.buffer)
             sys.stdout.flush()
         else:
-            # What a descriptor has been given before stays.
+            # Append: earlier content of the descriptor stays.
             with path.open("ab") as out:
                 shutil.copyfileobj(file, out)
 
 
 @contextlib.contextmanager
 def _scratch(path: Path, parent: Path) -> Iterator[Path]:
-    """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
+    """Give a scratch folder beside the target, so that one rename moves the result in place."""
     _remove_abandoned(path, parent, 8)
-    # Named before it is made: a signal at any moment leaves nothing behind.
+    # The name exists before the folder, so that a signal at any moment leaves nothing.
     folder = parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
         folder.mkdir(mode=0o700)
         with _opened(folder) as descriptor:
-            # Where the file system has no locks, what a killed run leaves stays.
+            # Without file locks, scratch files of killed processes stay.
             with contextlib.suppress(OSError):
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield folder
@@ -350,9 +373,10 @@ def _scratch(path: Path, parent: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(path: Path, parent: Path, digits: int) -> None:
-    """Remove scratch files and folders of a path that killed runs have left.
+    """Remove scratch files and folders of a path that killed processes have left.
 
-    Their names end with so many hexadecimal digits; a running process holds a lock on each.
+    Their names end with this number of hexadecimal digits. A running process holds a
+    lock on each.
     """
     pattern = f".{glob.escape(path.name)}.{'[0-9a-f]' * digits}"
     with contextlib.suppress(OSError):
@@ -371,7 +395,7 @@ def _remove_abandoned(path: Path, parent: Path, digits: int) -> None:
 
 @contextlib.contextmanager
 def scratch_folder(name: str) -> Iterator[Path]:
-    """Give a temporary folder; it is removed at the end, or by the next use after a kill."""
+    """Give a temporary folder. Its end, or the next use after a kill, removes the folder."""
     parent = Path(tempfile.gettempdir())
     path = parent / name
     with _scratch(path, parent) as folder:
@@ -380,7 +404,7 @@ def scratch_folder(name: str) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """Open a file or folder; a lock on it ends with the process."""
+    """Open a file or folder to lock it. The lock ends with the process."""
     descriptor = os.open(
         path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
     )

@@ -1,14 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where jobs run (blocks of trials, recordings): this process, processes of this machine, or a Dask cluster.
+"""Run jobs (blocks of trials, recordings) here, in local processes, or on a Dask cluster.
 
-A worker that dies costs the time of its job: it is run again. The results do not depend on which worker ran what. A job
-that kills its worker every time ends the run, or, where the caller says what stands for it, costs itself alone.
+A job whose worker dies runs again. Results do not depend on the choice of workers. A
+job that kills every worker ends the run, unless the caller provides a substitute
+result.
 
-A cluster is reached over TLS where its address says so, with the certificates that Dask's configuration names. Whoever
-reaches a scheduler without TLS can run any code on its workers, and, since results are pickled, here. So one that
-others can reach is warned of.
+A cluster address with tls:// uses the certificates of Dask's configuration. A scheduler
+without TLS lets everybody who reaches its port run code on the workers and, since
+results are pickled, here. A warning names such a scheduler.
 """
 
 from __future__ import annotations
@@ -34,13 +35,16 @@ from joblib.externals.loky.process_executor import (
 from fdi_ros.errors import StudyError
 from fdi_ros.system import require
 
-Job = tuple[Any, ...]  # arguments of one call; picklable
+#: arguments of one call, picklable
+Job = tuple[Any, ...]
 Function = Callable[..., Any]
 Lost = Callable[[int, str], Any]
-"""Makes the result of a job that is given up, from its index and one line that says why."""
+"""Makes the result of an abandoned job from its index and one line with the reason."""
 
-MAX_DEATHS = 3  # processes that a job may kill until it is given up; that a job on a cluster is tried again
-MOST_WORKERS = 256  # processes on this machine
+#: processes that a job may kill before the run gives up; retries of a job on a cluster
+MAX_DEATHS = 3
+#: processes on this machine
+MOST_WORKERS = 256
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
 ONE_THREAD = dict.fromkeys(
     (*(f"{name}_NUM_THREADS" for name in _THREADS), "VECLIB_MAXIMUM_THREADS"), "1"
@@ -49,7 +53,7 @@ ONE_THREAD = dict.fromkeys(
 
 
 def worker_count(workers: int | None) -> int:
-    """Return how many processes are asked for; None: as many as there are cores. `StudyError`: too few or too many."""
+    """Return the number of processes, None means one per core. `StudyError` if out of range."""
     count = (os.cpu_count() or 1) if workers is None else workers
     if not 1 <= count <= MOST_WORKERS:
         raise StudyError(f"workers is {count}, expected 1 to {MOST_WORKERS}")
@@ -67,12 +71,14 @@ def run_jobs(
     cluster: str | None,
     lost: Lost = _give_up,
 ) -> Iterator[tuple[int, Any]]:
-    """Run all jobs, the arguments of a function that workers can import, and give (index, result) as they are done.
+    """Run all jobs and yield (index, result) as they finish.
 
-    ``workers``: processes; 1: this one alone. ``cluster``: address of the scheduler of a Dask cluster that works
-    instead, ``tcp://host:port`` or ``tls://host:port``. ``lost`` makes the result of a job that kills its worker again
-    and again; without it such a job ends the run. In this process alone there is no worker to be killed. `StudyError`
-    if the address is none, the scheduler is not there or is lost, or a job is given up and ``lost`` is not given.
+    A job holds the arguments of a function that workers can import. ``workers``: number
+    of processes, 1 for this process alone. ``cluster``: address of a Dask scheduler to
+    use instead, ``tcp://host:port`` or ``tls://host:port``. ``lost`` makes the result
+    of a job that repeatedly kills its worker; without ``lost`` such a job ends the run.
+    `StudyError` if the address is invalid, the scheduler is unreachable, or a job is
+    abandoned.
     """
     if not jobs:
         return iter(())
@@ -91,16 +97,16 @@ def run_jobs(
 def _on_processes(
     function: Function, jobs: Sequence[Job], workers: int, lost: Lost
 ) -> Iterator[tuple[int, Any]]:
-    """Run each job in a process that has no other: if it dies, the cause is known and no other job is run again.
+    """Run each job in a process of its own, so that a crash identifies the job.
 
-    The processes of one pool would all be ended together.
+    A process pool would end all its processes together.
     """
     waiting, deaths = deque(range(len(jobs))), Counter[int]()
     idle = [ProcessPoolExecutor(1, env=ONE_THREAD) for _ in range(workers)]
     running: dict[Future[Any], tuple[int, ProcessPoolExecutor]] = {}
 
     def begin(k: int, process: ProcessPoolExecutor) -> None:
-        """Begin a job; in a new process if the idle one died under its last job, or since."""
+        """Begin a job, in a new process if the idle one has died."""
         try:
             running[process.submit(_in_worker, os.getpid(), function, jobs[k])] = (
                 k,
@@ -132,7 +138,7 @@ def _on_processes(
 
 
 def _in_worker(parent: int, function: Function, job: Job) -> Any:
-    """Do a job in a worker process, which ends when its parent does: killed, that can no longer end it."""
+    """Run a job in a worker process that ends together with its parent."""
     _follow(parent)
     return function(*job)
 
@@ -151,14 +157,15 @@ def _follow(parent: int) -> None:
 
 # On a cluster ---------------------------------------------------------------------------------------------------------
 
-CONNECT_TIMEOUT = 10.0  # s
+#: s
+CONNECT_TIMEOUT = 10.0
 TLS = "tls://"
 
 
 def _on_cluster(
     function: Function, jobs: Sequence[Job], cluster: str, lost: Lost
 ) -> Iterator[tuple[int, Any]]:
-    """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
+    """Run all jobs on the cluster and yield (index, result), as `run_jobs` does."""
     require("--scheduler", ("dask", "distributed"))
     import distributed
 
@@ -191,7 +198,8 @@ def _on_cluster(
                     suspects.append(k)
                 else:
                     yield k, future.result()
-            # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
+            # Dask blames every job of a dead worker, begun or not. Only the guilty one
+            # kills a worker that has no other job.
             for number in suspects:
                 for k, future in run([number]):
                     times = deaths(future)
@@ -204,7 +212,7 @@ def _on_cluster(
 
 @functools.cache
 def _warn_if_open(listens_at: str, address: str) -> None:
-    """Say once that a scheduler without TLS listens where others reach it."""
+    """Warn once about a scheduler without TLS that others can reach."""
     host = listens_at.partition("://")[2].rpartition(":")[0].strip("[]")
     try:
         private = ipaddress.ip_address(host).is_loopback
@@ -256,7 +264,7 @@ def _connected(distributed: Any, cluster: str) -> Iterator[Any]:
 
 
 def _died_words(times: int) -> str:
-    """Say that a job was given up."""
+    """Return the line for an abandoned job."""
     return f"the worker process that ran it died {times} times (out of memory, or a crash in native code)"
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text from outside, and dates, made fit to be shown: on a terminal, on a page, in a comment of a file."""
+"""Foreign text and dates, made safe for a terminal, a page or a comment in a file."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from datetime import datetime, timezone
 
 from fdi_ros.system.files import EARLIEST, LATEST
 
+#: characters of a text from a file, and of a whole line with such texts, that are shown
 WORD, LINE = (
     120,
     4000,
-)  # characters of a text from a file, and of a whole line with such texts, that are shown
+)
 
 
 def shown(text: object, most: int = WORD) -> str:
-    r"""Return a text on one line, shortened, with nothing in it that a terminal obeys.
+    r"""Return a short single-line text without characters that control a terminal.
 
-    Escape codes, line breaks, invisible characters and those that turn the direction of writing are written as
-    ``\x1b``, ``\n``, ``\u202e``.
+    Escape codes, line breaks, invisible characters and changes of the writing direction
+    appear as ``\x1b``, ``\n``, ``\u202e``.
     """
     text = str(text)
     if len(text) > most:
@@ -31,7 +32,7 @@ def shown(text: object, most: int = WORD) -> str:
 
 
 def visible(text: str, kept: str = "\n\t") -> str:
-    """Return a text of any length with nothing in it that a terminal or browser obeys, but for some characters."""
+    """Escape all control characters of a text, except those kept."""
     if text.isprintable():
         return text
     return "".join(
@@ -43,7 +44,7 @@ def visible(text: str, kept: str = "\n\t") -> str:
 
 
 def plus_minus(value: float, std: float) -> str:
-    """Write a value with its standard error to its first figure, to two where that is 1: `0.10 +- 0.03`."""
+    """Write a value with its standard error, rounded to the error: `0.10 +- 0.03`."""
     if not math.isfinite(std) or std <= 0.0:
         return f"{value:.3g}"
     exponent = math.floor(math.log10(std))
@@ -54,7 +55,7 @@ def plus_minus(value: float, std: float) -> str:
 def html_table(
     caption: str, head: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> str:
-    """Return a table as a notebook shows it."""
+    """Return an HTML table for a notebook."""
 
     def line(cells: Iterable[object], tag: str) -> str:
         return f"<tr>{''.join(f'<{tag}>{html.escape(shown(cell, LINE))}</{tag}>' for cell in cells)}</tr>"
@@ -64,12 +65,12 @@ def html_table(
 
 
 def storable(text: str) -> str:
-    r"""Return a text as Unicode: bytes of a name that are none, which Python keeps as surrogates, become ``\udcff``."""
+    r"""Return valid Unicode: surrogates, as in names of files, become ``\udcff``."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def date_of(ns: int) -> datetime | None:
-    """Return the date of a stamp, UTC; None: it counts from the start of an autopilot or of a simulation."""
+    """Return the date of a stamp, UTC, None if the stamp counts from the start of a system."""
     return (
         datetime.fromtimestamp(ns * 1e-9, timezone.utc)
         if EARLIEST <= ns <= LATEST

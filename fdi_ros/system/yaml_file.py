@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""YAML files, read within limits: plain values and nothing else, whatever the file holds."""
+"""YAML files, read within limits and with plain values only."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ except ImportError:  # PyYAML built without libyaml
 
 
 class _Refused(yaml.YAMLError):  # type: ignore[misc]
-    """The text is YAML, and beyond what is taken."""
+    """Valid YAML beyond the limits of this package."""
 
     def __init__(self, mark: Any, words: str) -> None:
         super().__init__(f"line {mark.line + 1}: {words}")
@@ -38,7 +38,7 @@ _TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(_SafeLoader):  # type: ignore[misc]
-    """Takes what a ROS 2 parameter file may hold: no dates, no binary data, no numbers beyond 64 bits."""
+    """Loader for the types of a ROS 2 parameter file; no dates, binary data or big integers."""
 
     yaml_implicit_resolvers: ClassVar = {
         first: [
@@ -91,9 +91,10 @@ _Loader.add_constructor(f"{_TAG}bool", _Loader.truth)
 
 
 def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
-    """Read a YAML file, which errors (of class ``error``) call ``what``: ``config``.
+    """Read a YAML file within limits.
 
-    They say that it cannot be read, is no YAML, or is beyond the limits.
+    ``what`` and the path name the file in errors, which are of class ``error``:
+    unreadable, not YAML, or beyond the limits.
     """
     try:
         with open_regular(path) as file:
@@ -111,7 +112,7 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
 
 
 def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
-    """Return the value of a YAML text; called and error as in `read_yaml`."""
+    """Parse a YAML text. ``called`` names the text in errors of class ``error``."""
     try:
         _check_size(text)
         # The loader is derived from the safe one.
@@ -123,7 +124,7 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
 
 
 def _problem(refused: yaml.YAMLError) -> str:
-    """Say what is wrong, and where: a text has lines, and no name of its own."""
+    """Describe a YAML error by its line and column."""
     if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:
         return " ".join(str(refused).replace(' in "<unicode string>"', "").split())
     mark, why = (
@@ -138,13 +139,13 @@ class _Collection:
 
     def __init__(self, event: yaml.CollectionStartEvent, before: int) -> None:
         self.anchor: str | None = event.anchor
-        self.before = before  #: number of values that precede it
+        self.before = before  #: number of values before this collection
         self._mapping = isinstance(event, yaml.MappingStartEvent)
         self._keys: set[str] = set()
         self._children = 0
 
     def add(self, event: yaml.NodeEvent) -> None:
-        """Take the next child; a mapping has keys and values in turn, each key once."""
+        """Take the next child. A mapping alternates keys and values, and keys must differ."""
         is_key = self._mapping and self._children % 2 == 0
         self._children += 1
         if not is_key or not isinstance(event, yaml.ScalarEvent):
