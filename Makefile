@@ -8,7 +8,7 @@ N ?= 2000
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
-.PHONY: demo test ubuntu fuzz check docs format venv clean help
+.PHONY: demo test ubuntu fuzz coverage check docs format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "watch,logs,calibrate" "$(PYTHON)" compile
@@ -25,6 +25,11 @@ ubuntu: ## what flies, with no more than a live node needs and in the versions o
 fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
 	@$(RUN) python -m fdi_ros.cli compile
 	@FUZZ_CASES=$(N) $(RUN) python -m pytest -n $(WORKERS) -o faulthandler_timeout=60 test/bag/test_limits.py -k hostile_file $(ARGS)
+
+coverage: venv ## share of the lines of Python that the tests run; compiled code is not seen
+	@$(RUN) python -m fdi_ros.cli compile
+	@$(RUN) python -m pip install --quiet pytest-cov
+	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov=fdi_ros --cov-report=term:skip-covered $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How units and channels agree by the motion that they share: mounts found, contradictions named and refused.
+"""Agreement of units and channels in their common motion: mounts and contradictions.
 
-All units of a rigid body see one rotation, each in its own frame: the mount of a unit against the first is the rotation
-that takes its rates into those of the first (Wahba 1965). Rotation about one axis alone leaves the turn about that axis
-open; which axes of the vehicle the first unit has, no gyro measures.
+All units of a rigid body measure one rotation, each in its own frame. The mount of a
+unit against the first is the rotation between their rates (Wahba 1965). Motion about a
+single axis leaves the turn about that axis open. No gyro measures how the first unit is
+mounted in the vehicle.
 """
 
 from __future__ import annotations
@@ -32,8 +33,7 @@ from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array
 from fdi_ros.setup.blocks import Data
 
-#: share of the rotation that others see which a channel shows at least, and they of
-#: what it shows
+#: smallest response of a channel to the rotation of others, and the reverse
 LEAST_RESPONSE = 0.3
 #: Share of rotation in common from which two units show one rotation, along other axes
 #: or on another scale.
@@ -46,11 +46,11 @@ SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
 
 
 def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) -> None:
-    """Refuse units and channels that do not show one rotation, whatever the fit would make of them.
+    """Refuse units and channels that do not measure one rotation.
 
-    Axes as configured are good enough to tell a dead channel from a live one, but for those of unknown mount.
-    `DisagreementError` names the unit that turns by another factor or about other axes than most, the channel that does
-    not follow, or all among which nothing decides.
+    Configured axes suffice for that, except for unknown mounts. `DisagreementError`
+    names the unit with another scale or other axes, the channel without response, or
+    all of them if nothing decides.
     """
     means = data.slow_rates()
     if len(means) < LEAST_WINDOWS:
@@ -65,7 +65,7 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
 
 
 def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> None:
-    """Refuse a unit that turns by another factor than most, such as deg/s, or about other axes."""
+    """Refuse a unit with another scale than most, such as deg/s, or with other axes."""
     units = [
         list(unit)
         for unit in nominal.units
@@ -88,7 +88,7 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
     alike = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
     rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
-    # Of what is mounted nobody knows how, the axes say nothing.
+    # Axes of unknown mounts cannot be compared.
     known = [not {*unit} & {*unknown} for unit in units]
     turn = [
         [
@@ -138,7 +138,7 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
 
 
 def _wrong_axes(signed: Array) -> str:
-    """Say what a unit shows whose channels are these rows (3, 3) of its axes as configured."""
+    """Describe a unit whose channels measure these rows (3, 3) of its configured axes."""
     # x forward, y left, z up.
     seen = (
         "a roll to the right as one to the left",
@@ -167,9 +167,10 @@ def _in_common(one: Array, other: Array) -> float:
 
 
 def _check_response(moving: Array, nominal: Geometry) -> None:
-    """Refuse a channel that does not follow the rotation the others see.
+    """Refuse a channel that does not follow the rotation of the others.
 
-    A channel that agrees with any three others is not refused: a faulty one contradicts only the threes it is among.
+    Agreement with any three others suffices: a faulty channel only contradicts threes
+    that include a faulty one.
     """
     square = moving.T @ moving / len(moving)
     for i, name in enumerate(nominal.channel_names):
@@ -192,9 +193,10 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
 
 
 def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, float]]:
-    """Share of the rotation that channel i shows, and the rotation, rad/s rms, by every three others; empty: not all.
+    """Return response of channel i and rotation, rad/s rms, by each three others.
 
-    ``square``: mean products (n, n) of the channels, (rad/s)^2.
+    ``square``: mean products (n, n) of the channels, (rad/s)^2. Empty unless all
+    contradict.
     """
     size, found = float(np.sqrt(square[i, i])), []
     for three in map(
@@ -225,8 +227,7 @@ LEAST_RATE = LEAST_ROTATION / 5
 LARGEST_DOUBT = SQUARE
 #: a mount less certain than this, in any direction, is not shown
 LARGEST_ERROR = np.radians(2.0)
-#: standard errors from which what is measured is shown: a delay, or a mount that is not
-#: along axes
+#: standard errors from which a delay or a mount off the axes is shown
 SHOWN = 3.0
 
 
@@ -234,31 +235,31 @@ SHOWN = 3.0
 class Mount:
     """How one unit is turned against the first."""
 
-    #: what it is, or why it is not known
+    #: description, or reason why the mount is unknown
     words: str
-    #: share of the rotation of the unit that is that of the first one
+    #: share of rotation in common with the first unit
     shared: float = 0.0
-    #: (3, 3) by rows: v_first = R v_unit; None: it is not shown
+    #: (3, 3) v_first = R v_unit, or None if unknown
     rotation: Array | None = None
-    #: what it was measured to be away from `rotation`, rad
+    #: measured angle from `rotation`, rad
     off: float = 0.0
-    #: standard error in the least certain direction, rad; infinite: not shown at all
+    #: standard error in the least certain direction, rad, infinite if unknown
     error: float = math.inf
-    #: it turns, and not as the first unit does, however it may be mounted
+    #: whether no mount explains the rotation of the unit
     contradicts: bool = False
     #: one of the two is no right-handed frame
     mirrored: bool = False
 
     @property
     def shown(self) -> bool:
-        """Whether the recording shows it; if not, `rotation` is an assumption or `None`."""
+        """Whether the recording shows the mount; otherwise `rotation` is assumed or None."""
         return self.rotation is not None and self.error < LARGEST_DOUBT
 
 
 def find_mounts(data: Data) -> tuple[Mount, ...]:
-    """Find the mounts of units from a recording of their channels as measured, three by three."""
+    """Find the mounts of units from the measured channels of a recording."""
     means = data.slow_rates()
-    # What is taken off must turn with the unit: means do, medians do not.
+    # Means turn with the unit, medians do not.
     means = means - means.mean(axis=0) if len(means) else means
     first = Mount("the body frame is taken to be its own", 1.0, np.eye(3), error=0.0)
     return (
@@ -271,7 +272,7 @@ def find_mounts(data: Data) -> tuple[Mount, ...]:
 
 
 def _against(first: Array, unit: Array) -> Mount:
-    """Mount of a unit whose rates are these (W, 3) against the one that shows first (W, 3), rad/s."""
+    """Return the mount of a unit with rates (W, 3) against the first one (W, 3), rad/s."""
     if len(unit) < LEAST_WINDOWS:
         return Mount(
             f"NOT KNOWN: only {len(unit) * WINDOW:.0f} s in which every unit gives values"
@@ -299,7 +300,7 @@ def _against(first: Array, unit: Array) -> Mount:
             contradicts=True,
             mirrored=True,
         )
-    # Then most of what it shows is not of this rotation.
+    # Most of the rotation then differs.
     if shared < 0.5:
         words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
         return Mount(words, shared, contradicts=True)
@@ -309,7 +310,7 @@ def _against(first: Array, unit: Array) -> Mount:
             f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg",
             shared,
         )
-    # Vibration that units see differently looks like a turn between them, however long it lasts.
+    # Unequal vibration of units looks like a turn, however long the recording.
     doubt = math.sqrt(missed) * min(1.0, math.sqrt(missed) / UNEQUAL)
     # Of all signed axes, a mirrored one is never the nearest.
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
@@ -323,7 +324,7 @@ def _against(first: Array, unit: Array) -> Mount:
         for body, axis in zip("xyz", _axes_of(nearest), strict=True)
     )
     if error >= LARGEST_DOUBT:
-        # Without a better one, what a config starts from is kept.
+        # The identity is the assumption of a starting config.
         words = f"NOT MEASURED, uncertain by {np.degrees(error):.0f} deg: vibration"
         words += " hides the turns that would show it"
         return Mount(words, shared, np.eye(3), off, error)

@@ -1,12 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording as the estimator sees it: its usable samples, all units at the same instants, in blocks and windows.
+"""A recording for the estimator: usable samples at common instants, blocks and windows.
 
-A value that stays exactly the same for long is not usable: noise lets no gyro at work do so, a driver that repeats old
-values does. Units whose stamps are late, that miss values or that are slower than others are interpolated (Lagrange,
-six points of their own) at the instants of the samples. A block, 40 ms, is the mean of its samples, of channels that
-have all of them; 25 blocks are a window.
+Values that stay exactly equal for long are repeated by a driver and not usable, since a
+gyro always shows noise. Units with late stamps, missing values or a lower rate are
+interpolated (Lagrange, six of their own samples). A block of 40 ms is the mean of its
+samples, for channels that have all. A window has 25 blocks.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Data:
         )
 
     def slow_rates(self) -> Array:
-        """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
+        """Return rates (W, n) averaged over complete windows, less their medians."""
         window = (self.stamp - self.stamp[0]) // round(WINDOW * 1e9)
         starts = np.flatnonzero(np.diff(window, prepend=-1))
         counts = np.diff(starts, append=len(window))
@@ -70,12 +70,12 @@ class Data:
 
 
 def prepare(block: Block, max_rate: Array) -> Data:
-    """Mark what cannot be used: not delivered, not finite, beyond max_rate (n,) rad/s, repeated for long."""
+    """Mark unusable values: missing, not finite, beyond max_rate (n,), rad/s, or repeated."""
     received, finite = block.delivered, np.isfinite(block.z)
     with np.errstate(invalid="ignore"):
         inside = np.abs(block.z) < max_rate
     data = Data(block.stamp, np.where(received & inside, block.z, np.nan), {})
-    # What does not change at all is an old value: it shows neither rest nor motion.
+    # Constant values are old and show neither rest nor motion.
     old = repeated(data.z, data.step)
     data.z[old] = np.nan
     reasons = {
@@ -91,9 +91,12 @@ def prepare(block: Block, max_rate: Array) -> Data:
 
 
 def spikes(z: Array, axes: Array) -> Mask:
-    """Find single values of z (N, n), rad/s, far off what both neighbours and all other channels say; axes (n, 3)."""
+    """Find single values of z (N, n), rad/s, far from their neighbours and other channels.
+
+    ``axes``: (n, 3).
+    """
     found, apart = np.zeros(z.shape, dtype=bool), projector(axes)
-    # What is usual changes with the vibration.
+    # Vibration changes the usual size.
     for first in range(0, max(len(z) - 2, 0), SPIKE_PORTION):
         part = z[first : first + SPIKE_PORTION + 2]
         size = np.abs((part[1:-1] - 0.5 * (part[2:] + part[:-2])) @ apart)
@@ -103,7 +106,7 @@ def spikes(z: Array, axes: Array) -> Mask:
         level = MEDIAN_TO_RMS * np.median(whole, axis=0)
         ratio = np.nan_to_num(size / np.maximum(level, 1e-9))
         far = ratio.max(axis=1) > SPIKE
-        # What comes more often is no spike.
+        # Frequent outliers are not spikes.
         if far.mean() < 0.1:
             found[first + 1 + np.flatnonzero(far), ratio[far].argmax(axis=1)] = True
     return found
@@ -117,11 +120,11 @@ def flag_runs(flags: Mask) -> Int:
 
 #: of the interpolation
 POINTS = 6
-#: share of a window that a channel gives to count in it
+#: share of a window that a channel must deliver
 PRESENT = 0.8
 #: samples worked on at once, about
 PORTION = 100_000
-#: s; smaller delays are none: of 100 rad/s^2 they make 1e-4 rad/s
+#: smallest delay to correct, s: at 100 rad/s^2 an error of 1e-4 rad/s
 NOT_SHIFTED = 1e-6
 
 
@@ -131,16 +134,16 @@ class Blocks:
 
     #: (B,) middle of each block, s from the first sample
     seconds: Array
-    #: (B, n) rad/s; NaN where a channel lacks a sample
+    #: (B, n) rad/s, NaN if a sample is missing
     mean: Array
     #: (W,) first block of each window
     start: Int
-    #: (W, n, n) covariance of single samples in each window, (rad/s)^2; NaN: a channel
-    #: is missing
+    #: (W, n, n) covariance of samples in each window, (rad/s)^2, NaN for absent
+    #: channels
     samples: Array
-    #: (n,) what interpolation has left of the variance of white noise in them
+    #: (n,) share of the variance of white noise that interpolation leaves
     white: Array
-    #: (W,) samples that it is of
+    #: (W,) number of samples
     count: Int
 
     def __post_init__(self) -> None:
@@ -188,9 +191,9 @@ def make_blocks(data: Data, delay: Array) -> Blocks:
 
 
 def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
-    """Interpolate a recording at the instants of its samples, delays (n,), s, taken off.
+    """Interpolate a recording at the instants of its samples, less delays (n,), s.
 
-    Returns values (N, n) rad/s, NaN: not known; and what is left (n,) of the variance of white noise.
+    Returns values (N, n), rad/s, NaN if unknown, and the remaining share (n,) of white noise variance.
     """
     seconds, there, z, white = (
         data.seconds,
@@ -232,9 +235,10 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
 
 
 def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
-    """Find the polynomials through the six knots (K,) around instants x (N,), s; knots are usually so many s apart.
+    """Return the polynomials through six knots (K,) around instants x (N,), s.
 
-    Returns the first knot (N,) of each, -1 where x is beside a hole or outside, and weights (N, `POINTS`) of the knots.
+    ``usual``: usual distance of knots, s. Returns the first knot (N,) of each, -1
+    beside holes and outside, and the weights (N, `POINTS`).
     """
     if len(knots) < POINTS:
         return np.full(len(x), -1), np.zeros((len(x), POINTS))

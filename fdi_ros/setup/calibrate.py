@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the samples of a recording to the settings of the monitor: axes, biases, noise, and their standard errors.
+"""Settings of the monitor from a recording: axes, biases and noise with standard errors.
 
-Method and formulas are in docs/calibration.md.
+docs/calibration.md has method and formulas.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ UNKNOWN_MOUNT = 0.58
 #: uncertainty of the axes along a direction of the body from which they are not
 #: measured
 UNMEASURED = SCALE_STD / 2
-#: the same of an array; axes from the motion alone are taken if they are off by more
+#: the same of an array, and the error from which axes follow the motion alone
 UNKNOWN_AXES = 0.1
 #: of channels that are taken for as configured
 REFERENCE_STD = 1e-6
@@ -62,22 +62,22 @@ LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
 )
 #: share of its samples that a channel must give
 LEAST_USABLE = 0.3
-#: share of the recording; of a channel faulty for longer it cannot be said which is
-#: right
+#: longest fault, as a share of the recording, for which the others decide
 MOST_FAULTY = 0.35
 #: share of the channels of a set that is left out: of a larger one nobody knows which
 #: are right
 MOST_LEFT_OUT = 1 / 3
 LOUDER = 4.0
-"""A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
-would not believe, as the motion begins, that it is vibration."""
+"""Largest ratio of the noise in motion to noise_std. The monitor would not accept more
+as vibration when motion begins.
+"""
 #: s before a declaration that a fault may have begun: most are declared sooner
 LEAD = 1.0
-#: what imus.max_skew is at least where delays smaller than it are to be taken off, s
+#: smallest imus.max_skew where smaller delays are taken off, s
 LEAST_SKEW = 5e-5
-#: what imus.timeout is at least, in differences of the delays of units
+#: smallest imus.timeout, in differences of unit delays
 WAITS = 2.5
-#: parameters that say nothing any more beside geometry.axes
+#: parameters without meaning beside geometry.axes
 REPLACED = (
     "imus.mounts",
     "geometry.cone_channels",
@@ -88,8 +88,7 @@ class StampDelay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
-    #: s; positive: their stamps are late, what they stand for was measured earlier; as
-    #: imus.delays has it
+    #: s, positive if stamps are late, as in imus.delays
     value: float
     #: s
     error: float
@@ -101,7 +100,7 @@ class StampDelay(NamedTuple):
 
 
 class Span(NamedTuple):
-    """Channels, one of which at least is faulty from one time to another, s from the start of the part used."""
+    """Channels of which one is faulty, from start to end, s from the start of the part used."""
 
     channels: tuple[int, ...]
     start: float
@@ -110,13 +109,13 @@ class Span(NamedTuple):
 
 @dataclass
 class Calibration:
-    """Result for the channels in use; all that is per channel is in their order."""
+    """Result for the channels in use, in their order."""
 
     names: tuple[str, ...]
     #: (n, 3) as configured
     nominal: Array
     estimate: StateEstimate
-    #: what is not known of the sampling instants, s, as written
+    #: uncertainty of the sampling instants, s, as written
     timing: float
     #: of all units but the first
     delays: tuple[StampDelay, ...]
@@ -128,7 +127,7 @@ class Calibration:
     duration: float
     #: parameters to be changed, ``{"section.field": value}``
     settings: dict[str, object]
-    #: of what channels differ by from the fused rate with these settings
+    #: spectrum of differences from the fused rate
     spectrum: Spectrum
 
     def __post_init__(self) -> None:
@@ -160,7 +159,7 @@ class Calibration:
         self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
         # (n,) channels whose scale factor the recording shows, against the others.
         self.measured = np.sqrt(along**2 @ self.axis_errors**2) < UNMEASURED
-        # Places of the channels of each unit; of an array without units each channel is alone.
+        # Channels of each unit. Channels of an array form units of one.
         unit_of = [name.rpartition(".")[0] or name for name in self.names]
         self.units = [
             [i for i, one in enumerate(unit_of) if one == unit]
@@ -171,12 +170,12 @@ class Calibration:
 def calibrate(
     block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()
 ) -> Calibration:
-    """Calibrate all channels that are not excluded: the more rest and rotation about all axes, the more is shown.
+    """Calibrate all channels that are not excluded.
 
-    ``reference``: name of the triad that is taken for as configured, or of three channels with commas between; empty:
-    no channel is believed more than the others (of an array: the first three that span space). ``unknown``: numbers of
-    channels of which nobody knows how they are mounted. `FdiError` if the recording is too short, or its channels
-    contradict each other, naming which.
+    ``reference``: a triad, or three channels with commas, taken as configured. Empty
+    trusts all alike, and in an array the first three that span space. ``unknown``:
+    channels with unknown mounts. `FdiError` if the recording is too short, or channels
+    contradict each other.
     """
     full = build_geometry(config)
     used = np.array(
@@ -202,7 +201,7 @@ def calibrate(
         # As the monitor will have them once the delays are taken off.
         still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
         z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
-        # Where there is none for the instant, the value of another one is not it.
+        # The value of another instant is no substitute.
         received[:, used] = np.isfinite(z[:, used])
         faults, spectrum = _watch(Block(block.stamp, z, received), tried, active)
         if faults:
@@ -247,7 +246,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         raise CalibrationError(f"the recording {words}")
     for i, name in enumerate(names):
         seconds = data.seconds[np.isfinite(data.z[:, i])]
-        # Of those that it would give at its own rate: a unit may be slower than the others.
+        # A unit may be slower than others, so its own rate counts.
         usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
         share = len(seconds) * usual / (samples * data.step)
         if share < LEAST_USABLE:
@@ -262,7 +261,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
 
 
 def reference_channels(config: Config, geometry: Geometry, name: str) -> list[int]:
-    """Return the places of the reference channels among those in use; none: all are alike."""
+    """Return the reference channels among those in use, empty if all are alike."""
     names, units = geometry.channel_names, source_of(config).units
     if not name:
         threes = map(list, itertools.combinations(range(geometry.n), 3))
@@ -292,7 +291,7 @@ def reference_channels(config: Config, geometry: Geometry, name: str) -> list[in
 def _sensors(
     config: Config, nominal: Geometry, data: Data, chosen: list[int], lost: list[int]
 ) -> Priors:
-    """Take axes as configured; of an array, and of lost channels, those that the motion shows."""
+    """Return the axes as configured; arrays and unknown mounts take those of the motion."""
     source, axes, scale = (
         source_of(config),
         nominal.axes.copy(),
@@ -306,7 +305,7 @@ def _sensors(
         if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
             axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
     if lost:
-        # About what does not turn they stay as they were.
+        # Directions without rotation stay as configured.
         others = [i for i in range(nominal.n) if i not in lost]
         rate = means[:, others] @ np.linalg.pinv(axes[others]).T
         weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
@@ -324,7 +323,7 @@ def _sensors(
 
 
 class _Watched(Kept):
-    """Keeps the states of channels, and takes the spectrum of what all differ by from the fused rate."""
+    """Keeps channel states, and the spectrum of differences from the fused rate."""
 
     def __init__(self, names: Sequence[str], rate: float, active: Int) -> None:
         super().__init__(lambda output: (output.stamp, output.state[:, active]))
@@ -341,8 +340,8 @@ class _Watched(Kept):
 def _watch(
     block: Block, config: Config, active: Int
 ) -> tuple[tuple[Span, ...], Spectrum]:
-    """Find when the monitor itself, with the settings found, has something declared, and the spectrum of residuals."""
-    # So that what was declared ends when it has gone.
+    """Return the declarations of the monitor with these settings, and the spectrum."""
+    # Declarations then end with their cause.
     pipeline = Pipeline.from_config(config.replaced({"decision.latch": False}))
     watched = _Watched(pipeline.channel_names, config.sample_rate, active)
     Walk(pipeline, [watched]).take(block)
@@ -367,7 +366,7 @@ def _watch(
 
 
 def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data:
-    """Leave faults out that are of so few channels that the others are known to be right; refuse one that lasts."""
+    """Leave out short faults of few channels, and refuse lasting ones."""
     clear = [
         span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)
     ]
@@ -390,7 +389,7 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
 def _settings(
     config: Config, active: Int, step: float, found: StateEstimate
 ) -> dict[str, object]:
-    """Parameters to be changed, of samples every `step` s; channels that are not in use keep what they have."""
+    """Return the changed parameters, for samples every `step` s."""
     geometry = build_geometry(config)
     before, source = build_noise(config, geometry.n), source_of(config)
 
@@ -445,7 +444,7 @@ def _settings(
 
 
 def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
-    """Find what is not known of the sampling instants (n,), s; as configured where no motion shows it."""
+    """Return the uncertainty of sampling instants (n,), s, as configured without motion."""
     before = build_noise(config, build_geometry(config).n).timing_std[active]
     error = (
         float(np.sqrt(np.mean(found.delay_std**2)))

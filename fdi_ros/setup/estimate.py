@@ -3,18 +3,18 @@
 
 """The error states of the monitor, estimated from a whole recording.
 
-The states are those of `fdi_ros.estimator.error_states`: what of them has a signal. In a window the noise of the
-moment, and so A, is one; with s = (1, rate, angular acceleration) of a block and channel i's signals ``B_i s``, the
-window says
+The states are those of `fdi_ros.estimator.error_states` that a recording can show. The
+noise, and therefore the information A, is constant within a window. With s = (1, rate,
+angular acceleration) of a block and the signals ``B_i s`` of channel i, a window
+contributes
 
     N = sum_ij A_ij B_i' (sum s s') B_j,        r = sum_ij A_ij B_i' (sum s y_j),
 
-at rest with the rate known to be zero. It is iterated, with the delays taken off the samples and the scale errors put
-into the axes, until both stay; what the recording does not show stays at its prior.
+where the rate is known to be zero at rest. Passes repeat, with delays taken off the
+samples and scale errors put into the axes, until both settle. States without evidence
+stay at their prior.
 
-Groups of windows say ``N x = r`` of the states x; biases b walk from group to group, all others c are constant. Written
-for the biases of all groups the system is banded, with the constants as its border: ``B b + C c = h, C' b + T c = g``.
-The biases are eliminated (banded Cholesky), and the marginal likelihood of the walk falls out.
+`fdi_ros.setup.smoother` solves the normal equations of all windows together.
 """
 
 from __future__ import annotations
@@ -62,31 +62,30 @@ from fdi_ros.setup.smoother import (
 SCALE_STD = 0.008
 PASSES = 12
 TRUSTING = PASSES // 3
-"""At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
-off look like vibration."""
-#: s of delays, and share of the rate of axes: what changes less has settled
+"""First passes, which take all motion for motion, because unknown delays and scale
+errors look like vibration.
+"""
+#: change of delays, s, and relative change of axes, below which a pass has settled
 SETTLED = 2e-5
 #: s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that
 #: moves no bias
 SHOWN_DELAY = 0.001
 #: s
 LARGEST_DELAY = PARAMETERS["imus.delays"].high
-#: by how much a delay changes in one pass at most, s: a slope is that of the motion
-#: near
+#: largest change of a delay in one pass, s, as slopes hold for nearby motion only
 STEP_DELAY = 2.0 * UNIT_DELAY
-#: windows are joined until there are no more than this
+#: windows are joined down to this number
 MOST_STEPS = 400
 #: variance of a channel that is not there, (rad/s)^2
 ABSENT = 1e12
-#: means of the windows at rest are at most so many of their standard deviations apart:
-#: hardly one by chance
+#: largest distance between means of windows at rest, in standard deviations
 ALIKE = 5.0
-#: rad/s/sqrt(s); of biases that show none
+#: walk of biases that show none, rad/s/sqrt(s)
 USUAL_WALK = 2e-5
 #: axes that are farther off than expected by so much are known less: once in 60 by
 #: chance, of two units
 WIDER = 1.5
-#: of a window that tells its noise, and of windows that tell its colour by longer means
+#: fewest blocks for the noise of a window, and blocks per mean for its colour
 LEAST_BLOCKS = SUBS = 5
 #: one, the rate, the angular acceleration
 BASE = 7
@@ -101,7 +100,7 @@ ESTIMATED = (
 
 @dataclass(frozen=True)
 class Priors:
-    """What is estimated, and what is known of it before."""
+    """Quantities to estimate, with their prior knowledge."""
 
     #: (n, 3) as configured
     axes: Array
@@ -123,7 +122,7 @@ class StateEstimate:
 
     #: (n, 3)
     axes: Array
-    #: (3 n, 3 n) of all of them
+    #: (3 n, 3 n) covariance of all axes
     axes_covariance: Array
     #: (n,) by how much the stamps of each channel's unit are late against those of the
     #: first, s
@@ -144,7 +143,7 @@ class StateEstimate:
     floor: Floor
     #: (W, n) standard deviation of a sample in every window, vibration included, rad/s
     moment: Array
-    #: what it is from
+    #: blocks in use
     blocks: Blocks
     #: (W,) windows at rest
     rest: Mask
@@ -157,9 +156,10 @@ class StateEstimate:
         return float(self.rest.sum()) * REST_BLOCKS * self.blocks.length
 
     def disagreement(self) -> tuple[float, float]:
-        """Scale error that is left between channels, root mean square of all components, and its uncertainty.
+        """Remaining scale error between channels, rms of all components, and its uncertainty.
 
-        What all channels have in common is a turn or a scale of the body frame: no channel contradicts it.
+        Errors common to all channels turn or scale the body frame, and no channel
+        contradicts them.
         """
         apart = np.kron(projector(self.axes), np.eye(3))
         left = apart @ self.axes_covariance @ apart
@@ -238,7 +238,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(known, known)
     delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
-    # What interpolation has taken of white noise is given back to what is left once the motion is out.
+    # Interpolation reduces white noise; the factor restores the residual.
     kept = np.sqrt(blocks.white)
     return StateEstimate(
         axes,
@@ -259,10 +259,11 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
 
 
 class _Pass:
-    """One linearisation: rest, rate and noise of every window with the states so far, and what they say of the states.
+    """One linearisation: rest, rate and noise of every window, and evidence for the states.
 
-    Of blocks with delays (units,) s taken off, axes (n, 3), and biases (K, n) rad/s of joined windows; whether these
-    are from a pass before; and colour (2, n), the variance of longer means over that of white noise, at rest and in
+    ``delay`` (units,): taken off the blocks, s. ``axes`` (n, 3). ``biases`` (K, n): of
+    joined windows, rad/s. ``known``: whether the biases come from an earlier pass.
+    ``colour`` (2, n): variance of longer means over that of white noise, at rest and in
     motion.
     """
 
@@ -295,7 +296,7 @@ class _Pass:
             self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
         )
         enough = count >= LEAST_BLOCKS
-        # (W, n); and those of whose single samples the windows tell.
+        # (W, n), the second for channels with usable single samples.
         self.present = present & enough[:, None]
         self.sampled = (
             self.present
@@ -305,7 +306,7 @@ class _Pass:
         moment = of_the_moment(covariance, self.present, axes)
         self.floor = find_floor(blocks.samples, blocks.count, self.sampled, axes)
         steady = np.where(self.present, moment, ABSENT)
-        # Biases of every window, of those of joined ones.
+        # Expand the biases of joined windows to all windows.
         bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[
             : blocks.windows
         ]
@@ -317,7 +318,7 @@ class _Pass:
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
         self.variance: Array = np.where(self.present, moment * factor, ABSENT)
-        # Angular acceleration, rad/s^2, where it is known.
+        # Angular acceleration, rad/s^2, 0 where unknown.
         acceleration, inside = (
             np.zeros_like(self.rate),
             np.zeros(len(self.rate), dtype=bool),
@@ -355,7 +356,10 @@ class _Pass:
         return found
 
     def _find_rest(self, gain: Array, variance: Array, known: bool) -> Mask:
-        """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
+        """Find windows (W,) at rest.
+
+        Quiet, at rest for the monitor, and with one common mean.
+        """
         blocks, rate, found = (
             self.blocks,
             self.rate,
@@ -394,7 +398,7 @@ class _Pass:
     def _find_evidence(
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array
     ) -> tuple[NormalEquations, NormalEquations]:
-        """Say what the blocks y (B, n) show of the states: all of it, and what of it no vibration explains."""
+        """Return the evidence in blocks y (B, n), complete and without vibration."""
         blocks, axes, variance, rest, n = (
             self.blocks,
             self.axes,
@@ -408,7 +412,7 @@ class _Pass:
             np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving])
             * self.used[:, None]
         )
-        # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
+        # In motion A H = 0. Subtracting the rate first avoids the rounding error.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
         moments, cross = self._by_window(base, base), self._by_window(base, residual)
         # The noise power of rate and acceleration is subtracted.
@@ -449,7 +453,7 @@ class _Pass:
                 right[k] = flat @ (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(
                     axis=0
                 ).reshape(-1)
-            # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
+            # A steady change is a state of its own: the bias is b + (t - mean t) g.
             since = (self.middle - self.middle.mean())[:, None, None]
             rates = since * normal[:, :n]
             whole = np.block(
@@ -466,9 +470,10 @@ class _Pass:
         return summed(moments, cross), summed(kept @ moments, kept @ cross)
 
     def _beyond_vibration(self, moments: Array, count: Int) -> Array:
-        """Find what (W, 7, 7) of the moments M (W, 7, 7) of the signals no vibration explains: M (M + K)^-1.
+        """Return the part (W, 7, 7) of moments M (W, 7, 7) beyond vibration: M (M + K)^-1.
 
-        In docs/calibration.md, "What vibration explains", K is W count^2 min(U, s^2), in units of e^2.
+        K is W count^2 min(U, s^2) in units of e^2 (docs/calibration.md, "What vibration
+        explains").
         """
         variance, moving = self.variance, ~self.rest
         at_rest = (
@@ -481,7 +486,7 @@ class _Pass:
         share = (beyond / variance).max(axis=1)[:, None]
         most = np.zeros((len(moments), BASE))
         most[:, 1:4] = (self.axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
-        # Half of it is in differences of two blocks at most.
+        # Differences of two blocks hold at most half of the power.
         most[:, 4:7] = (
             0.5 * most[:, 1:4].max(axis=1, keepdims=True) / self.blocks.length**2
         )
@@ -492,7 +497,10 @@ class _Pass:
         return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
 
     def colours(self, axes: Array) -> Array:
-        """Variance (2, n) of longer means over that of white noise, 1 at least, at rest and in motion."""
+        """Return the variance (2, n) of longer means over white noise, at least 1.
+
+        The first row is at rest, the second in motion.
+        """
         blocks, n, found = self.blocks, len(axes), np.ones((2, len(axes)))
         full = self.present.all(axis=1) & (blocks.size == REST_BLOCKS)
         full &= np.logical_and.reduceat(self.used, blocks.start)
@@ -521,7 +529,7 @@ def _at_rest(variance: Array, axes: Array) -> Array:
 
 
 def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
-    """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
+    """Return coefficients (states, n, 7) and priors (states,) of the kinds in `ESTIMATED`."""
     n, (layout,) = len(axes), allocate(Layout)
     priors: dict[str, float | Array] = {
         "bias": sensors.bias_std,
@@ -553,7 +561,7 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
 
 
 def _misfit(of: NormalEquations, found: Smoothed) -> float:
-    """Scatter of what single windows say of the constants, over what the noise explains."""
+    """Return the scatter of single windows about the constants over its expectation."""
     n = of.n
     x = (
         np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))])

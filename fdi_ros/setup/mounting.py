@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a mounting can do before it flies: accuracy, smallest errors found at once and by waiting, losses."""
+"""Performance of a mounting before flight: accuracy, smallest errors found, losses."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ WAITS = (0.02, 0.1, 0.5, 2.0)
 #: times by which vibration raises the noise, where noise_std is that at rest: an
 #: example
 VIBRATION = 5.0
-#: above this |rho| telling two channels apart takes an error twice as large as seeing
-#: it
+#: |rho| above which isolation takes an error twice as large as detection
 ALIKE = 0.9
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
-    """Find the smallest errors (waits, n), rad/s, in the order of WAITS, that are found by waiting, by condition.
+    """Return the smallest errors (waits, n), rad/s, found after each of WAITS, by condition.
 
-    At rest, while turning as fast as integrity.max_rate, and in vibration; infinite: never, NaN: the wait is shorter
-    than two samples. White noise averages out in time. What scale and timing errors make of a turn does not while the
-    turn lasts: they stay the same from sample to sample and add to the variance of the mean.
+    Conditions are rest, a turn at integrity.max_rate, and vibration. Infinite means
+    never, and NaN a wait below two samples. White noise averages out. Scale and timing
+    errors of a turn stay equal from sample to sample, so they add to the variance of
+    the mean.
     """
     limits, V, white = config.integrity, geometry.parity, noise.noise_std**2
     turning = (noise.scale_std * limits.max_rate) ** 2 + (
@@ -89,15 +89,16 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
 
 
 def smallest_shift(samples: float, run_length: float) -> float:
-    """Shift of a normal variable, in standard deviations, that the best sequential test finds within a mean delay.
+    """Return the shift of a normal variable, in standard deviations, found in a mean delay.
 
-    No test whose mean run length to a false alarm is A has a worst-case mean delay to a shift s below about
-    ``2 ln(A) / s^2`` (Lorden 1971); the CUSUM tuned to s attains the least there is (Moustakides 1986). Its run
-    lengths in closed form (Siegmund 1985): with x the level in units of 1/s,
+    No test with mean run length A to a false alarm has a worst-case mean delay to a
+    shift s below about ``2 ln(A) / s^2`` (Lorden 1971). The CUSUM tuned to s attains
+    the minimum (Moustakides 1986). Its run lengths (Siegmund 1985), with x the level in
+    units of 1/s, are
 
-        A = 2 (exp(x) - x - 1) / s^2,    delay = 2 (exp(-x) + x - 1) / s^2
+            A = 2 (exp(x) - x - 1) / s^2,    delay = 2 (exp(-x) + x - 1) / s^2
 
-    The delay is `samples` > 1, A is `run_length`, the mean number of samples to a false alarm.
+    ``samples``: the delay, > 1. ``run_length``: A, in samples.
     """
     level = math.log(run_length)
     shift = math.sqrt(2 * level / samples)
@@ -108,7 +109,7 @@ def smallest_shift(samples: float, run_length: float) -> float:
 
 
 class Loss(NamedTuple):
-    """What is left after some channels are lost."""
+    """Performance after the loss of some channels."""
 
     lost: tuple[int, ...]
     #: infinite where the rest does not span space
@@ -121,14 +122,13 @@ class Loss(NamedTuple):
 
 @dataclass
 class Mounting:
-    """What follows from the geometry and the noise at rest."""
+    """Consequences of geometry and noise at rest."""
 
     geometry: Geometry
     noise: NoiseModel
     #: per sample
     false_alarm_probability: float
-    #: (n,) error that one sample shows with probability DETECTION, rad/s; infinite:
-    #: never
+    #: (n,) error found in one sample with probability DETECTION, rad/s, or infinite
     smallest: Array
     #: errors (waits, n), rad/s, that an optimal test finds on average within WAITS
     waiting: dict[str, Array]
@@ -137,7 +137,7 @@ class Mounting:
 
     def __post_init__(self) -> None:
         rho = np.triu(np.abs(self.geometry.rho), 1)
-        # Pairs of channels that cannot be told apart, and those that can with effort.
+        # Pairs of channels that cannot be isolated, or only with effort.
         self.alike = np.argwhere(rho > SAME_DIRECTION).tolist()
         self.similar = np.argwhere((rho > ALIKE) & (rho <= SAME_DIRECTION)).tolist()
         self.single = [one for one in self.losses if len(one.lost) < 2]
@@ -145,7 +145,7 @@ class Mounting:
 
 
 def assess(config: Config) -> Mounting:
-    """Assess the mounting of a configuration; `FdiError` if the settings do not fit each other."""
+    """Assess the mounting of a configuration. `FdiError` if settings contradict each other."""
     geometry = build_geometry(config)
     noise, probability = build_noise(config, geometry.n), alarm_probability(config)
     smallest, waited = (
@@ -162,7 +162,7 @@ def assess(config: Config) -> Mounting:
 
 
 def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
-    """Accuracy and what can still be seen and named, without some channels."""
+    """Return accuracy, detection and isolation without some channels."""
     kept = np.array([i not in lost for i in range(geometry.n)])
     axes = geometry.axes[kept]
     if np.linalg.matrix_rank(axes, tol=1e-2) < 3:
@@ -172,7 +172,7 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     try:
         rest, numbers = geometry.subset(kept), np.flatnonzero(kept)
     except GeometryError:
-        # Three channels still give a rate; nothing checks it.
+        # Three channels give an unchecked rate.
         return Loss(lost, gdop, std)
     return Loss(
         lost,
@@ -330,7 +330,7 @@ def _double_words(result: Mounting) -> str:
 
 
 def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
-    """Say what a reader is to know first, with what no data can tell and every name rests on."""
+    """Return the first sentence for readers, with the assumptions behind every name."""
     assumed = assumption_words(result.geometry)
     return [
         summary_line(
@@ -369,7 +369,7 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
 
 
 def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
-    """Draw the smallest errors found over the time waited: a band for all channels, a line for the worst."""
+    """Plot the smallest errors over the wait: a band for all channels, a line for the worst."""
     data: list[dict[str, object]] = []
     for k, (condition, sizes) in enumerate(result.waiting.items()):
         low, high = (

@@ -22,7 +22,7 @@ from fdi_ros.estimator.noise import QUIETEST
 from fdi_ros.inspection.segments import AS_QUIET, ROUNDS
 from fdi_ros.model.samples import Array, Int, Mask
 
-#: (rad/s)^2; of what shows no noise at all
+#: variance of a channel without noise, (rad/s)^2
 LEAST_VARIANCE = LEAST_NOISE**2
 #: windows on both sides that the noise of the moment is averaged over: 5 s, in which
 #: vibration stays
@@ -31,27 +31,30 @@ MEMORY = 2
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise that channels have by themselves, as far as the recording shows it."""
+    """Noise of single channels, as far as a recording shows the floor."""
 
     #: (n,) of one sample, rad/s
     std: Array
     #: (n,) its standard error, rad/s
     error: Array
-    #: (W,) that it is from
+    #: (W,) windows in use
     windows: Mask
 
     @property
     def share(self) -> float:
-        """Part of the recording that it is from."""
+        """Share of the recording in use."""
         return float(self.windows.mean())
 
 
 def information(variance: Array, axes: Array) -> Array:
-    """Work out A (..., n, n), s^2/rad^2, of independent errors of variance (..., n), (rad/s)^2, the rate unknown."""
+    """Return A (..., n, n), s^2/rad^2, for independent errors of variance (..., n), (rad/s)^2.
+
+    The rate is unknown.
+    """
     weight = 1.0 / variance
     weighted = weight[..., :, None] * axes
     normal = np.swapaxes(axes, -1, -2) @ weighted
-    # A channel that is not there may leave too few for a rate: then nothing is known of it.
+    # Absent channels may leave no rate, and then no information.
     solved = np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(weighted, -1, -2)
     return np.asarray(weight[..., :, None] * np.eye(len(axes)) - weighted @ solved)
 
@@ -67,7 +70,7 @@ def gains(variance: Array, axes: Array) -> Array:
 
 
 def variances(covariance: Array, axes: Array) -> Array:
-    """Variance (W, n) of every channel in every window, from covariances (W, n, n) of its values, (rad/s)^2."""
+    """Return variances (W, n) of channels from covariances (W, n, n) of windows, (rad/s)^2."""
     start = np.einsum("wab,ab->w", covariance, projector(axes)) / (len(axes) - 3)
     v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
     for _ in range(25):
@@ -92,7 +95,10 @@ def projector(axes: Array) -> Array:
 
 
 def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
-    """Variance (W, n) of channels that are there (W, n), by covariances (W, n, n) of windows and their neighbours."""
+    """Return variances (W, n) of present channels (W, n), from covariances (W, n, n).
+
+    Neighbouring windows are averaged.
+    """
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
     near, beside = (
         np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))),
@@ -122,7 +128,7 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
 def _by_pattern(
     of: Callable[[Array, Array], Array], covariance: Array, there: Mask, axes: Array
 ) -> Array:
-    """Work out a figure (W, n) of windows of the same channels, from covariances and axes; NaN: too few are there."""
+    """Apply a function to windows with the same channels, (W, n), NaN if too few are present."""
     found = np.full(there.shape, np.nan)
     for rows, columns in patterns_of(there):
         found[np.ix_(rows, columns)] = of(
@@ -132,7 +138,7 @@ def _by_pattern(
 
 
 def _residual_variances(covariance: Array, axes: Array) -> Array:
-    """Variance (W, n) of what the rate does not explain of each channel."""
+    """Return variances (W, n) of the part of each channel that no rate explains."""
     apart = projector(axes)
     return np.asarray(
         np.einsum("ia,wab,bi->wi", apart, covariance, apart, optimize=True)
@@ -140,7 +146,7 @@ def _residual_variances(covariance: Array, axes: Array) -> Array:
 
 
 def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
-    """Windows and channels, of every set of more than three channels that are there (W, n) together."""
+    """Yield windows and channels of each set of more than three channels, from (W, n)."""
     patterns, which = np.unique(there, axis=0, return_inverse=True)
     for k, pattern in enumerate(patterns):
         if pattern.sum() > 3:
@@ -148,7 +154,7 @@ def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
 
 
 def levels(covariance: Array, there: Mask, axes: Array) -> Array:
-    """How noisy every window is (W,), against the usual one; infinite where nothing tells."""
+    """Return the noise of windows (W,) relative to the usual one, infinite if unknown."""
     residual = _by_pattern(_residual_variances, covariance, there, axes)
     known = np.isfinite(residual).any(axis=1)
     found = np.full(len(there), np.inf)
@@ -164,7 +170,7 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
 
 
 def _quietest(level: Array, count: Int) -> Mask:
-    """Windows (W,) of finite level that are about as quiet as the quietest; all the same where there are few."""
+    """Return the windows (W,) about as quiet as the quietest, by levels (W,)."""
     known = int(np.isfinite(level).sum())
     least = np.argsort(level)[:known][: max(4, round(0.05 * known))]
     quiet = np.zeros(len(level), dtype=bool)
@@ -180,7 +186,10 @@ def _quietest(level: Array, count: Int) -> Mask:
 
 
 def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor:
-    """Find the lower envelope of the noise, by covariances (W, n, n) of so many (W,) samples of channels (W, n)."""
+    """Find the floor of the noise.
+
+    ``covariance`` (W, n, n): of ``count`` (W,) samples, of channels ``there`` (W, n).
+    """
     level, (sums, precision, weight) = (
         levels(covariance, there, axes),
         np.zeros((3, len(axes))),
@@ -199,7 +208,8 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
             (v,) = variances(
                 np.average(part, axis=0, weights=count[rows])[None], axes[columns]
             )
-            # Of A_ii v_i of the variance the redundancy shows; the rest is as the others have it.
+            # Redundancy shows A_ii v_i of the variance. The rest follows from other
+            # channels.
             shown = np.maximum(np.diag(information(v, axes[columns])) * v, 0.1)
             chosen = alike[columns]
             which = columns[chosen]

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a setup or a calibration found, what is weak, and what to do next: as words and tables, as JSON, as a page."""
+"""Results of setup and calibration as text, JSON and page."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ LARGE_SWING, LARGE_BIAS = (
 )
 #: share of the samples that are missing or spikes, which is worth a look
 MANY = 0.01
-#: rad/s; share of test faults of that size to be found
+#: size of test faults, rad/s, and the share to be found
 FLOOR, LEAST_NAMED = 0.1, 0.9
 #: share of the samples that a monitor should judge
 LEAST_JUDGED = 0.5
@@ -80,14 +80,14 @@ BIAS_HINT = "Best estimate over the recording, each minus its mean; what all hav
 def calibration_findings(
     result: Calibration, body_frame: str, unit: Unit = RADIANS
 ) -> Iterator[Finding]:
-    """List what was found, what is not known, and what to look at."""
+    """Yield results, unknown quantities and warnings."""
     yield from _found(result, unit)
     yield from _unknown(result, body_frame, unit)
     yield from _warnings(result, unit)
 
 
 def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
-    """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
+    """Yield noise, remaining errors in motion, walk of the biases, and delays."""
     found, name, factor = result.estimate, unit.name, unit.factor
     rest, walk, floor, usual = (
         found.rest_seconds,
@@ -130,7 +130,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
 
 
 def _delay_words(delay: StampDelay, taken_off: bool) -> str:
-    """Say by how much stamps are late, and whether that is taken off."""
+    """Describe the delay of stamps, and whether the config takes this delay off."""
     if abs(delay.value) < delay.error:
         return (
             f"delay against the first unit not measured (+-{1e3 * delay.error:.2g} ms)"
@@ -146,7 +146,7 @@ def _delay_words(delay: StampDelay, taken_off: bool) -> str:
 
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
-    """List what is not observed, what is taken instead, and how to get it."""
+    """Yield unobserved quantities with the assumption made and the remedy."""
     found, share = result.estimate, result.estimate.floor.share
     if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
@@ -200,7 +200,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
 
 
 def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
-    """List what to look at before the settings are trusted: faults, values lost, and channels beyond a bound."""
+    """Yield warnings: faults, lost values, and channels beyond a bound."""
     found, names = result.estimate, result.names
     if result.faults:
         spans = [
@@ -270,7 +270,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
 
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
-    """List everything: what the settings are from and are worth, what is not known, what to look at."""
+    """Yield all findings: basis and worth of the settings, unknowns, warnings."""
     result, mounting, units = (
         found.calibration,
         found.mounting,
@@ -300,7 +300,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     yield from topic_findings(found.chosen, unit)
     tried = found.proof.before if found.kept else found.proof.after
     if tried.baseline is not None:
-        # What a replay with these settings says of their noise.
+        # A replay with these settings reports the same noise.
         for line in noisy_lines(tried.baseline.judgement, unit):
             yield Finding(Role.WARNING, "noise", line, headline="USABLE, BUT LOOK")
     limits = [
@@ -313,7 +313,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
 
 
 def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
-    """Say what the settings are worth: what is wrong, the worst first, or what they isolate."""
+    """Yield the verdict on the settings: the worst trouble, or their isolation."""
     proof, units = found.proof, source_of(found.config).units
     tried = proof.before if found.kept else proof.after
     warning = Role.WARNING
@@ -351,7 +351,7 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
 
 
 def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
-    """Say what settings without a false alarm find."""
+    """Return the finding for settings without a false alarm."""
     unused = " (not used for fitting)" if found.proof.apart else ""
     words = f"no false alarm in {found.proof.source}{unused}."
     isolated, biases = tried.isolated_of
@@ -375,7 +375,7 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
 
 
 def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
-    """List what the recording does not show, what is taken instead, and how to get it."""
+    """Yield the quantities that the recording does not show, with assumption and remedy."""
     yield from (Finding(Role.UNKNOWN, "damage", line) for line in found.damage)
     named = zip(found.config.imu_names, found.mounts, strict=False)
     if unshown := {name: mount.words for name, mount in named if not mount.shown}:
@@ -454,7 +454,7 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
 
 
 def _beyond_error(values: Array, errors: Array, factor: float, form: str) -> list[str]:
-    """Write values (n,); one that is smaller than its standard error is not measured."""
+    """Format values (n,); one below its standard error is not measured."""
     return [
         f"{value * factor:{form}}" if abs(value) > error else "not measured"
         for value, error in zip(values, errors, strict=True)
@@ -595,7 +595,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
 def _sections(
     found: SetupResult, findings: Sequence[Finding], bag: str, config: str, unit: Unit
 ) -> tuple[list[str], list[Section]]:
-    """Lay out what a reader is to know first: the verdict and what it is from; and the rest in sections."""
+    """Return the verdict with its basis, and the other sections."""
     proof, result, first = found.proof, found.calibration, verdict_of(findings)
     hint = f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
     hint += f" to be isolated within {WITHIN:g} s."
@@ -639,7 +639,7 @@ def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
 
 
 def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
-    """Return everything, and the course of it over time, as a page."""
+    """Return the page with all findings and their course over time."""
     findings = list(setup_findings(found, unit))
     topics = [report for report in found.reports if report.could_be_gyros]
     (first, *lines), sections = _sections(found, findings, bag, config, unit)
@@ -675,7 +675,7 @@ def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
 
 
 def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Section]:
-    """Plot what changes over the recording, and the spectrum of what channels differ by."""
+    """Plot changes over the recording, and the spectrum of differences."""
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
     found, names = result.estimate, result.names

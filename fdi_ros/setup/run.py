@@ -1,13 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
+"""From a recording to a config: topics, mounts, delays, biases and noise.
 
-What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor
-can be built from are taken: there is always one, or an error. A part of the recording is kept aside, and what the rest
-gives is proved on it: what is declared there, and which biases are isolated. If that is no worse than with the settings
-before, the settings are those that all of the recording gives; else they stay. `recalibrate` does the part of it that a
-config at hand leaves to do.
+Unknown quantities stay as in ``fdi inspect`` and are reported. The fullest settings
+from which a monitor can be built are taken. A part of the recording is kept aside as a
+proof: false declarations there, and isolated test biases. If the new settings are no
+worse than those before, settings from the whole recording are written, otherwise the
+old ones stay. `recalibrate` does the same for an existing config.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ LEAST_LEFT = 2 * LEAST_DURATION
 class Tried:
     """One config on the recording of a proof."""
 
-    #: as it is; None: the monitor judges nothing
+    #: result without test faults, None if nothing is judged
     baseline: Baseline | None
     note: str
-    #: by size, rad/s: biases isolated, and tried; empty: too short
+    #: by size, rad/s: biases isolated and tried; empty if the recording is too short
     isolated: dict[float, tuple[int, int]]
 
     def __post_init__(self) -> None:
@@ -101,11 +101,11 @@ def times_words(declared: Mapping[str, float]) -> str:
 
 @dataclass(frozen=True)
 class Proof:
-    """What a recording, or a part of one, says of the settings."""
+    """Performance of the settings on a recording or on a part of one."""
 
     #: which, in words
     source: str
-    #: whether it was not used for the settings
+    #: whether the settings are from other samples
     apart: bool
     seconds: float
     before: Tried
@@ -113,7 +113,7 @@ class Proof:
 
     @property
     def worse(self) -> str:
-        """By what the new settings are worse than those before; empty: they are as good, or better."""
+        """Words for worse performance than before, or empty."""
         before, after = self.before, self.after
         (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
         new = {
@@ -127,7 +127,7 @@ class Proof:
             return f"it judges nothing: {after.note}"
         if new:
             return f"it declares {times_words(new)}"
-        # Less is one at the edge of a gap.
+        # Smaller losses occur at the edge of a gap.
         if before.judged - after.judged > 0.02:
             return f"{after.judged:.0%} of the samples are judged instead of {before.judged:.0%}"
         # One fewer is chance.
@@ -137,7 +137,7 @@ class Proof:
 
 
 def _tried(block: Block, config: Config) -> Tried:
-    """Replay a recording as it is, and with biases of all sizes."""
+    """Replay a recording without and with test biases."""
     plan = Plan(
         tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")),
         TIMES,
@@ -167,37 +167,36 @@ Parameters = dict[str, object]
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedSettings:
-    """A config, and the calibration that it is from; without one as it was before it."""
+    """A config with the calibration behind it, if any."""
 
     #: ``{"section.field": value}`` of the config
     parameters: Parameters
     config: Config
     calibration: Calibration | None = None
-    #: for which there is no calibration
+    #: error that prevented a calibration
     why: FdiError | None = None
-    #: of each unit; empty: channels in one array, or mounts that were given
+    #: mount of each unit, empty for arrays or configured mounts
     mounts: tuple[Mount, ...] = ()
 
     @property
     def refused(self) -> str:
-        """Why there is no calibration."""
+        """Reason without a calibration, or empty."""
         return str(self.why or "")
 
     @property
     def disagree(self) -> bool:
-        """Whether it is because channels contradict each other."""
+        """Whether channels contradict each other."""
         return isinstance(self.why, DisagreementError)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SetupResult(LearnedSettings):
-    """The config that a recording gives, and what it is from."""
+    """The config from a recording, with its evidence."""
 
-    #: by what the calibration is no better than the settings before, which are kept
-    #: then; empty: it is taken
+    #: reason to keep the settings before, or empty
     kept: str
     mounting: Mounting
-    #: what it is worth
+    #: performance of the settings
     proof: Proof
     #: of all topics
     reports: Sequence[TopicReport] = ()
@@ -235,7 +234,7 @@ class SetupResult(LearnedSettings):
 
     @property
     def text(self) -> str:
-        """The parameter file, without a word of where it is from."""
+        """The parameter file without its origin."""
         return parameter_file(self.parameters, "", self.remarks)
 
 
@@ -246,12 +245,12 @@ def set_up(
     reference: str = "",
     proof: Path | None = None,
 ) -> SetupResult:
-    """Make the fullest config that a recording gives.
+    """Make the fullest config that a recording supports.
 
-    ``start``, ``end``: part that mounts and calibration are from, s from the first message. ``reference`` as of
-    `fdi_ros.setup.calibrate.calibrate`. ``proof``: recording that the settings are proved on; None: a part of this one,
-    which is kept aside. `FdiError` if it cannot be read, holds no gyros, or a monitor can be built from nothing that it
-    shows.
+    ``start``, ``end``: part for mounts and calibration, s from the first message.
+    ``reference`` as in `fdi_ros.setup.calibrate.calibrate`. ``proof``: recording for
+    the proof, by default a part of this one. `FdiError` if the recording is unreadable
+    or has no gyros, or no monitor can be built.
     """
     reports, damage = inspect(bag)
     chosen, lacking = candidates(reports), needs(reports)
@@ -296,9 +295,10 @@ def recalibrate(
     reference: str = "",
     proof: Path | None = None,
 ) -> SetupResult:
-    """Calibrate a config on a recording; parameters as of `set_up`.
+    """Calibrate an existing config on a recording (parameters as in `set_up`).
 
-    `FdiError` if it cannot be read, lacks a topic, or its channels contradict each other.
+    `FdiError` if the recording is unreadable or lacks a topic, or channels contradict
+    each other.
     """
     if copies := copy_words(refuse_unfit(bag, config)):
         raise CalibrationError(
@@ -332,7 +332,7 @@ Learn = Callable[[Block], tuple[LearnedSettings, LearnedSettings]]
 
 
 def _kept_from(block: Block) -> tuple[float, float] | None:
-    """Time from which a recording is kept aside, s, and how much that is, gaps not counted; None: it is too short."""
+    """Return start and length of the part kept aside, s, or None for a short recording."""
     if len(block) < 2:
         return None
     steps = np.diff(block.stamp) * 1e-9
@@ -352,9 +352,10 @@ def _proved(
     learn: Learn,
     needed: bool = False,
 ) -> SetupResult:
-    """Prove what a recording gives on another one, or what a part of it gives on the rest, if it is long enough.
+    """Prove settings on another recording, or on the last part of this one.
 
-    Then take what all of it gives, or the settings before. If needed, a first part without a calibration is an error.
+    Then take the settings of the whole recording, or those before. ``needed`` makes a
+    missing calibration of the first part an error.
     """
     learned, apart, source = (
         block,
@@ -376,7 +377,7 @@ def _proved(
     before, found = learn(learned)
     if needed and found.why is not None:
         raise found.why
-    # Delays are taken off as it is read.
+    # Reading takes the delays off.
     tried = [
         _tried(read_block(bag, one.config, start, end), one.config)
         for one in (before, found)
@@ -409,7 +410,7 @@ def _mounted(block: Block, start: LearnedSettings) -> LearnedSettings:
 
 
 def _if_built(known: Parameters, before: LearnedSettings) -> LearnedSettings:
-    """Take the settings that are known now where a monitor can be built from them; else those before."""
+    """Return the new settings if a monitor can be built from them, else those before."""
     try:
         new = Config.from_parameters(known)
         Pipeline.from_config(new)
@@ -421,12 +422,12 @@ def _if_built(known: Parameters, before: LearnedSettings) -> LearnedSettings:
 def _with_mounts(
     block: Block, before: LearnedSettings, reference: str
 ) -> LearnedSettings:
-    """Calibrate with the mounts found, or refuse by what they contradict."""
+    """Calibrate with the mounts found. Mirrored units are refused."""
     names, mounts = before.config.imu_names, before.mounts
     if odd := [
         name for name, mount in zip(names, mounts, strict=False) if mount.mirrored
     ]:
-        # Where most are mirrored against the first, it is the first.
+        # If most are mirrored against the first unit, the first is mirrored.
         if len(odd) > len(mounts) - 1 - len(odd):
             odd = [names[0]] if len(mounts) > 2 else [f"{names[0]} or {odd[0]}"]
         words = f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Biases that walk and constants, estimated from all groups of windows at once.
+"""Walking biases and constants, estimated from all groups of windows together.
 
-Groups of windows say ``N x = r`` of the states x; biases b walk from group to group, all others c are constant. Written
-for the biases of all groups the system is banded, with the constants as its border: ``B b + C c = h, C' b + T c = g``.
-The biases are eliminated (banded Cholesky), and the marginal likelihood of the walk falls out.
+Groups contribute ``N x = r`` for the states x. Biases b walk from group to group, and
+all other states c are constant. For the biases of all groups the system is banded with
+the constants as its border: ``B b + C c = h, C' b + T c = g``. Elimination of the
+biases (banded Cholesky) also gives the marginal likelihood of the walk.
 """
 
 from __future__ import annotations
@@ -20,21 +21,22 @@ from fdi_ros.model.samples import Array
 
 #: tried, rad/s/sqrt(s)
 WALKS = np.geomspace(1e-6, 4e-3, 13)
-#: rad/s/sqrt(s); moves no bias, and leaves a system that rounding does not spoil
+#: smallest walk, rad/s/sqrt(s), which moves no bias and keeps the system regular
 NO_WALK = 1e-7
 #: log-likelihood that a walk must gain over none to be shown: one of 200 without a walk
 #: does
 SHOWN_GAIN = 4.0
-#: what one may lose against the best and be possible: one of 20 true ones loses more
+#: loss of log-likelihood for a possible walk, exceeded by one true walk in 20
 POSSIBLE = 2.0
 
 
 class NormalEquations:
-    """What the groups say of the states, the biases (n) first; kept in units of their standard deviations before.
+    """Normal equations of groups, biases (n) first, in units of prior standard deviations.
 
-    In units of their own, information on them would be apart by more than what rounding leaves of a number. ``normal``,
-    ``right``: N (K, s, s) and r (K, s). ``apart`` (K,): time to the next group, s; the last is not read. ``prior``,
-    ``start`` (s,): standard deviations, of all biases the same, and means before.
+    The scaling keeps information within the range of double precision. ``normal``,
+    ``right``: N (K, s, s) and r (K, s). ``apart`` (K,): time to the next group, s, the
+    last unused. ``prior``, ``start`` (s,): prior standard deviations, equal for all
+    biases, and prior means.
     """
 
     def __init__(
@@ -60,13 +62,13 @@ class Smoothed:
 
     #: (m,) the states that stay
     constant: Array
-    #: (m, m) of them
+    #: (m, m) covariance of the constants
     constant_covariance: Array
     #: (K, n) biases over time, rad/s
     curve: Array
     #: (n,) their mean over the recording
     mean: Array
-    #: (n, n) of it
+    #: (n, n) covariance of the mean
     mean_covariance: Array
 
 
@@ -80,10 +82,11 @@ class RandomWalk(NamedTuple):
 
 
 def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, float]:
-    """Eliminate the biases, of such a walk.
+    """Eliminate biases with this walk.
 
-    Returns B^-1 (K n, n + m + 1) of the mean of the biases, of C and of h, which gives the biases if all constants were
-    zero; information (m, m) on the constants and its right-hand side (m,); and the log of the marginal likelihood.
+    Returns B^-1 (K n, n + m + 1) applied to the mean of the biases, to C and to h
+    (the biases for zero constants), information (m, m) on the constants with its
+    right-hand side (m,), and the log marginal likelihood.
     """
     n, count = of.n, len(of.normal)
     stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
@@ -140,10 +143,10 @@ def find_random_walk(of: NormalEquations) -> RandomWalk:
 def smooth(
     of: NormalEquations, walk: float, known: tuple[Array, Array] | None = None
 ) -> Smoothed:
-    """Estimate the states, with biases that walk so much, rad/s/sqrt(s).
+    """Estimate the states for biases with this walk, rad/s/sqrt(s).
 
-    Where the first constants (k,) and their covariance (k, k) are known from elsewhere, nothing is learned of them, and
-    they count as uncertain as they are (Schmidt 1966).
+    ``known``: the first constants (k,) and their covariance (k, k) from elsewhere. They
+    stay as given, and their uncertainty counts (Schmidt 1966).
     """
     n, (solved, information, side, _) = of.n, _eliminate(of, walk)
     if known is None:
