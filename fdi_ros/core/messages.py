@@ -24,6 +24,7 @@ from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
 from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
 from fdi_ros.model.samples import Array, Bytes, Int
+from fdi_ros.system.files import NAME
 
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
@@ -134,6 +135,17 @@ def read_rate(
         return -BAD_STAMP
     read_doubles(data, at, 3, little, rate)
     return sec * _NS + nanosec
+
+
+def frame_of(data: bytes) -> str:
+    """Return the frame_id of a serialised message that begins with a std_msgs/Header; empty: it has none to read."""
+    begin = ENCAPSULATION + 12
+    if len(data) < begin:
+        return ""
+    (length,) = struct.unpack_from(f"{byte_order(data)}I", data, begin - 4)
+    return (
+        data[begin : begin + min(length, NAME)].rstrip(b"\0").decode(errors="replace")
+    )
 
 
 def byte_order(data: bytes) -> str:

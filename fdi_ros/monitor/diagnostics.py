@@ -17,7 +17,7 @@ from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.sources import source_of
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.monitor.output import Topic
-from fdi_ros.system.text import plus_minus
+from fdi_ros.system.text import plus_minus, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
@@ -97,6 +97,8 @@ class InputStatus:
     error: str = ""  # why the last malformed message was refused
     unstamped: bool = False  # whether its headers have no stamp
     parted: bool = False  # whether its clock and that of the only other input that delivers went apart
+    frame: str = ""  # frame_id of its first message
+    frame_now: str = ""  # frame_id of its last message
     sources: str = ""  # what is wrong with who publishes on it: more than one does, or another input reads it, too
 
 
@@ -469,6 +471,7 @@ def _channel_values(
 def _input_values(line: InputStatus) -> Values:
     return (
         ("topic", line.topic),
+        *([("frame_id", line.frame_now)] if line.frame_now else []),
         ("received", str(line.received)),
         ("rate (Hz)", f"{line.rate:.1f}"),
         ("behind the other inputs (s)", _figure(line.lag)),
@@ -480,6 +483,11 @@ def _input_values(line: InputStatus) -> Values:
         *((kind, str(count)) for kind, count in line.counts.items()),
         *([("last malformed", line.error)] if line.error else []),
     )
+
+
+def frame_words(first: str, now: str) -> str:
+    """Return what is wrong with a topic whose frame_id has changed."""
+    return f"frame_id was {shown(first)!r} in the first message and is {shown(now)!r}: another sensor?"
 
 
 def _input_message(line: InputStatus) -> tuple[Level, str]:
@@ -502,6 +510,8 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         odd.append(
             "the clocks of the two inputs went apart, and nothing tells which is right: neither is used"
         )
+    if line.frame_now != line.frame:
+        odd.append(frame_words(line.frame, line.frame_now))
     if line.sources:
         odd.append(line.sources)
     if line.silent is None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.live import (
+    AHEAD_OF_CLOCK,
     HAS_EVENTS,
     HAS_RATE,
     MALFORMED,
@@ -23,7 +24,7 @@ from fdi_ros.core.live import (
     SUPPLY,
     WORKED,
 )
-from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.core.messages import LAST_STAMP, frame_of
 from fdi_ros.monitor.diagnostics import (
     OLD,
     WHOLE,
@@ -32,6 +33,7 @@ from fdi_ros.monitor.diagnostics import (
     StatusLine,
     describe,
     encode_diagnostics,
+    frame_words,
 )
 from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import (
@@ -144,7 +146,10 @@ class InputTopic:
         self._inlet = receiver.live["inlets"][0, number]
         self._name = receiver.source.names[number]
         self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
-        self._was_heard = self._was_unstamped = False
+        self._was_heard = self._was_unstamped = self._was_ahead = False
+        self.last = b""  # message
+        self._frame = ""  # frame_id of the first message
+        self._frame_now = ""  # frame_id as it was read last
         self._sources = ""  # what is wrong with who publishes on it; empty: nothing
         self._reported_counts: dict[str, int] = {}
 
@@ -185,6 +190,8 @@ class InputTopic:
             error=receiver.errors[self._number],
             unstamped=self._is_unstamped,
             parted=receiver.alignment.are_parted,
+            frame=self._frame,
+            frame_now=self._frame_now,
             sources=self._sources,
         )
 
@@ -192,10 +199,11 @@ class InputTopic:
         """Log what is new at the clock time now, ns; return whether the topic fell silent, or came back."""
         received = int(self._inlet["received"])
         changed = self._watchdog.check(received, now)
+        self._check_frame(log)
         if changed and not self._watchdog.silent:
-            log.info(
-                f"{self._name}: messages on {self.topic}{' again' if self._was_heard else ''}"
-            )
+            again = " again" if self._was_heard else ""
+            frame = f", frame_id {shown(self._frame_now)}" if self._frame_now else ""
+            log.info(f"{self._name}: messages on {self.topic}{again}{frame}")
         elif changed and not received:
             log.warning(f"{self._name}: no message yet on {self.topic}")
         elif changed:
@@ -204,7 +212,23 @@ class InputTopic:
         if self._is_unstamped and not self._was_unstamped:
             self._was_unstamped = True
             log.warning(f"{self.topic}: stamps are not set")
+        if not self._was_ahead and self._receiver.counts(self._number).get("ahead"):
+            self._was_ahead = True
+            log.warning(
+                f"{self.topic}: stamps are more than {AHEAD_OF_CLOCK / 1e9:g} s ahead"
+                " of the clock: such messages are refused"
+            )
         return changed
+
+    def _check_frame(self, log: BoundedLog) -> None:
+        """Log when the frame_id of the messages becomes another."""
+        if not self._receiver.source.stamped or not self.last:
+            return
+        frame = frame_of(self.last)
+        self._frame = self._frame or frame
+        if frame != self._frame_now and frame != self._frame:
+            log.warning(f"{self.topic}: {frame_words(self._frame, frame)}")
+        self._frame_now = frame
 
     def check_sources(
         self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog
@@ -291,6 +315,7 @@ class Running:
     def _take(self, inlet: int, data: bytes) -> None:
         """Take in a message, and publish what comes of it and of all samples that it completes."""
         begun, receiver = time.perf_counter_ns(), self.receiver
+        self.topics[inlet].last = data
         # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
         result = receiver.receive(
             inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP)

@@ -216,7 +216,7 @@ def test_only_ok_is_ok_and_every_word_is_there(
         (
             {"recent": {"malformed": 2}, "error": "array has 5 values"},
             Level.WARN,
-            "malformed messages (2)",
+            "malformed messages (2); array has 5 values",
         ),
         (
             {"recent": {"ahead": 7}},

@@ -24,7 +24,16 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, healthy, monitoring, struck
+from ros.harness import (
+    DEEP,
+    RATE,
+    SIGMA,
+    TWO_IMUS,
+    Listener,
+    healthy,
+    monitoring,
+    struck,
+)
 from ros.processes import ROOT, wait
 from sensor_msgs.msg import Imu
 
@@ -215,6 +224,30 @@ def test_one_dead_topic_does_not_silence_the_rest_and_when_all_is_silent_all_is_
     assert {s.level for s in listener.diagnostics[-1][-1].status} == {
         DiagnosticStatus.STALE
     }
+
+
+def test_another_frame_and_stamps_ahead_of_the_clock_are_named_once(
+    node, listener
+) -> None:
+    _, process = node
+    other, rates = ImuTemplate("left_wing"), healthy(100, seed=3)[1]
+    for k, row in enumerate(rates.tolist()):
+        ahead = 5_000_000_000 if 40 < k < 60 else 0
+        listener.send_imu(0, time.time_ns() + ahead, row[:3])
+        listener.outputs[1].publish(other.fill(time.time_ns(), row[3:], (0.0,) * 9))
+        time.sleep(1 / RATE)
+    words = (
+        "frame_id was 'imu' in the first message and is 'left_wing': another sensor?"
+    )
+    assert listener.says("input imu_2", words)
+    assert listener.value("input imu_2", "frame_id") == "left_wing"
+    late = "/imu_1/data_raw: stamps are more than 1 s ahead of the clock"
+    assert wait(lambda: late in process.said())
+    lines = process.said().splitlines()
+    warned = [line for line in lines if late in line or words in line]
+    assert ["[WARN]" in line for line in warned] == [True, True]
+    assert listener.settle()
+    assert wait(lambda: "frame_id" not in listener.status("input imu_2").message)
 
 
 def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
