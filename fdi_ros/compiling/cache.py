@@ -4,22 +4,22 @@
 """Cache of compiled code on disk: where results lie, when they are valid, whose files are trusted.
 
 A result depends on the source of its function, on every module of this package which that source imports, on Numba,
-NumPy, the minor version of Python and the target processor. All of these are in its key, and no path or time is: a
+NumPy, the minor version of Python and the target processor. The key holds all of them, and neither path nor time: a
 copied or installed package finds its results, and a changed one never meets old results.
 
-The target is x86-64-v2 where the processor has it (all but the oldest do), else the plain instruction set. So code
-that was compiled on one computer runs on every other one. ``NUMBA_CPU_NAME`` chooses another target. Numba has one
-target for a process: it holds for the user's own functions, too.
+The target is x86-64-v2 on processors of that level (all but the oldest), else the plain instruction set. So code that
+was compiled on one computer runs on every other one. ``NUMBA_CPU_NAME`` chooses another target. Numba has one
+target for a process, which holds for the user's own functions, too.
 
-Three folders are searched, the first of which takes what is compiled now:
+Three folders are searched. New results go to the first:
 
-1. a writable one: below ``NUMBA_CACHE_DIR`` if that is set, else in the ``__pycache__`` of the package, in the cache
-   folder of the user, or in a temporary one;
-2. the ``__pycache__`` of the package, which ``fdi compile`` may have filled before the package became read-only;
+1. a writable one: below ``NUMBA_CACHE_DIR`` if set, else in the ``__pycache__`` of the package, in the cache
+   folder of the user, or in a temporary one,
+2. the ``__pycache__`` of the package, which ``fdi compile`` may have filled before the package became read-only,
 3. `SHIPPED`, which the build of the package fills (``setup.py``).
 
-Compiled code is run as it is found. The first folder must be closed to all other users (`fdi_ros.system.files`). The
-others are part of the package: a file there is trusted if no more users can write it than the modules beside it.
+Compiled code runs as found. The first folder must be closed to all other users (`fdi_ros.system.files`). The
+others are part of the package: a file there is trusted if no more users can write the file than the modules.
 """
 
 from __future__ import annotations
@@ -151,10 +151,10 @@ class Results(FunctionCache):  # type: ignore[misc,unused-ignore]
 
 
 class _Files(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
-    """Index and results of one function in one folder; a file that is not trusted or damaged counts as absent."""
+    """Index and results of one function in one folder. Files that are not trusted or damaged count as absent."""
 
     def check(self, path: str) -> None:
-        """Raise `DistrustError` unless a file is trusted, `OSError` if there is none."""
+        """Raise `DistrustError` unless a file is trusted, `OSError` if none exists."""
         raise NotImplementedError
 
     def _load_index(self) -> Any:
@@ -204,7 +204,7 @@ class Kept(_Files):
     new_marks: set[Path] = set()  # noqa: RUF012, shared: of parts whose callers are not kept yet
 
     def load(self, key: Any) -> Any:
-        """Return the result for a key, None if no folder has it."""
+        """Return the result for a key, None if no folder has one."""
         found = super().load(key)
         inside = Path(self._cache_path).name
         base = self._index_name.removesuffix(".nbi")
@@ -215,7 +215,7 @@ class Kept(_Files):
         return found
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep a result; what cannot be written is logged, and stops nothing."""
+        """Keep a result. A failed write is logged, and stops nothing."""
         try:
             self._close()
             with lock(f"{self._index_path}.lock"):
@@ -256,7 +256,7 @@ class Kept(_Files):
 def check_as_package(path: Path) -> None:
     """Check that a file in the package can be written by no more users than this module.
 
-    `DistrustError` if that is not so for it or a folder above it in the package; `OSError` if there is no such file.
+    Raise `DistrustError` if not, or if not for a folder above in the package, `OSError` without such a file.
     """
     module = os.stat(__file__)
     for one in (path, *path.parents):
@@ -329,7 +329,7 @@ def _temporary() -> Path:
 
 
 def _usable(root: Path) -> bool:
-    """Return whether results can be kept below a root, and by nobody else; the folders are made if need be."""
+    """Return whether this user alone can keep results below a root. Make the folders if need be."""
     path = root / _version()
     try:
         for one in (root, path):
@@ -366,7 +366,7 @@ def ship(package: Path) -> None:
 
 @functools.cache
 def _digest(source: Path) -> str:
-    """Digest of a module's source and of all that it imports from this package."""
+    """Digest of a module's source and of all its imports from this package."""
     text = source.read_text(encoding="utf-8")
     found = hashlib.sha256(text.encode())
     for match in _IMPORT.finditer(text):
@@ -377,7 +377,7 @@ def _digest(source: Path) -> str:
 
 
 def _source_of(module: str) -> Path | None:
-    """Return the file of a module of the package; None for the package itself, and for what is no module."""
+    """Return the file of a module of the package, None for the package itself and for names of other kinds."""
     path = PACKAGE.joinpath(*module.split(".")[1:])
     files = (path.with_suffix(".py"), path / "__init__.py")
     return next(

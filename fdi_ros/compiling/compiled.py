@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compiling with Numba: functions, and the records they work on; with `cache` the only module that calls Numba.
+"""Compiling with Numba: functions, and the records they work on. With `cache` the only module that calls Numba.
 
 Numba optimises each function by itself, and again within every function that calls it: at five levels of calls, five
 times. Here only functions that Python calls are optimised and made machine code. A function that compiled code calls is
-a `Part`: it is translated once and linked into its callers. The private interfaces of Numba that this needs are tested
+a `Part`: translated once and linked into its callers. The private interfaces of Numba that this needs are tested
 with the oldest and the newest version allowed.
 
 `cache` keeps the results on disk. With ``NUMBA_DISABLE_JIT=1`` everything runs as plain Python: slowly, with the same
@@ -48,7 +48,7 @@ warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning
 # Records --------------------------------------------------------------------------------
 # A record is a class whose annotated fields form a NumPy structured type. Each field is
 # one line, ``name: Real  # unit, meaning``. Type checkers see plain numbers, arrays and
-# other records. Records nest; a list of records is an array.
+# other records. Records nest. A list of records is an array.
 
 MAX_CHANNELS = 12
 MAX_UNITS = 4
@@ -102,7 +102,8 @@ def allocate(kind: type, count: int = 1) -> NDArray[Any]:
     return rows.view(np.recarray) if INTERPRETED else rows
 
 
-# Compiling ------------------------------------------------------------------------------------------------------------
+# Compiling ----------------------------------------------------------------------------
+# --------------------------------
 
 _dispatchers: list[Any] = []
 _callbacks: list[Callback] = []
@@ -130,20 +131,20 @@ class _Library(JITCodeLibrary):  # type: ignore[misc,unused-ignore]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """There is no machine code of it."""
+        """Return 0: a part has no machine code."""
         return 0
 
     @property
     def codegen(self) -> _Library:
-        """Itself: Numba tells ``library.codegen`` the environment of the code, which is for code that runs."""
+        """Return the library: Numba passes the environment of running code to ``library.codegen``."""
         return self
 
     def set_env(self, name: str, env: Any) -> None:
-        """Pass it over."""
+        """Ignore the environment."""
 
 
 def compiled(function: F) -> F:
-    """Compile a function when it is first called; the compiled result is kept on disk.
+    """Compile a function at its first call, and keep the result on disk.
 
     Division by zero gives infinity or NaN, as in NumPy. No fast-math: results do not depend on the processor.
     """
@@ -177,7 +178,7 @@ def _call_as_part(dispatcher: Any) -> None:
 
 
 class Callback:
-    """A compiled function over records, reached through its address: its callers need not be compiled anew for it."""
+    """A compiled function over records, called through its address, so that its callers are compiled separately."""
 
     def __init__(
         self, function: Callable[..., None], records: tuple[type, ...]
@@ -187,12 +188,12 @@ class Callback:
         _callbacks.append(self)
 
     def __call__(self, *arguments: Any) -> None:
-        """Call the plain Python function; compiled code reaches it by `call`."""
+        """Call the plain Python function. Compiled code uses `call`."""
         self.function(*arguments)
 
     @property
     def address(self) -> int:
-        """What `call` takes; compiles the function if that was not done before."""
+        """Address for `call`. The first access compiles the function."""
         if INTERPRETED:
             return _callbacks.index(self)
         if self.compiled is None:
@@ -221,7 +222,7 @@ def as_input(values: Any, kind: Any) -> NDArray[Any]:
 
 
 def address_of(rows: NDArray[Any]) -> int:
-    """Address of the first record; the array must live as long as the address is used."""
+    """Address of the first record. The array must outlive every use of the address."""
     if INTERPRETED:
         _by_address[rows.ctypes.data] = rows
     return int(rows.ctypes.data)
@@ -241,7 +242,7 @@ def reported(what: str) -> Iterator[None]:
 
 
 def compilations() -> int:
-    """Return how many compilations this process has made so far; what was only loaded does not count."""
+    """Count the compilations of this process so far, without loaded results."""
     misses = sum(
         sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers
     )
@@ -264,7 +265,8 @@ def name_of(function: Callable[..., Any]) -> str:
     return f"{function.__module__}.{function.__qualname__}"
 
 
-# Calling by address -------------------------------------------------------------------------------------------------
+# Calling by address -------------------------------------------------------------------
+# ------------------------------
 
 _by_address: dict[int, NDArray[Any]] = {}
 
@@ -280,7 +282,7 @@ if INTERPRETED:
         sample: Any,
         verdict: Any,
     ) -> None:
-        """Call a `Callback`; see the compiled form."""
+        """Call a `Callback`. See the compiled form."""
         _callbacks[address](
             _by_address[constants][row], _by_address[state][row], sample, verdict
         )

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What users see of compiling: a notice with the share done and the time left, and a clock that leaves it out.
+"""Reports of compiling: a notice with the share done and the time left, and a clock without the time of compiling.
 
 While the compiler runs, garbage is collected less often.
 """
@@ -30,7 +30,10 @@ FIRST_REPORT = 2.0
 """Time from the notice to the first report of progress, s: by then some twenty functions are compiled."""
 REPORT_PERIOD = 5.0  # s
 _PASS = "numba:run_pass"
-"""Event of Numba: a compiler pass. Every compilation has passes, a result loaded from disk has none."""
+"""Event of Numba: a compiler pass.
+
+Every compilation has passes, a result loaded from disk has none.
+"""
 _FUNCTION = "numba:compile"  # event of Numba: the compilation of one function with all functions that it calls
 
 
@@ -152,7 +155,7 @@ def progress_logged(
 
 @contextlib.contextmanager
 def announced() -> Iterator[None]:
-    """Log that this process compiles, before it does, and how far it is; nothing if all results are found."""
+    """Log compilations within the context, before they begin, with their progress. Log nothing if all results exist."""
     done: set[str] = set()
     with contextlib.ExitStack() as stack:
         begun = False

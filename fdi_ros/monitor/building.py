@@ -30,15 +30,20 @@ from fdi_ros.model.noise import MAX_RUN_LENGTH, FalseAlarmRate, NoiseModel, norm
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
 and where all channels arrive in one message, s."""
-BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples
+BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std. White noise exceeds the bound in 6e-5 of samples
 REST_NOISE = (
     4.0  # at rest the standard deviation of a channel is at most this many noise_std
 )
-RETURN_PROBABILITY = 1e-6  # with which a healthy channel disagrees by chance in one sample, where it is to return
+RETURN_PROBABILITY = (
+    1e-6  # chance that a healthy channel disagrees in one sample while returning
+)
 
 
 def build_geometry(config: Config) -> Geometry:
-    """Sensitivity axes of a configuration; `FdiError` if axes, names and topics do not fit each other."""
+    """Sensitivity axes of a configuration.
+
+    Raise `FdiError` if axes, names and topics contradict each other.
+    """
     geometry = _axes(config)
     source_of(config).check_channels(geometry.n)
     units = config.channels.units
@@ -50,7 +55,7 @@ def build_geometry(config: Config) -> Geometry:
         raise ConfigError(
             f"channels.units has {len(units)} names, expected {geometry.n}, one for each channel"
         )
-    # Of the presets some are made of triads; names with a point say the same.
+    # Some presets consist of triads. Names with a point show triads, too.
     if (
         not config.has_units
         and not any("." in name for name in config.channel_names)
@@ -61,7 +66,10 @@ def build_geometry(config: Config) -> Geometry:
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration; a bias averaged at start-up is as well known as white noise lets it be."""
+    """Error model of a configuration.
+
+    A bias averaged at the start is known as well as white noise allows.
+    """
     noise = config.noise
     std = np.array(noise.noise_std)
     bound = np.array(noise.bound) if noise.bound else BOUND_IN_NOISE * std
@@ -130,7 +138,7 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
 def _build(
     name: str, config: Config, geometry: Geometry, noise: NoiseModel
 ) -> Detector:
-    """Build a detector by name, with those of the options that it takes."""
+    """Build a detector by name, with the options that it takes."""
     settings = config.detector
     accepted = accepted_options(detector_class(name))
     known = {field.name for field in fields(settings)} - _RATES
@@ -149,7 +157,10 @@ def _build(
 
 
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
-    """Record of a monitor before its first sample, (1,) `Core`; `ConfigError` if a setting has another length."""
+    """Record of a monitor before its first sample, (1,) `Core`.
+
+    Raise `ConfigError` if a setting has a wrong length.
+    """
     n = geometry.n
     check_lengths(config, "channel", n)
     cores = allocate(Core)
@@ -170,7 +181,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
 
 
 def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> None:
-    """Set in core (1,) all that may change at run time: the rule of decision, what is followed, what is withheld."""
+    """Set in core (1,) all settings that may change at run time: rule of decision, estimation, withholding."""
     settings, rule = core["settings"], config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
     settings["guard_declares"] = detector.name == GUARD

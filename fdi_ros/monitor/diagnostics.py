@@ -30,11 +30,10 @@ INPUT = "input "  # what the name of the line about an input topic begins with, 
 FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
 OLD = 86400.0  # stamps that far behind the clock are of a recording, most likely, s
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN = (
-    4.0  # a delay between units is reported from so many of its standard deviations on
-)
-LEAST_DELAY = 0.001  # and from so much on, s: less is usual between drivers, and 0.01 rad/s in turns of 10 rad/s^2
-NEARLY = 0.8  # a bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault
+CERTAIN = 4.0  # standard deviations from which a delay between units is reported
+LEAST_DELAY = 0.001
+"""Smallest delay that is reported, s. Less is usual between drivers: 0.01 rad/s in turns of 10 rad/s^2."""
+NEARLY = 0.8  # share of ``bias.max_drift`` from which a drift is reported before the bias counts as a fault
 
 
 class Level(IntEnum):
@@ -56,16 +55,16 @@ class StatusLine(NamedTuple):
     values: tuple[tuple[str, str], ...] = ()
 
     def value(self, key: str) -> str:
-        """Return a value by its key; empty: there is none."""
+        """Return a value by its key, empty if the key is missing."""
         return dict(self.values).get(key, "")
 
     def number(self, key: str) -> float:
-        """Return a value as a number; NaN: it is none."""
+        """Return a value as a number, NaN if the text is none."""
         return parse_number(self.value(key))
 
 
 def parse_number(text: str) -> float:
-    """Return a number in a text; NaN: there is none."""
+    """Return the number in a text, NaN if the text is none."""
     try:
         return float(text)
     except ValueError:
@@ -74,32 +73,34 @@ def parse_number(text: str) -> float:
 
 @dataclass(frozen=True)
 class InputStatus:
-    """One input topic as it stands."""
+    """Present state of one input topic."""
 
     name: str
     topic: str
     received: int
     rate: float  # messages per second, lately
-    silent: float | None  # since the last message, s; None: there was none yet.
-    live: bool  # whether it delivers, by the stamps of the others and by the clock
+    silent: float | None  # time since the last message, s. None before the first one.
+    live: (
+        bool  # whether the input delivers, by the stamps of the others and by the clock
+    )
     arrives: bool = False  # whether messages arrive, of use or not
     lag: float = 0.0  # how far its stamps stay behind those of the other inputs, s
-    max_lag: float = math.inf  # what is still one instant, s
+    max_lag: float = math.inf  # largest lag within one instant, s
     offset: float | None = (
-        None  # clock of the monitor minus its last stamp, s; None: its messages carry no stamp.
+        None  # clock of the monitor minus the last stamp, s. None for messages without stamps.
     )
     counts: Mapping[str, int] = field(
         default_factory=dict
-    )  # all that was not taken as it came, by kind
+    )  # messages not taken as they came, by kind
     recent: Mapping[str, int] = field(
         default_factory=dict
     )  # the same since the last regular report
     error: str = ""  # why the last malformed message was refused
     unstamped: bool = False  # whether its headers have no stamp
-    parted: bool = False  # whether its clock and that of the only other input that delivers went apart
+    parted: bool = False  # whether its clock and the clock of the only other live input drifted apart
     frame: str = ""  # frame_id of its first message
     frame_now: str = ""  # frame_id of its last message
-    sources: str = ""  # what is wrong with who publishes on it: more than one does, or another input reads it, too
+    sources: str = ""  # fault of its publishers: a second publisher, or a second input on the topic
 
 
 _LEVELS = {
@@ -115,7 +116,7 @@ _TIMES = (
     ("h", 3600, 172_800, 0),
     ("days", 86_400, 63_072_000, 0),
     ("years", 31_557_600, math.inf, 0),
-)  # name, length, below what it is used, s, and decimals
+)  # name, seconds, upper end of the use in s, and decimals
 ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
@@ -123,7 +124,7 @@ ODD = {
     "ahead": "stamps ahead of the clock, refused",
     "jumped": "stamps far ahead of all others, refused",
     "late": "messages too late for their sample",
-}  # what was not taken as it came, in words, by the names of the counters
+}  # names of the counters, with words for messages not taken as they came
 
 
 def describe(
@@ -136,11 +137,12 @@ def describe(
     since: Sequence[int] | None = None,
     warning: str = "",
 ) -> list[StatusLine]:
-    """Describe a monitor: the whole first, then every channel, then every input; all names begin with the prefix.
+    """Describe a monitor: the whole first, then every channel and every input. All names begin with the prefix.
 
-    ``figures``: more key-values for the whole. ``silent``: no sample for this long, s, so that all is STALE; None:
-    samples come. ``since``: stamps of the messages that brought the channels into their states, ns; None: those of the
-    samples. ``warning``: what else is wrong with the whole.
+    ``figures``: more key-values for the whole. ``silent``: time without samples, s,
+    which makes all STALE, or None while samples come. ``since``: stamps of the messages
+    that brought the channels into their states, ns, by default those of the samples.
+    ``warning``: further faults of the whole, in words.
     """
     worse = _find_worse(status)
     level, message = _whole_message(status, worse)
@@ -170,7 +172,7 @@ def describe(
 
 
 def degraded(status: Status) -> dict[str, str]:
-    """Say in a line each what is used, and worse than it should be, beside what is declared: by channel and unit."""
+    """Return a sentence for each channel and unit that is degraded but in use, by name."""
     units = {unit.name for unit in status.units}
     return {
         name: f"{name}{' as a whole' if name in units else ''}: {'; '.join(words)}"
@@ -179,7 +181,10 @@ def degraded(status: Status) -> dict[str, str]:
 
 
 def _find_worse(status: Status) -> dict[str, list[str]]:
-    """Say the same without the name; what is worse of no channel and no unit has no entry."""
+    """Return the same words without the name.
+
+    Channels and units without degradation have no entry.
+    """
     found = {
         one.name: _channel_worse(one, status)
         for one in status.channels
@@ -242,7 +247,10 @@ def _whole_message(
 
 
 def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[str]:
-    """Say what is wrong with units as a whole; the setting that takes delays off stands with the last of those late."""
+    """Return the faults of whole units in words.
+
+    The setting that corrects delays stands with the last late unit.
+    """
     late = [unit for unit in status.units if unit.name in worse]
     words = [
         f"{first} and {second} give the same values: one sensor, no redundancy; the second is left out;"
@@ -280,7 +288,7 @@ def _format_frozen(unit: UnitStatus) -> str:
 
 
 def _format_unit_set(group: Sequence[str], units: Sequence[UnitStatus]) -> str:
-    """Say of a set of whole units that one is faulty; empty if it is none."""
+    """Return a sentence if a set consists of whole units, else an empty text."""
     inside = [unit for unit in units if set(group).issuperset(unit.channels)]
     if not inside or sum(len(unit.channels) for unit in inside) != len(group):
         return ""
@@ -355,7 +363,7 @@ def _late(unit: UnitStatus) -> str:
 def _channel_message(
     channel: ChannelStatus, status: Status, worse: Mapping[str, Sequence[str]]
 ) -> tuple[Level, str]:
-    """Say how a channel stands, with that in which it is worse than it should be."""
+    """Return level and words for a channel: its state, and each degradation."""
     wrong = [
         *map(_format_frozen, _frozen_units(channel, status)),
         *worse.get(channel.name, ()),
@@ -486,7 +494,7 @@ def _input_values(line: InputStatus) -> Values:
 
 
 def frame_words(first: str, now: str) -> str:
-    """Return what is wrong with a topic whose frame_id has changed."""
+    """Return a warning about a topic whose frame_id has changed."""
     return f"frame_id was {shown(first)!r} in the first message and is {shown(now)!r}: another sensor?"
 
 
@@ -539,8 +547,8 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 
 def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> bytes:
-    """Encode diagnostics, stamped at the clock time now, ns; what no header can hold is moved to its end."""
-    # A simulator may say any time.
+    """Encode diagnostics, stamped at the clock time now, ns, clipped to the times that a header can hold."""
+    # A simulator may publish any time.
     out = bytearray(
         struct.pack(
             "<4BiI", 0, 1, 0, 0, *divmod(min(max(now, 0), LAST_STAMP), 1_000_000_000)
@@ -549,7 +557,7 @@ def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> bytes:
 
     def add(content: str | int) -> None:
         data = b"" if isinstance(content, int) else content.encode() + b"\0"
-        # The 4 bytes of encapsulation do not change what is aligned to 4.
+        # The 4 bytes of encapsulation keep the alignment to 4.
         out.extend(
             bytes(-len(out) % 4)
             + struct.pack("<I", content if isinstance(content, int) else len(data))

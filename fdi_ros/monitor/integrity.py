@@ -3,13 +3,13 @@
 
 """Protection level: how far off the fused rate may be, undetected, by multiple-hypothesis solution separation.
 
-Hypotheses: no channel faulty, each one, each pair; the fault may take any size, whatever is worst. As in advanced
+Hypotheses: no channel faulty, each one, each pair, with a fault of the worst size. As in advanced
 receiver autonomous integrity monitoring (Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1));
 docs/integrity.md has the formulas.
 
-It is worked out once for each set of channels, at noise_std. For a sample whose errors are larger the risk stays shared
-among the hypotheses as it is there: then ``T_L + q_L sigma_L`` with ``q_L = (level - T_L) / sigma_L`` is enough, and
-the largest of these is bounded in the sample path (`fdi_ros.core.level.fill_level`). NumPy alone.
+The level is computed once for each set of channels, at noise_std. For a sample with larger errors the risk stays shared
+among the hypotheses in the same way. Then ``T_L + q_L sigma_L`` with ``q_L = (level - T_L) / sigma_L`` is enough, and
+the sample path bounds the largest term (`fdi_ros.core.level.fill_level`). NumPy alone.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from fdi_ros.model.samples import Array, Mask
 Axes = tuple[float, float, float]
 NO_LEVEL: Axes = (math.inf,) * 3
 
-MIN_LEFT = 1e-3  # smallest singular value of S_LL: below it L reaches no residual, or cannot be told apart
+MIN_LEFT = 1e-3  # smallest singular value of S_LL. Below, L reaches no residual, or its channels cannot be told apart
 MIN_SPREAD = 1e-9  # residuals with less than this share of the channel's standard deviation are rounding
 _HALVINGS = 48
 _erfc = np.frompyfunc(math.erfc, 1, 1)
@@ -41,12 +41,10 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 class ProtectionLevel:
     """What holds for one set of fused channels."""
 
-    level: (
-        Array  # (3,) protection level of the body axes, rad/s; inf: none can be given
-    )
+    level: Array  # (3,) protection level of the body axes, rad/s, inf if none exists
     limit: Array
-    """(n,) largest residual of each channel that passes the separation test, rad/s; inf for channels not fused, and
-    where the others say nothing of it."""
+    """(n,) largest residual of each channel that passes the separation test, rad/s, inf for channels not fused, and
+    for channels that no others check."""
     share: Array  # (n, 3) weight of the variance of each channel in the square of the level of each axis, at most
 
 
@@ -56,7 +54,7 @@ class _Modes(NamedTuple):
     prior: Array  # (h,)
     sigma: Array  # (h, 3) standard deviation of the rate without them, rad/s
     sigma_share: Array  # (h, 3, k) share of its square that is due to each channel
-    limit: Array  # (h, 3) largest separation that passes the test, rad/s; inf where the rest gives no rate
+    limit: Array  # (h, 3) largest separation that passes the test, rad/s, inf where the rest gives no rate
     limit_share: (
         Array  # (h, 3, k) part of that which is due to each channel's variance, rad/s
     )
@@ -66,7 +64,7 @@ class Integrity:
     """Protection levels, one set of channels at a time.
 
     The settings have risk, fault rates, false-alarm probability of the test, and the greatest motion. The weights of
-    the fused rate are 1 / noise_std^2; biases left, bias_std, count as if they hung together as is worst for each axis.
+    the fused rate are 1 / noise_std^2. Remaining biases, bias_std, count with the worst correlation for each axis.
     """
 
     def __init__(
@@ -107,7 +105,7 @@ class Integrity:
                 subset["has_level"] = True
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
-        """Level after one more loss, in the greatest motion, on each axis the worst one to lose, rad/s; inf if none."""
+        """Level after one more loss, in the greatest motion, for the worst channel on each axis, rad/s, or inf."""
         self.fill(subsets, mask, *(rest := single_losses(mask)))
         if not rest:
             return NO_LEVEL
@@ -121,7 +119,7 @@ class Integrity:
             self.fill(subsets, left, *single_losses(left))
 
     def of(self, mask: Mask, variances: Array | None = None) -> ProtectionLevel:
-        """Level when exactly the channels marked in mask (n,) are fused; variances (n,), (rad/s)^2, or noise_std^2."""
+        """Level with the channels in mask (n,) fused, for variances (n,), (rad/s)^2, or noise_std^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
         axes, variance = (
@@ -136,7 +134,7 @@ class Integrity:
         residual = np.eye(len(kept)) - axes @ gain
         parts = residual**2 * variance
         spread = np.sqrt(parts.sum(axis=1))
-        # Bonferroni's bound: within 1 % of the exact threshold, and never below it.
+        # Bonferroni's bound lies within 1 % above the exact threshold.
         test = normal_isf(self.alarm_probability / (2 * len(kept))) * spread
         limit[kept] = np.where(spread > MIN_SPREAD * np.sqrt(variance), test, np.inf)
         if self.risk <= 0:
@@ -173,7 +171,7 @@ def _modes(
 ) -> _Modes:
     """Fault modes of the sets (h, l), from gain (3, k), residual matrix (k, k) and variance (k,).
 
-    Row i of test_parts (k, k) sums to the test limit of channel i; its elements are what is due to each variance.
+    Row i of test_parts (k, k) sums to the test limit of channel i. Its elements belong to the variances.
     """
     inner = residual[sets[:, :, None], sets[:, None, :]]
     possible = np.linalg.svd(inner, compute_uv=False)[:, -1] >= MIN_LEFT
@@ -195,7 +193,7 @@ def _modes(
 
 
 def _share(level: Array, share: Array, modes: _Modes) -> Array:
-    """Largest share (k, 3) of each variance in the square of the level (3,); given that of the rate alone, (k, 3)."""
+    """Largest share (k, 3) of each variance in the squared level (3,), given the share of the rate alone, (k, 3)."""
     for at, limit_share, sigma_share in zip(
         modes.limit, modes.limit_share, modes.sigma_share, strict=True
     ):
@@ -212,7 +210,8 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     priors, sigmas, limits = modes.prior, modes.sigma, modes.limit
     covered = np.isfinite(limits[:, 0])
     none, by_number = float((1 - prior).prod()), np.ones(1)
-    # Probability of each number of faulty channels, without cancellation: the product of all 1 - p + p x.
+    # Probability of each number of faulty channels, without cancellation: the product
+    # of all 1 - p + p x.
     for p in prior:
         by_number = np.convolve(by_number, [1 - p, p])
     budget = risk - float(by_number[3:].sum()) - float(priors[~covered].sum())

@@ -51,15 +51,15 @@ def time_index(stamp: Sequence[int] | NDArray[np.int64]) -> pandas.Index:
 class Event:
     """One change of state of one channel."""
 
-    stamp: int  #: Stamp of the sample that brought it, ns.
+    stamp: int  #: Stamp of the sample that brought the change, ns.
     channel: int
     before: ChannelState
     after: ChannelState
     reason: Reason
     group: tuple[
         int, ...
-    ]  #: AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone.
-    error: float  #: Estimated error of the channel, rad/s; 0 where the reason is neither disagreement nor drift.
+    ]  #: AMBIGUOUS: the channels one of which is faulty, otherwise the channel alone.
+    error: float  #: Estimated error of the channel, rad/s, 0 where the reason is neither disagreement nor drift.
 
     row: int = field(default=0, compare=False)  #: Row of that sample in its output.
 
@@ -76,7 +76,7 @@ _HEAD = ("stamp s", "channel", "change", "why")
 
 
 def format_reason(event: Event, names: Sequence[str]) -> str:
-    """Say why a channel changed its state; without names channels are numbered."""
+    """Return why a channel changed its state. Without names channels are numbered."""
     size = f" by {abs(event.error):.3g} rad/s" if event.error else ""
     group = ", ".join(names[i] if names else f"channel {i}" for i in event.group)
     return (
@@ -126,9 +126,9 @@ class Output:
     events
         Changes of state within these samples, in order.
     channel_names
-        Of the channels; default g1, g2, ...
+        Of the channels, by default g1, g2, ...
 
-    What is not asked for is not made: one sample at a time, ten views would cost more than judging it.
+    Properties build their arrays on demand: for single samples ten views would cost more than judging.
     """
 
     stamp: NDArray[np.int64] = _column("stamp", "(N,) ns.")
@@ -167,7 +167,7 @@ class Output:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(N,) whether there is a fused rate."""
+        """(N,) whether the sample has a fused rate."""
         return self.rows["valid"].view(_FLAG)
 
     @property
@@ -182,12 +182,12 @@ class Output:
 
     @property
     def residual(self) -> Array:
-        """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
+        """(N, n) bias-free channel minus fused rate along its axis, rad/s, NaN where either is missing."""
         return np.asarray(self.rows["residual"][:, : self.n])
 
     @property
     def covariance(self) -> Array:
-        """(N, 3, 3) of the fused rate, (rad/s)^2; NaN where there is none."""
+        """(N, 3, 3) of the fused rate, (rad/s)^2, NaN where the sample has none."""
         return np.asarray(self.rows["covariance"][:, _FULL].reshape(-1, 3, 3))
 
     def __repr__(self) -> str:
@@ -204,7 +204,7 @@ class Output:
         )
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a table with one row a sample; needs pandas.
+        """Return a table with one row a sample. Needs pandas.
 
         Columns as in the file that ``fdi replay --csv`` writes, with the same units: fused rate and its standard
         deviation, statistic, threshold, alarm, the protection level (``level_x``, rad/s), and of each channel
@@ -248,21 +248,21 @@ Template = ImuTemplate | ChannelsTemplate
 class Topic(NamedTuple):
     """One topic that a monitor publishes."""
 
-    name: str  # as the node publishes it, before it is remapped
+    name: str  # name before remapping
     type: str  # of its messages: ``sensor_msgs/msg/Imu``
 
 
 @dataclass(frozen=True, eq=False)
 class SampleOutput:
-    """What is said of each sample on a topic of its own."""
+    """A message about each sample, on a topic of its own."""
 
     topic: Topic
     make: Callable[[str, Sequence[str]], Template]
     """Returns a message to be filled, from the frame_id of the rate and the names of the channels."""
     fill: Callable[[Template, Any, int, int], None]
-    """Fills it from an `fdi_ros.core.records.OutputRow`, n, and what is to be taken off its stamp, ns."""
-    needs_rate: bool = False  # whether it is of samples with a fused rate alone
-    on_demand: bool = False  # whether the node leaves it out while nobody subscribes
+    """Fills the message from an `fdi_ros.core.records.OutputRow`, n, and the shift in ns to subtract from its stamp."""
+    needs_rate: bool = False  # whether only samples with a fused rate are published
+    on_demand: bool = False  # whether the node skips the output without subscribers
 
 
 FUSED = SampleOutput(
@@ -290,13 +290,13 @@ class Encoder:
         self.templates = {output: output.make(frame_id, names) for output in OUTPUTS}
 
     def fill(self, output: SampleOutput, row: Any, shift: int = 0) -> None:
-        """Write what is said of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
+        """Write the message about one sample, an `fdi_ros.core.records.OutputRow`, in place."""
         output.fill(self.templates[output], row, self.n, shift)
 
     def encode(
         self, results: Output, shift: int = 0
     ) -> Iterator[tuple[Topic, int, bytes]]:
-        """Encode what is said of samples: topic, stamp of the sample, ns, and bytes, in which shift is taken off it."""
+        """Encode the messages about samples: topic, stamp of the sample, ns, and bytes, stamped less the shift."""
         for row in results.rows:
             for output, template in self.templates.items():
                 if row["valid"] or not output.needs_rate:

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages handed to a pipeline one at a time; whether they keep coming; and all of it compiled ahead of the first."""
+"""Messages handed to a pipeline one at a time, checks of their flow, and compilation ahead of the first."""
 
 from __future__ import annotations
 
@@ -37,21 +37,23 @@ from fdi_ros.monitor.output import (
 )
 from fdi_ros.monitor.pipeline import Pipeline
 
-STANDING_TIME = 2_000_000_000  # ns of steady time; a simulation at a tenth of real time steps by 0.2 s
+STANDING_TIME = 2_000_000_000  # ns of steady time. A simulation at a tenth of real time steps by 0.2 s
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
-RATE_WINDOWS = 4  # so many measurements in a row must agree with each other: a pause or a loss is no rate
+RATE_WINDOWS = (
+    4  # consecutive measurements that must agree: a pause or a loss is no rate
+)
 
 
 class SilenceClock:
-    """Time by which silence is judged: that of the clock, which goes on by a steady clock where the clock stands.
+    """Clock for judging silence: the clock of the node, continued by a steady clock while that one stands.
 
-    The clock of a simulation or a recording stands for `STANDING_TIME` between two of its messages at most, else it is
-    paused or lost: silence is no health then.
+    The clock of a simulation or a recording stands for `STANDING_TIME` between two messages at most. Longer, and the
+    clock is paused or lost, and silence must not look healthy.
     """
 
     def __init__(self) -> None:
         self.standing = 0.0
-        """Time for which the clock has stood, s; 0: it runs."""
+        """Time for which the clock has stood, s, 0 while the clock runs."""
         self._clock = -1  # clock time of the last reading, ns
         self._moved = 0  # steady time at which the clock moved last, ns
 
@@ -77,8 +79,9 @@ class Watchdog:
         self._measured = 0, 0  # count and clock time, ns, of the last call
 
     def check(self, count: int, now: int) -> bool:
-        """Check the count at the clock time now, ns; True if silence began or ended."""
-        # Where the clock went back, or was not running at the last check, the time between is unknown.
+        """Check the count at the clock time now, ns. Return whether silence began or ended."""
+        # Where the clock went back, or was not running at the last check, the time
+        # between is unknown.
         if count != self._count or now < self.at or not self.at:
             self._count, self.at = count, now
         before, self.silent = self.silent, now - self.at > self.timeout
@@ -99,7 +102,7 @@ class SampleRateCheck:
     """Compares the rate of the samples, by their stamps, with the configured one, Hz, which all times are made for."""
 
     def __init__(self, configured: float) -> None:
-        self.words = ""  # what is wrong, for people; empty: nothing is known to be
+        self.words = ""  # fault in words, empty if none is known
         self._configured = configured
         self._points: deque[tuple[int, int]] = deque(
             maxlen=RATE_WINDOWS + 1
@@ -136,7 +139,7 @@ class Receiver:
         self.pipeline = pipeline
         self.source = source_of(config)
         self.alignment = Alignment(*self.source.alignment)
-        self.live = allocate(Live)  # record of what was received, (1,)
+        self.live = allocate(Live)  # record of received messages, (1,)
         self.errors = [""] * len(
             self.source.topics
         )  # why the last malformed message of each topic was refused
@@ -159,7 +162,10 @@ class Receiver:
         self.warm(self.source)
 
     def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
-        """Take in a message of an input topic; stamp: when it arrived, ns; 0: not known."""
+        """Take in a message of an input topic.
+
+        The stamp is its time of arrival, ns, or 0 if unknown.
+        """
         # Bytes: arrays of what can be written would be compiled once more.
         message = np.frombuffer(bytes(data), dtype=np.uint8)
         flags = self.source.receive(
@@ -172,7 +178,7 @@ class Receiver:
         return int(process(self.pipeline.path, *self._records))
 
     def supply(self) -> None:
-        """Prepare what was asked for by `SUPPLY`."""
+        """Prepare the constants requested by `SUPPLY`."""
         self.pipeline.supply()
         self.encoder.fill(INTEGRITY, self.pipeline.core[0]["last"], self.shift)
 
@@ -182,9 +188,9 @@ class Receiver:
         self.errors[unit] = self.source.explain(code, data, self.pipeline.geometry.n)
 
     def message(self, output: SampleOutput) -> bytes:
-        """Return what is to be published about the last sample."""
+        """Return the message of an output about the last sample."""
         if output not in (FUSED, INTEGRITY):
-            # Compiled code does not fill it.
+            # Compiled code fills the other two.
             self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
         return self.encoder.templates[output].bytes.tobytes()
 
@@ -195,7 +201,7 @@ class Receiver:
 
     @property
     def shift(self) -> int:
-        """To be taken off the stamp of the last sample to have that of its message, ns."""
+        """Shift to subtract from the stamp of the last sample for its message, ns."""
         return int(self.live["shift"][0])
 
     @property
@@ -204,7 +210,7 @@ class Receiver:
         return int(self.alignment.rows["restarts"][0] + self.live["restarts"][0])
 
     def counts(self, unit: int) -> dict[str, int]:
-        """All that was not taken as it came, by kind."""
+        """Count messages not taken as they came, by kind."""
         malformed = {"malformed": int(self.live["inlets"]["malformed"][0, unit])}
         if not self.source.stamped:
             return malformed
@@ -213,7 +219,7 @@ class Receiver:
         return malformed | counters
 
     def warm(self, kind: Source | type[Source]) -> None:
-        """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
+        """Load or compile the code for messages of a kind now, on copies, so that the first message need not wait."""
         path = Path(*(one.copy() for one in self.pipeline.path))
         aside: Any = tuple(one.copy() for one in self._records)
         kind.receive(self.alignment.rows.copy(), self.live.copy(), 0, _NOTHING, 0)
@@ -228,7 +234,7 @@ _FEW = 5  # channels for a method that does not take six
 
 
 def warm_detector(name: str) -> None:
-    """Compile or load what one detector needs; `DetectorError` if there is none of that name."""
+    """Compile or load the code of one detector. Raise `DetectorError` for an unknown name."""
     method = detector_class(name)
     for one in vars(sys.modules[method.__module__]).values():
         if isinstance(one, Callback):

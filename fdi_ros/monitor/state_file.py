@@ -32,13 +32,13 @@ from fdi_ros.system.files import DistrustError, open_regular, read_trusted, repl
 
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
-MAX_BYTES = 1 << 20  # bytes of a state file at most; what is longer is damaged
-PLAUSIBLE = 5.0  # an error is believed up to so many of its standard deviations beforehand, beside its walk since
+MAX_BYTES = 1 << 20  # largest state file, bytes. Longer files are damaged
+PLAUSIBLE = 5.0  # expected standard deviations within which a saved error is believed, beside its walk since
 MOVED = 2.0
 """Errors are saved again when one is off the saved one by so many of its standard deviations, or known so many times
 better. In between, the random walk that the age stands for on restoring covers it."""
 DIGITS = 9  # of the figures saved
-RETRY = 1.0  # what could not be saved is tried again after so long, s
+RETRY = 1.0  # time until a failed save is tried again, s
 
 
 def configuration_hash(config: Config) -> str:
@@ -52,7 +52,7 @@ def configuration_hash(config: Config) -> str:
 
 
 class RefusalError(Exception):
-    """Why a state is not taken over, in words; what is merely damaged shows as one of `DAMAGED`."""
+    """Why a state is refused, in words. Damaged states raise one of `DAMAGED`."""
 
 
 DAMAGED = (
@@ -66,7 +66,7 @@ DAMAGED = (
 
 
 def _content(pipeline: Pipeline) -> dict[str, Any]:
-    """Return what outlives a monitor, in the fields of the file, with channels by name; biases in rad/s."""
+    """Return the lasting state of a monitor, in the fields of the file, with channels by name and biases in rad/s."""
     core, names = pipeline.core[0], pipeline.channel_names
     bias, decision, learned = (
         core["bias"],
@@ -91,7 +91,7 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _errors(detector: Detector) -> dict[str, Array] | None:
-    """Return what the estimator knows of ``ERROR_KINDS``, (N,), (N, N), and delays taken off, s; None: nothing."""
+    """Return the estimates of ``ERROR_KINDS``, (N,), (N, N), and corrected delays, s, or None."""
     if not detector.states[0]["begun"]:
         return None
     estimator, count = (
@@ -104,7 +104,7 @@ def _errors(detector: Detector) -> dict[str, Array] | None:
 
 
 def _as_json(figures: Array) -> list[float]:
-    """Return figures as they are saved; of a covariance the lower triangle."""
+    """Return figures in the form of the file. Covariances are lower triangles."""
     values = figures if figures.ndim == 1 else figures[np.tril_indices(len(figures))]
     return [float(f"{one:.{DIGITS}g}") for one in values]
 
@@ -126,7 +126,10 @@ def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
 
 
 def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
-    """State from what a file holds, if it fits and is plausible; else a refusal, or one of `DAMAGED`."""
+    """Return the state in a file's content, if plausible and of this monitor.
+
+    Raise a refusal, or one of `DAMAGED`.
+    """
     names, detector, settings = (
         pipeline.channel_names,
         pipeline.guard,
@@ -174,7 +177,10 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _parsed_errors(saved: Any, detector: Detector) -> dict[str, Array]:
-    """Errors from what a file holds; one of `DAMAGED` if they are none, or not of this detector."""
+    """Return the errors in a file's content.
+
+    Raise one of `DAMAGED` if they are invalid or of another detector.
+    """
     count, units = (
         int(detector.constants[0]["layout"]["count"]),
         len(detector.geometry.units),
@@ -220,7 +226,7 @@ def _check(
     prior[:n] = turn_on
     limit = PLAUSIBLE * np.sqrt(prior**2 + np.diag(errors["covariance"]))
     delays = layout["delays"][1 : len(geometry.units)]
-    # Of what was saved before the first sample there are biases only.
+    # A state from before the first sample has only biases.
     limit[delays[delays < count]] = LONGEST_DELAY
     worst = int(np.argmax(np.abs(value) / np.maximum(limit, 1e-300)))
     if abs(value[worst]) > limit[worst]:
@@ -238,7 +244,7 @@ def _check(
 
 
 def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
-    """Write a state, which is so many seconds old, into the records of a monitor."""
+    """Write a state of a certain age, s, into the records of a monitor."""
     core, names, n = pipeline.core[0], pipeline.channel_names, pipeline.geometry.n
     settings, faulty, ambiguous = (
         core["settings"],
@@ -285,7 +291,7 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
 
 
 class StateFile:
-    """The file in which one monitor keeps its biases and declarations; what is older than ``max_age``, s, is left.
+    """The file in which one monitor keeps its biases and declarations. States older than ``max_age``, s, are refused.
 
     `ConfigError` if its folder does not exist, or the age is not above zero.
     """
@@ -302,7 +308,9 @@ class StateFile:
         self.path = path
         self.max_age = max_age
         self.words = "not read yet"  # what became of the file, for people
-        self.is_rejected = False  # whether there is a file that was not taken over; the next save moves it aside
+        self.is_rejected = (
+            False  # whether a file was refused. The next save renames that file
+        )
         self.failed = (
             False  # whether the state could not be saved when that was last tried
         )
@@ -310,7 +318,10 @@ class StateFile:
         self._not_before = 0.0
 
     def restore(self, pipeline: Pipeline) -> bool:
-        """Take over the state in the file, if it fits; return whether it did. `ConfigError`: the file is no state."""
+        """Take over the state in the file, if it fits, and return whether it did.
+
+        Raise `ConfigError` if the file is no state.
+        """
         self._check_ours(self.path)
         self._check_ours(self._old)
         self.is_rejected = True
@@ -357,7 +368,7 @@ class StateFile:
                 )
 
     def save(self, pipeline: Pipeline) -> bool:
-        """Write the state, whole or not at all, if it has changed; return whether that was tried."""
+        """Write a changed state, whole or not at all. Return whether a write was tried."""
         state = _content(pipeline)
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False

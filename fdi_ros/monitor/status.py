@@ -35,37 +35,39 @@ from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import plus_minus
 
-CERTAIN = 4.0  # two channels of a larger set surely differ from so many standard deviations on
+CERTAIN = (
+    4.0  # standard deviations from which two channels of a larger set surely differ
+)
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
-UNUSUAL = 3.0  # an error beyond so many standard deviations expected of it is not what was expected
+UNUSUAL = 3.0  # expected standard deviations from which an error is unusual
 
 MAX_START_BIAS = 4.0  # a start bias of more bias.turn_on_std is reported: one healthy start in 16 000
 
 
 @dataclass(frozen=True)
 class ChannelStatus:
-    """One channel as it stands."""
+    """Present state of one channel."""
 
     name: str
     state: ChannelState
     reason: Reason
-    since: int  #: Stamp of the sample that brought the state, ns; 0 before the first sample.
+    since: int  #: Stamp of the sample that brought the state, ns, 0 before the first sample.
     group: tuple[str, ...]  #: AMBIGUOUS: names of the set one of which is faulty.
     error: float  #: Estimated error when declared or suspected, rad/s.
-    residual: float  #: Of the last sample, rad/s; NaN where missing.
-    last_received: int  #: Stamp of the last sample it delivered, ns; 0 if none.
+    residual: float  #: Of the last sample, rad/s, NaN where missing.
+    last_received: int  #: Stamp of the last sample with a value, ns, 0 if none.
     counts: Mapping[
         str, int
-    ]  #: ``samples``, and of these ``missing``, ``non-finite``, ``out of range`` and ``stuck``.
+    ]  #: ``samples``, with ``missing``, ``non-finite``, ``out of range`` and ``stuck`` among them.
     #: Share of the recent samples in which the channel gave a finite value.
     delivers: float = 1.0
     drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
     #: Bias learned at the start, beyond ``bias.fixed``, rad/s.
     start_bias: float = 0.0
-    #: Standard deviation of the bias without the part common to all channels, rad/s;
+    #: Standard deviation of the bias without the part common to all channels, rad/s,
     #: NaN: not estimated.
     bias_std: float = math.nan
-    noise: float = 0.0  #: Lately, in noise_std; 0: not measured.
+    noise: float = 0.0  #: Recent noise in noise_std, 0 if not measured.
     noisy: bool = False  #: Whether that is much, and more than the others show.
 
     @property
@@ -80,25 +82,26 @@ class UnitStatus:
 
     name: str
     channels: tuple[str, ...]
-    delay: float  # by how much its stamps are late against those of another unit, s; negative: early; NaN: not measured
+    delay: float  # lateness of its stamps against another unit, s. Negative if early, NaN if not measured
     delay_std: float  # standard deviation of that, s
-    against: str  # the other unit: of two units the first, of more the one in the middle; itself for that one
-    taken_off: bool = (
-        False  # whether that is taken off the stamps, but for what is not sure
-    )
+    against: str  # the other unit: with two units the first, with more the middle one, which names itself
+    taken_off: bool = False  # whether the certain part of the delay is corrected
     frozen: float = 0.0
-    """For how long all its values have repeated while the others measure motion, s; 0: shorter than
+    """Time for which all its values have repeated while the others measure motion, s, 0 if shorter than
     ``health.stuck_time``."""
 
 
 @dataclass(frozen=True)
 class ApartStatus:
-    """Two channels that alone measure one axis and surely differ: one of them is faulty, and nothing tells which."""
+    """Two channels that alone measure one axis and surely differ.
+
+    One is faulty, and no evidence tells which.
+    """
 
     channels: tuple[str, str]
     who: str  # the two in words
     size: float  # by how much they differ, rad/s
-    std: float  # standard deviation of that, rad/s; NaN: not known
+    std: float  # standard deviation of the difference, rad/s, NaN if unknown
 
     def __str__(self) -> str:
         return f"{self.who.removesuffix(',')}, {plus_minus(self.size, self.std)} rad/s apart"
@@ -109,7 +112,7 @@ class ErrorStatus:
     """What is known of one error of a channel or a unit."""
 
     owner: str  # name of the channel, or of the unit
-    kind: str  # name in `fdi_ros.estimator.error_states.ERROR_KINDS`; of three components with x, y or z
+    kind: str  # name in `fdi_ros.estimator.error_states.ERROR_KINDS`, with x, y or z if the error has three components
     unit: str
     value: float
     std: float
@@ -117,7 +120,7 @@ class ErrorStatus:
 
     @property
     def is_unusual(self) -> bool:
-        """Whether it is for certain larger than what was expected."""
+        """Whether the error is certainly larger than expected."""
         return (
             abs(self.value) > UNUSUAL * self.prior
             and abs(self.value) - UNUSUAL * self.prior > 2.0 * self.std
@@ -131,42 +134,42 @@ class ErrorStatus:
 
 @dataclass(frozen=True)
 class Status:
-    """The whole monitor as it stands after the last sample."""
+    """State of the whole monitor after the last sample."""
 
     config: Config = field(repr=False)
-    stamp: int  #: Of the last sample, ns; 0 before the first.
+    stamp: int  #: Of the last sample, ns, 0 before the first.
     samples: int
     detector: str
     channels: tuple[ChannelStatus, ...]
     statistic: float
     threshold: float
     has_rate: bool  #: Whether the last sample gave a fused rate.
-    withheld: bool  #: Whether it would have, but of old values, or of doubted channels (``publish_under_doubt``).
+    withheld: bool  #: Whether a rate was withheld because of old values or doubted channels (``publish_under_doubt``).
     all_repeat: bool  #: Whether all channels repeat their values.
     can_detect: tuple[str, ...]  #: Channels whose fault would be seen.
     can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
     bias: tuple[
         float, ...
-    ]  #: Subtracted from each channel, rad/s: from the start, and what was followed in flight.
+    ]  #: Subtracted from each channel, rad/s: the bias of the start, and its drift in flight.
     bias_state: str  #: Words: fixed, learned, learning, refused and why, followed from a start in motion.
-    note: str  #: Why checking is limited, in words; empty if it is not.
+    note: str  #: Why checking is limited, in words, empty without limits.
     protection_level: tuple[float, float, float] = (math.inf,) * 3
-    """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
+    """Of the fused rate in the last sample, for each body axis, rad/s, inf where none holds."""
     protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
-    """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
+    """Protection level after the loss of the worst further channel on each axis, rad/s."""
     units: tuple[UnitStatus, ...] = ()  #: Units of several channels, in their order.
     delays: tuple[
         float, ...
-    ] = ()  #: By how much each unit is late against the first, s; empty: not measured.
+    ] = ()  #: Lateness of each unit against the first, s, empty if not measured.
     delay_std: tuple[float, ...] = ()  #: Standard deviation of each, s.
     errors: tuple[
         ErrorStatus, ...
     ] = ()  #: Of the sensors, in the order of ``ERROR_KINDS``.
-    names_rest_on: str = ""  #: What no data can tell, and every name rests on; empty: one fault at a time.
+    names_rest_on: str = ""  #: Assumption that no data can test and every name rests on, empty for one fault at a time.
     copies: tuple[tuple[str, str], ...] = ()
     """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
     apart: ApartStatus | None = (
-        None  #: Where a set is declared: the pair in it that surely differs.
+        None  #: Where a set is declared: the pair of its channels that surely differs.
     )
 
     def is_far(self, channel: ChannelStatus) -> bool:
@@ -189,7 +192,7 @@ def status_of(
 ) -> Status:
     """Snapshot of a monitor after its last sample.
 
-    ``subsets`` (2^n,): what every set of channels can do; ``guard``: detector that keeps the estimator; ``detector``:
+    ``subsets`` (2^n,): capability of every set of channels. ``guard``: detector that keeps the estimator. ``detector``:
     the one that declares.
     """
     geometry = detector.geometry
@@ -277,7 +280,7 @@ def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
 
 
 def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
-    """Channels whose fault would be seen, and isolated, (n,); why others' would not; what every isolation rests on."""
+    """Return the channels whose fault would be seen, and isolated, (n,), with the limits and assumptions in words."""
     detectable, isolable = np.zeros((2, len(mask)), dtype=bool)
     try:
         reduced = detector.geometry.subset(mask)
@@ -302,7 +305,7 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
 
 
 def _too_little(left: int) -> str:
-    """Say why so many channels check nothing."""
+    """Return why this number of channels checks nothing."""
     if left >= MIN_CHANNELS:
         return f"the axes of the {left} channels left do not span three dimensions: a fault of one would not be seen"
     if left == 0:
@@ -316,7 +319,10 @@ def _unit_names(geometry: Geometry) -> list[str]:
 
 
 def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
-    """How late each unit is against each other one, and its standard deviation, (units, units) s; (0, 1): not known."""
+    """Lateness of each unit against each other one, and its standard deviation, (units, units) s.
+
+    Unknown ones are (0, 1).
+    """
     units = len(guard.geometry.units)
     if units < 2 or not begun:
         return np.zeros((0, 1)), np.zeros((0, 1))
@@ -336,7 +342,7 @@ def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
 def _units(
     core: Any, guard: Detector, late: Array, late_std: Array
 ) -> tuple[UnitStatus, ...]:
-    """Units of several channels; of three units or more the late one shows against the one in the middle."""
+    """Units of several channels. With three or more, lateness counts against the middle one."""
     geometry, measured = guard.geometry, len(late) > 0
     names = _unit_names(geometry)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
@@ -356,7 +362,7 @@ def _units(
 
 
 def _frozen(core: Any, channels: Sequence[int]) -> float:
-    """For how long a unit has given old values for certain, s; 0: it does not."""
+    """Time for which a unit has certainly given old values, s, 0 if none."""
     unit, now = mask_of(channels), core["now"]
     seconds = (
         float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max())
@@ -417,7 +423,7 @@ def _apart(guard: Detector, core: Any) -> ApartStatus | None:
             continue
         size, std = abs(float(core["error"][b])), math.nan
         if case["open"]:
-            # What the detector explains: the mean since the onset, with all that is not known of it.
+            # The detector explains the mean since the onset, with all its uncertainty.
             axes, mean, covariance = (
                 geometry.axes,
                 case["inference"]["y"],

@@ -28,13 +28,11 @@ from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros.node import CheckedNode
 
-LOOK_PERIOD = (
-    0.05  # how often it is looked whether an output has found its first subscriber, s
-)
+LOOK_PERIOD = 0.05  # period of the checks for the first subscriber of an output, s
 
 
 class InjectorNode(CheckedNode):
-    """Republishes the input topics of a monitor with faults in them; `FdiError` if a parameter or a fault is wrong.
+    """Republishes the input topics of a monitor with faults. Raise `FdiError` if a parameter or a fault is wrong.
 
     A topic is subscribed to when its output has found its first subscriber: who waits for this node waits for the
     monitor behind it, and nothing is lost in between.
@@ -82,7 +80,8 @@ class InjectorNode(CheckedNode):
             faults += load_scenario(values["scenario"])
         if values["enabled"] and not faults:
             raise FdiError("nothing to inject: both faults and scenario are empty")
-        # One per topic: the messages of the topics come apart, and each effect keeps its own memory of them.
+        # One per topic: messages of the topics arrive separately, and each effect has
+        # its own memory.
         self._injectors = [Injector(faults, self._names) for _ in self.config.topics]
         self._origin: int | None = None
         self._injecting = (
@@ -90,7 +89,7 @@ class InjectorNode(CheckedNode):
             if values["enabled"]
             else ""
         )
-        """In words; empty: off."""
+        """The faults in words, empty while the injector is off."""
         if self._injecting:
             self.log.error(self._injecting)
         else:
@@ -114,13 +113,13 @@ class InjectorNode(CheckedNode):
             try:
                 struck = self._strike(k, data)
             except MessageError:
-                # Not the injector's to refuse: what comes in goes out.
+                # The injector refuses no message: malformed ones pass unchanged.
                 self._malformed += 1
         if struck is not None:
             publisher.publish(struck)
 
     def _strike(self, k: int, data: bytes) -> bytes | None:
-        """Return the message with the faults in it; None: it is lost."""
+        """Return the message with the faults, None if a fault drops the message."""
         n = len(self._names)
         channels = self._source.channels_of(k, n)
         measured, values = self._source.parse(data, channels.stop - channels.start)

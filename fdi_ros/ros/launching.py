@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the launch files share. A value that is wrong is refused by its name: by a choice, or by the node."""
+"""What the launch files share.
+
+A value that is wrong is refused by its name: by a choice, or by the node.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,10 @@ def arguments(config: str) -> list[Action]:
 
 
 def checked(context: LaunchContext) -> tuple[str, Config]:
-    """Return the parameter file and its settings; launch_ros itself would leave out a wrong file with a warning."""
+    """Return the parameter file and its settings.
+
+    launch_ros would skip a wrong file with a warning.
+    """
     file = str(resolve(LaunchConfiguration("config").perform(context)))
     try:
         return file, Config.from_file(file)
@@ -74,7 +80,10 @@ def node(
 
 
 def end(event: ProcessExited, context: LaunchContext) -> list[Action]:
-    """End the launch with the first of its nodes that ends; raising makes it fail with a node that failed."""
+    """End the launch with the first node that ends.
+
+    Raise to fail the launch with a node that failed.
+    """
     if context.is_shutdown:
         return []
     if event.returncode:

@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The live monitor as a managed node: life cycle, parameters and services; `Running` does the work."""
+"""The live monitor as a managed node: life cycle, parameters and services.
+
+`Running` does the work.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +37,7 @@ from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.system.text import shown
 
-CHECK_PERIOD = (
-    0.05  # how often silence is checked for, and the state saved if it has changed, s
-)
+CHECK_PERIOD = 0.05  # period of the checks for silence and of saving a changed state, s
 LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
 END_OF_TIME = (
     2**62
@@ -46,21 +47,25 @@ RCLError = rclpy_implementation.RCLError
 
 
 class MonitorNode(CheckedNode, LifecycleNode):
-    """Gyro fault monitor; `FdiError` if a parameter is wrong or the settings do not fit each other."""
+    """Gyro fault monitor.
+
+    Raise `FdiError` if a parameter is wrong or settings contradict each other.
+    """
 
     def __init__(self, **options: Any) -> None:
         topics = [output.topic.name for output in OUTPUTS]
         super().__init__(
             "fdi_node", MONITOR, subscribes=True, publishes=topics, **options
         )
-        # It says of every impossible transition what the node says, too, and that without bound.
+        # rcl_lifecycle repeats the node's own line on every impossible transition, without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         file, age = (self.values()[name] for name in ("state_file", "state_max_age"))
         self._state_file = StateFile(Path(file), age) if file else None
         self.log.take_over()
         self._running: Running | None = None
         self._checked_at = time.monotonic()  # steady time of the last check, s
-        # Built here too, so that settings that do not fit refuse the start and not the first transition.
+        # Built here too, so that settings that do not fit refuse the start and not the
+        # first transition.
         self._receiver: Receiver | None = (
             self._build()
         )  # again from configure to cleanup
@@ -82,7 +87,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, *arguments: Any, **options: Any
     ) -> Any:
-        """Subscribe; what rclpy makes of /clock is made safe from times that it cannot hold."""
+        """Subscribe. Messages on /clock with times that rclpy cannot hold are ignored."""
         if kind is ClockMessage:
             callback = partial(self._on_clock, callback)
         return super().create_subscription(kind, topic, callback, *arguments, **options)
@@ -96,7 +101,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
             )
             self.get_logger().error(words, throttle_duration_sec=1.0)
 
-    # Managed node -------------------------------------------------------------------------------------------------
+    # Managed node ---------------------------------------------------------------------
+    # ----------------------------
 
     def start(self) -> None:
         """Configure and activate without a manager."""
@@ -104,7 +110,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
             self.trigger_activate()
 
     def live(self, stop: Stop) -> None:
-        """Begin, if it is not for a manager to do that, and work until stopped."""
+        """Begin, unless a manager starts the node, and work until stopped."""
         if self.get_parameter("autostart").value:
             self.start()
         else:
@@ -117,7 +123,10 @@ class MonitorNode(CheckedNode, LifecycleNode):
     def _on_change_state(
         self, change: Any, request: ChangeState.Request, response: Any
     ) -> ChangeState.Response:
-        """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""
+        """Answer a request that is impossible in the present state.
+
+        rclpy raises, and never answers.
+        """
         try:
             return change(request, response)
         except RCLError as error:
@@ -131,7 +140,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
             return response
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Build the monitor, unless it was built at the start, and announce the outputs."""
+        """Build the monitor, unless the constructor has built one, and announce the outputs."""
         try:
             self._receiver = self._receiver or self._build()
         except FdiError as error:
@@ -142,7 +151,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to listen; what was learned of the time of the samples stays from before."""
+        """Begin to listen. The known offsets between clocks remain."""
         if self._running is None:
             return FAILURE
         self._running.listen()
@@ -157,7 +166,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop listening; what is known stays."""
+        """Stop listening. All estimates remain."""
         self.inputs.close()
         return SUCCESS
 
@@ -181,7 +190,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         return self.on_cleanup(state)
 
     def keep_up(self) -> None:
-        """Take in what waits and check what may have changed, where requests keep the executor from doing so."""
+        """Take in waiting messages and run the checks while requests keep the executor busy."""
         super().keep_up()
         if (
             self._running is not None
@@ -202,7 +211,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
             running.start(self._receiver)
 
     def save_state(self) -> None:
-        """Save biases and declarations, if there is a file for them and they have changed."""
+        """Save changed biases and declarations, if a state file is set."""
         if (
             self._state_file is None
             or self._receiver is None
@@ -219,7 +228,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
         self.save_state()
         super().destroy_node()
 
-    # Parameters and services --------------------------------------------------------------------------------------
+    # Parameters and services ----------------------------------------------------------
+    # ----------------------------
 
     def change(self, changes: Sequence[Parameter]) -> None:
         """Take over settings that may change at run time, all or none."""
@@ -229,12 +239,13 @@ class MonitorNode(CheckedNode, LifecycleNode):
         config = self.config.replaced(values)
         name = config.detector.name
         if self.inputs.subscriptions and name != self.config.detector.name:
-            # While it is compiled, an active node would be deaf.
+            # An active node would be deaf while compiling.
             words = f"detector {name} is not compiled yet, which would stop the monitor for up to a minute"
             with refused(f"{words}: run fdi compile first, or deactivate the node"):
                 warm_detector(name)
         if self._receiver is None:
-            # Unconfigured: so that what does not fit is refused now, and not at the next transition.
+            # Unconfigured: so that what does not fit is refused now, and not at the
+            # next transition.
             Pipeline.from_config(config)
         else:
             self.inputs.drain()

@@ -47,25 +47,31 @@ from fdi_ros.system.text import LINE, shown
 DEPTH = 256  # messages that a topic keeps, in and out, for a busy node: a quarter of a second at 1 kHz
 REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 MOST_LINES = 20  # of one severity in one such period: what anybody may cause with requests hides no declaration
-LONGEST = 0.05  # others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood
+LONGEST = 0.05  # longest turn, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
 FLOOD_TIME = (
-    5.0  # so long after a flood has begun it is not looked whether it is over, s
+    5.0  # time after the start of a flood before the first check for its end, s
 )
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
-"""Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
+"""Types that a parameter can be set to.
+
+PARAMETER_NOT_SET is absent, because no parameter can be deleted.
+"""
 MOST_PARAMETERS = 256  # in one request: several times what any node has
 OVERRIDABLE = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
 _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
     "depth": (),
     "reliability": ("reliable", "best_effort", "system_default"),
-}  # what QoS may be overridden, and the values it may have
+}  # QoS policies that may be overridden, and their values
 _MAX_DEPTH = 100_000
 
 
 def message_class(name: str) -> Any:
-    """Return the class of a message type, ``sensor_msgs/msg/Imu``; `FdiError` if its package is not installed."""
+    """Return the class of a message type, ``sensor_msgs/msg/Imu``.
+
+    Raise `FdiError` if its package is not installed.
+    """
     package, _, kind = name.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
@@ -76,7 +82,10 @@ def message_class(name: str) -> Any:
 
 
 def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
-    """Return what a node says in a message of /diagnostics, names without its own; `ValueError`: no such level."""
+    """Return the statuses of a node in a message of /diagnostics, without its name.
+
+    Raise `ValueError` for a wrong level.
+    """
     prefix = f"{node.strip('/')}: "
     found = []
     for status in message.status:
@@ -95,7 +104,10 @@ def read_diagnostics(message: Any, node: str) -> list[StatusLine]:
 
 
 class BoundedLog(logging.Handler):
-    """Logs so many lines a second at most, each of bounded length, and says how many were left out."""
+    """Log with a bound on the lines per second and on their length.
+
+    The log counts the lines left out.
+    """
 
     def __init__(
         self, logger: Any, clock: Callable[[], float] = time.monotonic
@@ -108,7 +120,7 @@ class BoundedLog(logging.Handler):
 
     # The logger of ROS refuses another severity from the same line of code.
     def info(self, words: str) -> None:
-        """Log what is as it should be."""
+        """Log a normal event."""
         if self._has_room("info"):
             self._logger.info(shown(words, LINE))
 
@@ -123,7 +135,7 @@ class BoundedLog(logging.Handler):
             self._logger.error(shown(words, LINE))
 
     def begin_period(self) -> None:
-        """Begin the next period if it is time, with a line on what was left out of the last one."""
+        """Begin the next period if due, with a line on the lines left out of the last one."""
         now = self._clock()
         if now - self._since < REPORT_PERIOD:
             return
@@ -141,7 +153,7 @@ class BoundedLog(logging.Handler):
         return has_room
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log what the package says; see `take_over`."""
+        """Log a record of the package's logger. See `take_over`."""
         self.info(record.getMessage())
 
     def take_over(self) -> None:
@@ -167,7 +179,7 @@ class InputQueue:
         self._node = node
         self._taken = 0  # messages that came by an event of the executor in this turn
         self._waiting = 0  # events of messages that were drained
-        self._until = 0.0  # until when it counts as flooded, steady time, s
+        self._until = 0.0  # steady time at which the flood ends at the earliest, s
 
     def open(self, kind: str, topic: str, take: Callable[[bytes], None]) -> None:
         """Subscribe to the bytes of the messages of a topic."""
@@ -178,7 +190,7 @@ class InputQueue:
             if subscription in self.subscriptions:
                 take(data)
 
-        # A new QoS each time, as overrides are written into it.
+        # A new QoS each time, as rclpy writes overrides into the object.
         qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         message = message_class(kind)
         subscription = self._node.create_subscription(
@@ -193,7 +205,7 @@ class InputQueue:
         self.subscriptions, self.flooded, self._waiting = {}, False, 0
 
     def drain(self) -> None:
-        """Take what waits, in the order in which it arrived, for `LONGEST` at most, or what two queues hold."""
+        """Take waiting messages in the order of their arrival, for `LONGEST` or two full queues at most."""
         takers = list(self.subscriptions.items())
         taken, end = 0, time.monotonic() + LONGEST
         heads = [_next(one) for one, _ in takers]
@@ -212,7 +224,7 @@ class InputQueue:
         self._waiting += taken
 
     def turn(self) -> None:
-        """Take what waits after a turn of an EventsExecutor, and see whether it is a flood."""
+        """Take waiting messages after a turn of an EventsExecutor, and check for a flood."""
         self.drain()
         if self._waiting and not self._taken:
             # The turn has used up the event of a message that was drained, or was a timer's.
@@ -227,17 +239,17 @@ class InputQueue:
 
 
 def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:
-    """Take a message out of the queue: when it arrived, ns, and its bytes."""
+    """Take a message out of the queue: time of arrival, ns, and bytes."""
     with subscription.handle:
         message = subscription.handle.take_message(subscription.msg_type, True)
     return None if message is None else (message[1]["received_timestamp"], message[0])
 
 
 class CheckedNode(Node):
-    """A node that refuses what it cannot use (`ConfigError`), answers every request, and bounds what many bring about.
+    """A node that refuses unusable parameters (`ConfigError`), answers every request, and bounds the effect of floods.
 
-    ``fields`` are its parameters that are none of the settings. QoS may be overridden of the input topics, if it
-    subscribes to them, and of topics that it ``publishes``.
+    ``fields`` are its parameters beside the settings. QoS overrides are allowed for the
+    input topics, with ``subscribes``, and for the topics in ``publishes``.
     """
 
     def __init__(
@@ -254,7 +266,7 @@ class CheckedNode(Node):
         super().__init__(name, **options)
         self.log = BoundedLog(
             self.get_logger()
-        )  # for lines that something outside may cause as often as it likes
+        )  # for lines that outside events can cause at any rate
         # A file gives no type, and so no value, for an empty array.
         given = {
             name: [] if one.value is None else one.value
@@ -304,7 +316,7 @@ class CheckedNode(Node):
         }
 
     def change(self, changes: Sequence[Parameter]) -> None:
-        """Take over parameters that are being set; `FdiError` if they cannot be: then none of them is set."""
+        """Take over parameters that are being set. Raise `FdiError` to refuse all of them."""
 
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
@@ -314,13 +326,16 @@ class CheckedNode(Node):
         return SetParametersResult(successful=True)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
-        """Call a function by the steady clock: that of a simulation, or of a recording, may stand still."""
+        """Call a function by the steady clock.
+
+        The clock of a simulation or recording may stand still.
+        """
         return self.create_timer(
             seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
     def keep_up(self) -> None:
-        """Do what must go on between the parts of a long request, and beside a storm of short ones."""
+        """Keep regular work going between the parts of a long request and during many short ones."""
         self.log.begin_period()
 
     def live(self, stop: Stop) -> None:
@@ -334,19 +349,22 @@ class CheckedNode(Node):
 
     def create_output(self, kind: str, topic: str, **options: Any) -> Any:
         """Publish messages, given as bytes, as REP-2003 wants sensor data: reliable, for subscribers of either kind."""
-        # A new QoS each time, as overrides are written into it.
+        # A new QoS each time, as rclpy writes overrides into the object.
         return self.create_publisher(
             message_class(kind), topic, QoSProfile(depth=DEPTH), **options
         )
 
     def create_diagnostics(self) -> Any:
-        """Publish diagnostics; they are handed over as bytes."""
+        """Publish diagnostics, given as bytes."""
         return self.create_publisher(
             message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
         )
 
     def resolved(self, topic: str) -> str:
-        """Return the full name of a topic, remapped; `ConfigError` if it is no name of a topic."""
+        """Return the full name of a topic after remapping.
+
+        Raise `ConfigError` if the name is invalid.
+        """
         try:
             return str(self.resolve_topic_name(topic))
         except (ValueError, RuntimeError) as error:
@@ -383,12 +401,13 @@ class CheckedNode(Node):
                     f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}"
                 )
 
-    # Requests -----------------------------------------------------------------------------------------------------
+    # Requests -------------------------------------------------------------------------
+    # ----------------------------
 
     def set_parameters_atomically(
         self, parameter_list: list[Parameter]
     ) -> SetParametersResult:
-        """Set parameters together; every refusal is logged too."""
+        """Set parameters together. Log every refusal, too."""
         typed = [
             _typed(one, self._declared[one.name]) if one.name in self._declared else one
             for one in parameter_list
@@ -414,7 +433,7 @@ class CheckedNode(Node):
     def create_service(
         self, kind: Any, name: str, callback: Any, **options: Any
     ) -> Any:
-        """Offer a service that answers every request; rclpy leaves one unanswered in which something is wrong."""
+        """Offer a service that answers every request. rclpy leaves faulty requests unanswered."""
         if kind in (SetParameters, SetParametersAtomically):
             callback = self._on_set_parameters
         return super().create_service(
@@ -489,7 +508,7 @@ _TYPES = {
 
 
 def _typed(parameter: Parameter, field: Field) -> Parameter:
-    """Return a parameter in the type of its field; unchanged where its value has no equal in that type."""
+    """Return a parameter in the type of its field, or unchanged if no equal value of that type exists."""
     value, kind = parameter.value, _TYPES[field.kind]
     is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
     if hasattr(value, "tolist"):
@@ -511,13 +530,13 @@ def _typed(parameter: Parameter, field: Field) -> Parameter:
 
 
 def _descriptor(name: str, field: Field) -> ParameterDescriptor:
-    """Describe a parameter to ROS: meaning, unit, range; read-only unless it may change at run time."""
+    """Describe a parameter to ROS: meaning, unit, range, and read-only unless the parameter may change at run time."""
     unit = f" [{field.unit}]" if field.unit else ""
     described = ParameterDescriptor(
         description=field.description + unit, read_only=not field.runtime
     )
     bounded = math.isfinite(field.low) and math.isfinite(field.high)
-    # Not in the table of settings: detectors are a layer above it.
+    # Not in the table of settings, because detectors are a layer above.
     choices = tuple(DETECTORS) if name == "detector.name" else field.choices
     if choices:
         described.additional_constraints = f"one of: {', '.join(choices)}"

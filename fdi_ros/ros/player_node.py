@@ -34,13 +34,16 @@ SETTLING = 0.3  # time for the subscribers that were found to have found the pla
 LONGEST_STEP, DISORDER = (
     60.0,
     1.0,
-)  # a longer pause is not waited for, s; messages may stand so far out of order, s
-MOST_BEHIND = 0.01  # a message is late by so much at most, s: what is due meanwhile fits into a queue at 10 kHz
+)  # longest pause that is played, and largest disorder of messages, s
+MOST_BEHIND = 0.01  # largest delay of a message, s: messages due meanwhile fit into a queue at 10 kHz
 CLOCK_STEP = 1_000_000  # /clock is published at most this often, ns of recorded time
 
 
 class PlayerNode(CheckedNode):
-    """Plays the input topics of a monitor's settings; `FdiError` if the recording does not hold them."""
+    """Plays the input topics of a monitor's settings.
+
+    Raise `FdiError` if the recording lacks them.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("player_node", PLAYER, subscribes=False, **options)
@@ -104,25 +107,29 @@ class PlayerNode(CheckedNode):
             spin(0.05)
         if (lacking := self._without_subscriber()) and not stop.asked:
             self.log.warning(f"no subscriber to {lacking}: playing all the same")
-        # A publisher learns of a subscriber a moment before that one takes what it sends.
+        # A publisher sees a subscriber a moment before the subscriber can receive.
         time.sleep(SETTLING if not stop.asked else 0)
 
     def _play_once(self, stop: Stop, spin: Callable[[float], None]) -> bool:
-        """Play the recording; return whether it came to its end; `BagError` if it holds no message."""
+        """Play the recording.
+
+        Return whether the end was reached. Raise `BagError` if no message is found.
+        """
         start = answered = math.nan
         for due in self.messages():
             now = time.monotonic()
             if math.isnan(start):
-                # From when the first message is ready: reading it takes a while.
+                # Counted from the first message that is ready, as reading takes a while.
                 start = answered = now
             while True:
                 ahead, paused = start + due / self._rate - now, self._paused
-                # What was late, as a chunk was read, is not made up for in a burst that no queue holds.
+                # What was late, as a chunk was read, is not made up for in a burst that
+                # no queue holds.
                 start += max(0.0, -ahead - MOST_BEHIND)
                 if paused or ahead > 0 or now - answered > PATIENCE:
                     spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
                     answered = time.monotonic()
-                    # Nor what was paused.
+                    # Pauses do not count either.
                     start += answered - now if paused else 0.0
                 if stop.asked:
                     return False
@@ -144,7 +151,7 @@ class PlayerNode(CheckedNode):
         )
 
     def messages(self) -> Iterator[float]:
-        """Publish the messages one by one; before each, yield when it is due, s from the first."""
+        """Publish the messages one by one. Before each, yield its due time, s from the first."""
         last = clock = None
         due = 0.0
         for batch in self.recording.batches(self.config.topics):

@@ -24,7 +24,7 @@ from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.signals import heeded
 from fdi_ros.system import BAGS, require
 
-TIMEOUT = 0.1  # of one turn of the executor, s, which a signal waits for; the EventsExecutor needs one to work
+TIMEOUT = 0.1  # longest turn of the executor, s, which delays a signal. The EventsExecutor needs a limit to work
 ROS_ARGUMENTS = (
     "--params-file",
     "--param",
@@ -43,7 +43,7 @@ NO_ROS = "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or in a clone pip
 
 
 class Stop:
-    """Set by a stopping signal, once or many times; checked by the loop of the node."""
+    """Set by any number of stopping signals, checked by the loop of the node."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -61,7 +61,7 @@ def spin(node: Any, stop: Stop) -> None:
 
     executor, flooded = make_executor(node), False
     single = isinstance(executor, SingleThreadedExecutor)
-    # What is there now stays: the collector need not look at it again.
+    # Objects that exist now stay: the garbage collector need not visit them again.
     gc.collect()
     gc.freeze()
     try:
@@ -75,7 +75,8 @@ def spin(node: Any, stop: Stop) -> None:
                 if node.inputs.flooded != flooded:
                     flooded = not flooded
                     executor.remove_node(node)
-                    # Nothing else empties its queue. What was announced to it, the next one finds itself.
+                    # Nothing else empties its queue. The next executor finds pending
+                    # work by itself.
                     executor.shutdown()
                     executor = _executor(node, events=not flooded)
                 node.keep_up()
@@ -85,7 +86,7 @@ def spin(node: Any, stop: Stop) -> None:
 
 @contextlib.contextmanager
 def guarded(node: Any) -> Iterator[None]:
-    """Log what is raised inside, and go on."""
+    """Log any exception raised inside, and go on."""
     try:
         yield
     except Exception as error:
@@ -94,7 +95,7 @@ def guarded(node: Any) -> Iterator[None]:
 
 
 def make_executor(node: Any, auto: str = "events") -> Any:
-    """Choose the executor, add the node to it, and log which it is; what auto means, the node says."""
+    """Choose the executor, add the node, and log the choice. The node resolves auto."""
     wanted = node.get_parameter("executor").value
     if (auto if wanted == "auto" else wanted) == "events":
         try:
@@ -129,7 +130,7 @@ def _make(name: str) -> Any:
         raise FdiError(f"no such node, expected one of: {', '.join(NODES)}")
     if name == "player_node":
         require("reading recordings", BAGS)
-    # Numba loads SciPy's linear algebra where it finds it, 17 MB; nothing that a node runs calls it.
+    # Numba loads SciPy's linear algebra, 17 MB, if installed. No node calls SciPy.
     sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
     module, _, kind = NODES[name].partition(".")
     return getattr(importlib.import_module(f"fdi_ros.ros.{module}"), kind)()
@@ -138,11 +139,12 @@ def _make(name: str) -> Any:
 def run(
     name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None
 ) -> int:
-    """Make one of `NODES`, let it live until it is done, a signal or a shutdown; return the exit code, 0 or 2.
+    """Make one of `NODES`, and run the node until its end, a signal or a shutdown. Return the exit code, 0 or 2.
 
     Arguments are those of ROS, by default those of the process. Something else may make the node.
     """
-    # A signal ends the process until the node is up: while something is compiled, no handler in Python runs.
+    # A signal ends the process until the node is up: while something is compiled, no
+    # handler in Python runs.
     for number in heeded(by_node=True):
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -155,10 +157,10 @@ def run(
 
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        # RuntimeError: what rclpy raises for a parameter file that it cannot read.
+        # rclpy raises RuntimeError for a parameter file that cannot be read.
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         if left := remove_ros_args([name, *arguments])[1:]:
-            # It would have no effect.
+            # The argument would have no effect.
             expected = f"{name} --ros-args --params-file FILE -p NAME:=VALUE"
             raise FdiError(f"unknown argument {left[0]!r}, expected: {expected}")
         node = _make(name) if make is None else make()
@@ -166,7 +168,7 @@ def run(
         stop = Stop()
     except (FdiError, ImportError, RuntimeError, ParameterException) as error:
         rclpy.try_shutdown()
-        # rcl adds where in its sources it noticed, and of unknown arguments says nothing but which they are.
+        # rcl adds the place in its sources, and only lists unknown arguments.
         words = str(error).split(", at ")[0]
         if unknown := re.match(r"\[.*?'(-.*?)'", words):
             words = f"unknown ROS argument {unknown[1]!r}, expected one of: {', '.join(ROS_ARGUMENTS)}"
@@ -188,8 +190,11 @@ def _refuse(name: str, words: str) -> int:
 
 
 def _check_files(node: Any, arguments: list[str]) -> None:
-    """Refuse parameter files without parameters of this node: it would run with nothing but defaults, or old values."""
-    # Here: without ROS 2 there may be no YAML either, and that is to be said by its name.
+    """Refuse parameter files without parameters of this node.
+
+    The node would run with defaults or old values.
+    """
+    # Imported here: without ROS 2 YAML may be missing, too, and the error must name it.
     from fdi_ros.system.yaml_file import read_yaml
 
     name = node.get_fully_qualified_name()

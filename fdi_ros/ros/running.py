@@ -54,7 +54,7 @@ LATE_SAMPLE = 0.5
 alignment take. A starved computer, or clocks that differ, look like this."""
 ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
 NAMED = 4  # publishers of one topic that are named at most
-QUIET = 5.0  # after a line about a channel the next one waits so long, s, unless its state becomes worse
+QUIET = 5.0  # after a line about a channel, time until the next one unless its state gets worse, s
 BY_SEVERITY = (
     "OK",
     "EXCLUDED",
@@ -91,7 +91,10 @@ class ChangeLog:
     def add(
         self, events: Sequence[Event], shift: int, pair: ApartStatus | None
     ) -> None:
-        """Log what a sample has changed; shift, ns, is taken off its stamp; pair: what surely differs in a set."""
+        """Log the changes of a sample, stamped in ns less the shift.
+
+        The pair is the two channels of a set that surely differ.
+        """
         now = self._clock()
         lines: dict[tuple[ChannelState, str], list[int]] = {}
         for event in events:
@@ -138,7 +141,7 @@ class ChangeLog:
 
 
 class InputTopic:
-    """Status of one input topic of a monitor; number: among the topics of the receiver."""
+    """Status of one input topic of a monitor, by its number among the topics of the receiver."""
 
     def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
         self.topic = topic
@@ -149,8 +152,8 @@ class InputTopic:
         self._was_heard = self._was_unstamped = self._was_ahead = False
         self.last = b""  # message
         self._frame = ""  # frame_id of the first message
-        self._frame_now = ""  # frame_id as it was read last
-        self._sources = ""  # what is wrong with who publishes on it; empty: nothing
+        self._frame_now = ""  # last frame_id read
+        self._sources = ""  # faults of its publishers, in words, or empty
         self._reported_counts: dict[str, int] = {}
 
     @property
@@ -196,7 +199,10 @@ class InputTopic:
         )
 
     def check(self, now: int, log: BoundedLog) -> bool:
-        """Log what is new at the clock time now, ns; return whether the topic fell silent, or came back."""
+        """Log changes at the clock time now, ns.
+
+        Return whether the topic fell silent or came back.
+        """
         received = int(self._inlet["received"])
         changed = self._watchdog.check(received, now)
         self._check_frame(log)
@@ -233,7 +239,7 @@ class InputTopic:
     def check_sources(
         self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog
     ) -> None:
-        """Log when more than one publisher comes to be on the topic, or an input before it reads the same one."""
+        """Log when the topic gets a second publisher, or when an earlier input reads the same topic."""
         before, self._sources = self._sources, ""
         first = next(one for one in inputs if one.topic == self.topic)
         if first is not self:
@@ -253,14 +259,14 @@ class InputTopic:
             log.warning(self._sources)
 
     def count_anew(self, now: int) -> None:
-        """Begin to count anew what is recent, at the clock time now, ns."""
+        """Restart the counts of recent messages at the clock time now, ns."""
         self._watchdog.measure(int(self._inlet["received"]), now)
         self._reported_counts = self._receiver.counts(self._number)
         self._inlet["lag"] = NEVER
 
 
 class Running:
-    """A configured monitor: the path of its messages, its outputs, and what an operator should know of it."""
+    """A configured monitor: the path of its messages, its outputs, and its reports to an operator."""
 
     def __init__(
         self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None
@@ -289,22 +295,23 @@ class Running:
         self._watchdog = Watchdog(round(config.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._silence_clock = SilenceClock()
-        self._clock_stood = False  # as it was logged
+        self._clock_stood = False  # in the log
         self._due = 0.0  # steady time of the next regular report, s: the first at once
         self._at_once = (
-            MAX_AT_ONCE  # changes that may still be reported at once before it
+            MAX_AT_ONCE  # reports of changes left before the next regular one
         )
         self._restarts = receiver.restarts
         self._bias_outcome = -1
         self._changed = [(0, 0)] * len(receiver.pipeline.channel_names)
-        """By channel: stamps of the sample that last changed its state, and of the message that brought it, ns."""
+        """By channel: stamps in ns of the sample that last changed its state, and of the message behind that sample."""
 
     def close(self) -> None:
         """Take the topics down."""
         for publisher in (*self._outputs.values(), self._diagnostics):
             self._node.destroy_publisher(publisher)
 
-    # The path of a message ----------------------------------------------------------------------------------------
+    # The path of a message ------------------------------------------------------------
+    # ----------------------------
 
     def listen(self) -> None:
         """Subscribe to the input topics."""
@@ -313,10 +320,11 @@ class Running:
             self._node.inputs.open(source.type, topic, partial(self._take, k))
 
     def _take(self, inlet: int, data: bytes) -> None:
-        """Take in a message, and publish what comes of it and of all samples that it completes."""
+        """Take in a message, and publish the results of all samples that the message completes."""
         begun, receiver = time.perf_counter_ns(), self.receiver
         self.topics[inlet].last = data
-        # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
+        # The clock of a simulator may have any time: what the header of a message
+        # cannot hold is its end.
         result = receiver.receive(
             inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP)
         )
@@ -335,7 +343,7 @@ class Running:
             result = receiver.go_on() if result & MORE else 0
 
     def _report_events(self, events: Sequence[Event]) -> None:
-        """Log and report changes of state, as far as there are not too many."""
+        """Log and report changes of state, up to a limit."""
         in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
         pair = self.receiver.pipeline.status().apart if in_sets else None
         for event in events:
@@ -348,10 +356,11 @@ class Running:
             self._at_once -= 1
             self._report()
 
-    # Supervision --------------------------------------------------------------------------------------------------
+    # Supervision ----------------------------------------------------------------------
+    # ----------------------------
 
     def check(self) -> None:
-        """Look for everything that may have changed; to be called many times in the period of the reports."""
+        """Check for changes. Call this many times in each period of the reports."""
         self._count_subscribers()
         now, log = self._now(), self._node.log
         self._check_clock()
@@ -380,7 +389,7 @@ class Running:
         return self._silence_clock.read(clock, time.monotonic_ns())
 
     def _check_clock(self) -> None:
-        """Log when the clock comes to stand, and when it runs again."""
+        """Log when the clock stops and when the clock runs again."""
         words = self._clock_words()
         if bool(words) != self._clock_stood:
             self._clock_stood = bool(words)
@@ -390,7 +399,7 @@ class Running:
                 self._node.log.info("the clock runs again")
 
     def _clock_words(self) -> str:
-        """Return what is wrong with the clock; empty: it runs."""
+        """Return the fault of the clock in words, empty while the clock runs."""
         if not self._silence_clock.standing:
             return ""
         if self._node.get_clock().now().nanoseconds == 0:
@@ -401,7 +410,7 @@ class Running:
         )
 
     def _warnings(self, status: Status, clock: int) -> tuple[str, str, str]:
-        """Return what is wrong with the whole at a clock time, ns: its rate, the clock, the age of its samples."""
+        """Return warnings about the whole at a clock time, ns: sample rate, clock, age of the samples."""
         age = self._age(status, clock)
         old = LATE_SAMPLE < age <= OLD and not self._has_no_samples
         return (
@@ -415,7 +424,7 @@ class Running:
         return (clock - status.stamp + self.receiver.shift) / 1e9
 
     def why_not_at_rest(self) -> str:
-        """Say why the bias cannot be learned now; empty if it can."""
+        """Return why the bias cannot be learned now, empty if learning is possible."""
         if not self._node.inputs.subscriptions or self._has_no_samples:
             return "no samples"
         rate = float(np.linalg.norm(self.receiver.pipeline.core["last"]["rate"][0]))
@@ -437,7 +446,7 @@ class Running:
         return self._watchdog.silent or not self._samples
 
     def _count_subscribers(self) -> None:
-        """Check which outputs are wanted, and of what samples: with a subscriber, or whether there is one or not."""
+        """Find the outputs to publish: those with subscribers, and those that are always published."""
         self._wanted = [
             (HAS_RATE if output.needs_rate else WORKED, output, publisher)
             for output, publisher in self._outputs.items()

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Watch a running monitor, fdi watch: a picture of what it publishes, drawn in place or told line by line."""
+"""Watch a running monitor (fdi watch): a picture of its messages, drawn in place or printed line by line."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ except ImportError:
 
 PERIOD = 0.1  # how often the view is drawn, s
 REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
-SERVICE = "/relearn_bias"  # a node with this service is a monitor: it is there before the node is configured
-SETTLE = 1.0  # monitors appear one by one: wait for so long before one is taken for the only one, s
+SERVICE = "/relearn_bias"  # a monitor has this service, before the node is configured
+SETTLE = 1.0  # monitors appear one by one: time until one counts as the only one, s
 STATES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 SILENT = {
     "fused": 1.0,
     "diagnostics": 3.0,
-}  # after so long without a message the last one is no longer shown, s
+}  # age from which a message is no longer shown, s
 REMEMBERED = 50  # changes of state that were not reported yet, or may be drawn
 COLOURS = {
     Level.OK: "green",
@@ -61,13 +61,13 @@ COLOURS = {
 }
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
-"""What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
+"""Ends of a residual bar, rad/s. The least is above the noise of healthy channels."""
 LATEST = 8  # changes of state that are drawn
 WIDE = 90  # columns from which the biases have room
 
 
 class Change(NamedTuple):
-    """Channels that changed state alike; when: s since 1970."""
+    """Channels with the same change of state. The time counts in s since 1970."""
 
     at: float
     level: Level
@@ -76,14 +76,14 @@ class Change(NamedTuple):
 
 @dataclass
 class Picture:
-    """What a monitor has published so far; the figures are those of the last message of each kind."""
+    """The newest messages of a monitor, one of each kind."""
 
     monitor: str = ""  # full name of the node
-    caption: str = ""  # what else is to be known, above all; empty: nothing
-    waiting: str = "looking for a monitor"  # what is waited for; empty: nothing
+    caption: str = ""  # notice above all others, or empty
+    waiting: str = "looking for a monitor"  # name of the awaited monitor, or empty
     since: float = field(
         default_factory=time.monotonic
-    )  # when waiting for it began, s, monotonic clock
+    )  # start of the wait, s, monotonic clock
     whole: StatusLine = field(
         default_factory=lambda: StatusLine(Level.STALE, WHOLE, "")
     )
@@ -101,7 +101,7 @@ class Picture:
 
     @property
     def evidence(self) -> tuple[float, float] | None:
-        """Statistic and threshold; None: no sample is judged now."""
+        """Statistic and threshold, None while no sample is judged."""
         found = self.whole.number("statistic"), self.whole.number("threshold")
         is_stale = self.whole.level == Level.STALE or self.is_silent("diagnostics")
         return (
@@ -131,7 +131,10 @@ class Picture:
 
 
 class Watcher(Node):
-    """Finds a monitor and keeps a picture of it; without the full name of a node, of the only one there is."""
+    """Finds a monitor and keeps a picture of its messages.
+
+    Without a name the only monitor is taken.
+    """
 
     def __init__(self, monitor: str = "", name: str = "fdi_watch") -> None:
         super().__init__(name, start_parameter_services=False)
@@ -139,11 +142,11 @@ class Watcher(Node):
         self._callbacks = {Imu: self._on_fused, DiagnosticArray: self._on_diagnostics}
         self._heard_on: dict[
             type, Subscription[Any]
-        ] = {}  # by message type; empty: nothing is listened to yet
+        ] = {}  # by message type, empty before the first subscription
         self._found = math.inf
 
     def look(self) -> None:
-        """Look for a monitor and listen to it; `FdiError` if there are several and none is named."""
+        """Look for a monitor and listen. Raise `FdiError` if several run and none is named."""
         picture = self.picture
         before, picture.monitor = picture.waiting, picture.monitor or self._choose()
         if picture.monitor:
@@ -170,8 +173,9 @@ class Watcher(Node):
         return there[0]
 
     def _listen(self, monitor: str) -> str:
-        """Listen to a monitor if it is there; return what is waited for, empty: nothing."""
-        # Anew each time: after a restart it may publish elsewhere. Others publish on the same topics, as on
+        """Listen to a monitor if found. Return the awaited name, or empty."""
+        # Anew each time: after a restart it may publish elsewhere. Others publish on
+        # the same topics, as on
         # /diagnostics: that a topic has a publisher proves nothing.
         namespace, _, name = monitor.rpartition("/")
         try:
@@ -246,7 +250,10 @@ class Watcher(Node):
 
 
 def watch(node: str = "", plain: bool = False) -> int:
-    """Show a monitor, by its full name or the only one, until interrupted; `FdiError` if there is not one monitor."""
+    """Show a monitor, by its full name or the only one, until interrupted.
+
+    Raise `FdiError` unless exactly one is found.
+    """
     name = f"/{node.removeprefix('/')}" if node else ""
     if name and not is_plain_name(name):
         raise FdiError(
@@ -298,12 +305,12 @@ class LineReport:
         self._due = 0.0  # when the state of the whole is reported again, s since 1970
 
     def print(self) -> None:
-        """Print what is new since the last time."""
+        """Print new lines since the last call."""
         for line in self.lines():
             print(line, flush=True)
 
     def lines(self) -> list[str]:
-        """Return what is new since the last time; its changes are taken out of the picture."""
+        """Return new lines since the last call, and take their changes out of the picture."""
         picture, now, caption, before = (
             self._picture,
             time.time(),
@@ -344,12 +351,16 @@ def _format_figures(picture: Picture) -> str:
     return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"
 
 
-# Drawn on a terminal ------------------------------------------------------------------------------------------------
+# Drawn on a terminal ------------------------------------------------------------------
+# ------------------------------
 
 
 @contextlib.contextmanager
 def drawing(picture: Picture) -> Iterator[Callable[[], None]]:
-    """Yield what draws a monitor anew, on a screen of its own; what was seen last stays on that of before."""
+    """Yield a function that draws a monitor on a screen of its own.
+
+    The last picture stays on the former screen.
+    """
     console = Console()
     try:
         with Live(console=console, screen=True, auto_refresh=False) as live:
@@ -407,7 +418,7 @@ def _head(picture: Picture) -> Text:
 
 
 def _grid(widths: Sequence[int | None]) -> Table:
-    """Make a table without lines; None: the column that takes what is left of the terminal."""
+    """Make a table without lines. A width of None takes the rest of the terminal."""
     table = Table.grid(padding=(0, 1), expand=True)
     for wide in widths:
         table.add_column(
@@ -454,7 +465,7 @@ def _figure_table(picture: Picture) -> Table:
 
 
 def _channel_table(picture: Picture, is_wide: bool) -> Table:
-    """Draw one row per channel: state, residual, and where there is room the bias."""
+    """Draw one row per channel: state, residual, and the bias if the width allows."""
     is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
     residuals = {
         name: line.number("residual (rad/s)") for name, line in picture.channels.items()
@@ -507,7 +518,7 @@ def _format_bias(line: StatusLine) -> str:
 
 
 def _input_lines(picture: Picture) -> list[Text]:
-    """Return the inputs in which something is wrong; if there is none, the rates of all."""
+    """Return the inputs with a fault, or the rates of all inputs if none has one."""
     if picture.is_silent("diagnostics") or not picture.inputs:
         return []
     odd = [line for line in picture.inputs if line.level != Level.OK]
