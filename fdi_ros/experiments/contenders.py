@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Detectors side by side: at one false-alarm rate, on the same samples; and the least delay that any could have."""
+"""Detectors compared on the same samples at one false-alarm rate, and the least delay possible."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from fdi_ros.model.samples import Array, Mask
 
 
 class ChiSquare:
-    """Chi-square test of the whole parity vector, constant noise; names the channel of the largest ``|w_i|``.
+    """Chi-square test of the whole parity vector, constant noise, which names the channel of the largest ``|w_i|``.
 
     Not a detector of the monitor: parameters and verdicts as of one, without a memory.
     """
@@ -95,7 +95,7 @@ LOOSE_BOUNDS = (
     0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
 )
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
-"""Methods that leave several suspects and rank them by their scores; of others the largest normalised error counts."""
+"""Methods that rank several suspects by their scores. For others the largest normalised error counts."""
 
 NORMALISED_SCORES = (
     "likelihood_ratio",
@@ -114,16 +114,16 @@ METHODS: dict[str, Any] = {
 class Evaluation(NamedTuple):
     """Verdicts of one method on N samples at its loose threshold."""
 
-    ratio: Array  # (N,) statistic over threshold; alarm where it reaches the factor found. NaN without an alarm.
+    ratio: Array  # (N,) statistic over threshold: an alarm from the calibrated factor on, NaN without an alarm.
     suspects: Mask  # (N, n)
     isolated: Mask  # (N,)
     named: NDArray[np.intp]  # (N,) the worst of the suspects; -1 without suspects
     best: NDArray[np.intp] | None
-    """(N,) the channel of the largest normalised residual, alarm or not; None: the method does not give it."""
+    """(N,) channel of the largest normalised residual. None if the method has no residuals."""
 
 
 class Contender:
-    """One method with a loose threshold; that of the common false-alarm rate is a multiple of it."""
+    """One method with a loose threshold. The common false-alarm rate needs a multiple of that threshold."""
 
     def __init__(self, detector: Method) -> None:
         self.detector = detector
@@ -176,7 +176,7 @@ class Contenders(NamedTuple):
 
 
 def _largest(size: Array) -> NDArray[np.intp]:
-    """Column of the largest of each row (N,); parallel channels are equal but for rounding, which must not decide."""
+    """Column of the largest value of each row, (N,). Rounding must not decide between parallel channels."""
     size = np.nan_to_num(size, nan=-1.0)
     top = size.max(axis=1, keepdims=True)
     return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
@@ -186,7 +186,7 @@ def _largest(size: Array) -> NDArray[np.intp]:
 
 
 class Cell(NamedTuple):
-    """Trials on one geometry, with faults of one size or one selection of trials; neither: healthy channels."""
+    """Trials on one geometry, with faults of one size or one selection of trials, or without faults."""
 
     geometry: int
     size: float = 0.0
@@ -236,7 +236,7 @@ class CommonRate(TrialProtocol[Cell]):
         return [Cell(g) for g in range(len(self.specs))]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
+        """Return the trials of a cell and of a block, as set. Healthy channels need more than faulty ones."""
         return self.settings[
             "sound_trials" if cell.healthy else "trials"
         ], self.settings["block"]
@@ -281,7 +281,7 @@ class CommonRate(TrialProtocol[Cell]):
     def build(
         self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]
     ) -> Contenders:
-        """Build methods of `METHODS` at their loose thresholds for a geometry; ``own``: options by name, which win."""
+        """Build methods of `METHODS` at loose thresholds for a geometry. Options by name in ``own`` take precedence."""
         geometry, (noise, probability) = self.geometries[g], self.loose()
         running, refused, streaming = {}, {}, {}
         for name in names:
@@ -328,7 +328,7 @@ def factors_of(
 def threshold_factor(
     largest: Sequence[float], alarm_probability: float, trials: int
 ) -> float:
-    """Ratio that the given share of trials reaches, from their largest ratios; at least the loose threshold, 1."""
+    """Ratio that the given share of trials reaches, from their largest ratios, at least the loose threshold, 1."""
     rank = round(alarm_probability * trials)
     ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
     if rank < 1 or rank > len(ordered):
@@ -356,7 +356,8 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 def cusum_run_length(limit: float, reference: float, mean: float) -> float:
     """Mean number of samples until a one-sided CUSUM ``s = max(0, s + x - reference)`` of normal x reaches its limit.
 
-    From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature; all in standard deviations of x.
+    Starts at s = 0. Solves the integral equation of Page (1954) by Gauss-Legendre quadrature, in
+    standard deviations of x.
     """
 
     def above(x: float) -> float:

@@ -73,8 +73,9 @@ def vehicle_motion(
 ) -> Motion:
     """Motion of a small vehicle: a rest at the start, then rests, slow turns and fast manoeuvres as they come.
 
-    It ends at rest after about ``duration``, s; the first rest takes ``rest``, s. ``max_rate``: largest rate of a
-    component in a fast manoeuvre, rad/s; slow turns reach 0.15 of it. ``max_acceleration``: largest angular
+    The motion ends at rest after about ``duration``, s. The first rest takes ``rest``, s.
+    ``max_rate``: largest rate of a component in a fast manoeuvre, rad/s. Slow turns
+    reach 0.15 of that rate. ``max_acceleration``: largest angular
     acceleration of a component, rad/s^2.
     """
     times: list[float] = [0.0, rest]
@@ -93,7 +94,7 @@ def vehicle_motion(
 def _phase(
     kind: str, max_rate: float, rng: np.random.Generator
 ) -> list[tuple[Array, float]]:
-    """Rates to go to and how long to hold each, s; ends at rest."""
+    """Rates with the time to hold each, s, ending at rest."""
     stop = (np.zeros(3), float(rng.uniform(0.2, 0.6)))
     if kind == "rest":
         return [(np.zeros(3), float(rng.uniform(1.0, 3.0)))]
@@ -111,7 +112,7 @@ def _phase(
 
 @dataclass(frozen=True)
 class GyroErrors:
-    """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit."""
+    """How far gyros of one make differ from ideal ones. The defaults are those of a small MEMS unit."""
 
     noise_std: float = 0.0025  # white noise of one sample, rad/s
     bias_std: float = 0.01  # bias at switch-on, rad/s
@@ -123,7 +124,7 @@ class GyroErrors:
     delay_std: float = 0.0002  # sampling instant of a chip against the stamp, s
     resolution: float = float(
         np.radians(1 / 16.4)
-    )  # step of the converter, rad/s; 0: none
+    )  # step of the converter, rad/s, 0 for none
     max_rate: float = 34.9  # range of the converter, rad/s
     channels_per_chip: int = 3  # channels that are sampled together
 
@@ -156,7 +157,7 @@ class Gyros:
     def measure(
         self, motion: Motion, stamp: NDArray[np.int64], rng: np.random.Generator
     ) -> Block:
-        """Sample at the given stamps, (N,) ns, strictly increasing; the motion's time is 0 at the first."""
+        """Sample at the given stamps, (N,) ns, strictly increasing. The motion's time is 0 at the first."""
         errors = self.errors
         seconds = (stamp - stamp[0]) * 1e-9
         z: Array = np.empty((len(stamp), len(self.axes)))
@@ -196,14 +197,14 @@ class Flown(NamedTuple):
 
     block: Block
     truth: Array  # true body rates, (N, 3) rad/s
-    channel: int | None  # the faulty one; None: all are healthy.
+    channel: int | None  # the faulty channel, None if all are healthy.
     onset: int  # row at which the fault begins, or would
 
 
 class Flight(TrialProtocol[str]):
     """Kind of fault by method: declared, named rightly, delay, and error of the fused rate, false declarations.
 
-    Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset; every
+    Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset. Every
     method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest. A cell
     is a kind of fault.
     """
@@ -336,8 +337,9 @@ class Flight(TrialProtocol[str]):
 def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
     """Run the monitor over flights, and count what came of them.
 
-    ``right``: the faulty channel is isolated, and no other; ``wrong``: a healthy one is; ``ambiguous``: the faulty one
-    is in an ambiguity group, and never isolated; ``silent``: none of these. ``without_rate``: samples from the onset on
+    ``right``: the faulty channel is isolated, and no other. ``wrong``: a healthy one is isolated.
+    ``ambiguous``: the faulty one is in an ambiguity group, and never isolated.
+    ``silent``: none of these. ``without_rate``: samples from the onset on
     without a fused rate. ``delays``: flights by samples from the onset to the isolation. ``after`` and ``before`` the
     onset: sum of the squared errors of the fused rate, (rad/s)^2, over so many samples.
     """

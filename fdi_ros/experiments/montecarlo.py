@@ -3,7 +3,7 @@
 
 """Monte-Carlo studies: the same trials for every method, the same figures for the same seed on any worker.
 
-A study file holds ``title``, ``seed`` and one or more sections; the name of a section says what kind of trial it runs
+A study file holds ``title``, ``seed`` and one or more sections. The name of a section says what kind of trial it runs
 (`fdi_ros.experiments.PROTOCOLS`), its keys are that kind's settings. A protocol has cells of equal settings, which are
 cut into blocks that any worker can run. What blocks give, what the first stage finds and the figures of a cell are
 mappings by name, as the JSON has them: they go between processes and into the result as they are.
@@ -45,10 +45,10 @@ Counts = dict[
 ]  # what trials gave: numbers, None, and lists or mappings by text of these
 Preparation = dict[
     str, Any
-]  # what the first stage gives; in the result under ``found``
+]  # results of the first stage, under ``found`` in the result
 Figures = dict[
     str, Any
-]  # of one cell of the second stage, in the order of the result; shares are an `Estimate`
+]  # figures of one cell of the second stage, in the order of the result. Shares are an `Estimate`
 Refusals = Mapping[
     str, Mapping[str, str]
 ]  # by geometry and method: why the method does not run
@@ -57,7 +57,7 @@ Refusals = Mapping[
 class TrialProtocol(ABC, Generic[Cell]):
     """One section of a study, with settings checked against `schema`.
 
-    The first stage finds thresholds on healthy channels and whatever else trials need; the second runs the trials. A
+    The first stage finds thresholds on healthy channels and whatever else trials need. The second runs the trials. A
     block's result depends on its settings, its seed and the first stage alone.
     """
 
@@ -67,7 +67,7 @@ class TrialProtocol(ABC, Generic[Cell]):
         self.settings = dict(settings)
 
     def preparation_cells(self) -> list[Cell]:
-        """Cells of the first stage; none unless a protocol has them."""
+        """Cells of the first stage, which most protocols lack."""
         return []
 
     @abstractmethod
@@ -128,7 +128,7 @@ class Section:
     kind: str
     settings: Mapping[
         str, Any
-    ]  # every setting of the kind, defaults filled in; plain values that JSON can hold
+    ]  # every setting of the kind with defaults, as plain values for JSON
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Study:
 def load_study(
     path: str | Path, trials: int | None = None, seed: int | None = None
 ) -> Study:
-    """Read a study file; trials per cell and seed win over it. `StudyError` if it is missing or does not fit."""
+    """Read a study file. Given trials and seed take precedence. Raise `StudyError` if the file is missing or wrong."""
     raw = read_yaml(path, "study", StudyError)
     if not isinstance(raw, dict):
         raise StudyError(
@@ -203,7 +203,7 @@ def section_settings(kind: str, raw: Any, schema: Schema) -> dict[str, Any]:
 
 
 def checked(section: str, name: str, field: Field, value: Any) -> Any:
-    """Value of one setting, of its type and within its range (else `StudyError`); plain values that JSON can hold."""
+    """Value of one setting, of its type and within its range (else `StudyError`), as plain values for JSON."""
     where = f"{section}.{name}"
     if field.kind == "detectors":
         named = replace(field, kind="texts", choices=field.choices or tuple(DETECTORS))
@@ -317,7 +317,7 @@ def run_block(
 def _built(
     kind: str, settings: str, preparation: str
 ) -> tuple[AnyProtocol, Preparation]:
-    """Build a protocol; its preparation is empty in the first stage."""
+    """Build a protocol. Its preparation is empty in the first stage."""
     return protocol_class(kind)(json.loads(settings)), json.loads(preparation)
 
 
@@ -335,7 +335,7 @@ def run_study(
 ) -> StudyResult:
     """Run a study and return all figures and settings.
 
-    ``workers``: local processes; None: as many as there are cores. The figures do not depend on it. ``cluster``:
+    ``workers``: local processes, by default one per core. The figures do not depend on their number. ``cluster``:
     address of the scheduler of a Dask cluster that works instead. ``progress`` is called with the share done.
     `StudyError` if the study cannot be run.
     """

@@ -22,7 +22,7 @@ Say = Callable[
     [Any], str
 ]  # words of the figures of a method, or of the limit, in a cell
 ByDetector = tuple[str, Mapping[str, Any], Say]
-"""A column of a table: its head, the figures of each detector, and their words; None: there are none."""
+"""A column of a table: its head, the figures of each detector, and their words, or None."""
 Curve = tuple[
     Sequence[float], Sequence[Estimate]
 ]  # x, and for each x a figure with its confidence interval
@@ -60,7 +60,7 @@ def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:
 
 
 def tables(result: StudyResult) -> list[Section]:
-    """All tables of a result, in the order of its sections; detectors of equal figures share a row."""
+    """All tables of a result, in the order of its sections. Detectors of equal figures share a row."""
     return _shown(result, _TABLES)
 
 
@@ -130,7 +130,7 @@ def _alike_together(
 
 
 def _of(name: str) -> Say:
-    """Words of one share, in percent; a dash where there is none."""
+    """Words of one share, in percent, or a dash."""
 
     def say(at: Figures | None) -> str:
         figure = None if at is None else at.get(name)

@@ -3,8 +3,8 @@
 
 """The Monte-Carlo protocol of Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019, with every method beside its four.
 
-``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube; k and b of healthy channels normal and clipped at
-3 standard deviations; one channel, any, with ``k = sign(X1) ((D - 3) |X1| + 3) sigma_k`` and b alike, X uniform on
+``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube, k and b of healthy channels normal and clipped at
+3 standard deviations. One channel, any, has ``k = sign(X1) ((D - 3) |X1| + 3) sigma_k`` and b alike, X uniform on
 -1 to 1. A trial is kept by the error ``dZ = |z - H omega|`` of the failed channel against the mean M and standard
 deviation s of those of the healthy ones: inside ``M - 3 s < dZ < M + 3 s`` as printed, or outside, a fault that stands
 out.
@@ -38,9 +38,9 @@ names within the tolerance too."""
 
 
 class ResidualSearch(CommonRate):
-    """Outcomes of the protocol: right or wrong channel, declared or within the tolerance; and false alarms.
+    """Outcomes of the protocol: right or wrong channel, declared or within the tolerance, and false alarms.
 
-    The four searches with the paper's tolerance; then all methods at common false-alarm rates of healthy channels. A
+    The four searches with the paper's tolerance. Then all methods at common false-alarm rates of healthy channels. A
     cell is a selection of trials, or healthy channels.
     """
 
@@ -147,7 +147,7 @@ class ResidualSearch(CommonRate):
     def draw(
         self, cell: Cell, count: int, rng: np.random.Generator
     ) -> tuple[Array, Index | None]:
-        """Draw trials and keep those of a selection: z (N, n) rad/s, and the failed channel (N,); None: none is."""
+        """Draw trials and keep those of a selection: z (N, n) rad/s, and the failed channel (N,), or None."""
         n = self.geometries[0].n
         omega = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         scale, zero = np.clip(rng.standard_normal((2, count, n)), -CLIP, CLIP)
@@ -188,7 +188,7 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
 
 
 def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> Counts:
-    """Trials by outcome: declared, of healthy channels; else right or wrong name, declared or within the tolerance."""
+    """Trials by outcome: declared, of healthy channels, or right or wrong name, declared or within the tolerance."""
     if failed is None:
         return {"declared": int(declared.sum())}
     right = named == failed

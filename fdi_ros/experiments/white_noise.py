@@ -121,7 +121,7 @@ class Snapshot(CommonRate):
     def _at_rates(
         self, g: int, factors: Mapping[str, Sequence[float]]
     ) -> dict[str, list[tuple[Contender, float]]]:
-        """Each method with the factor of each false-alarm rate; those that depend on their threshold built anew."""
+        """Each method with the factor of each false-alarm rate, built anew if it depends on its threshold."""
         if g not in self._ready:
             self._ready[g] = {}
             for name, loose in self.contenders[g].running.items():
@@ -162,9 +162,9 @@ def _noise(noise_std: float) -> NoiseModel:
 
 
 def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
-    """Count what came of samples with faults in the channels struck (N, n); none struck: false alarms.
+    """Count the outcomes of samples with faults in the channels struck (N, n). Without faults count false alarms.
 
-    ``identified``: the largest normalised residual is a faulty channel's; None: the method does not give it. ``right``:
+    ``identified``: the largest normalised residual is a faulty channel's, or None without residuals. ``right``:
     declared, and the channel named first is faulty. ``covered``: declared, and every faulty channel is a suspect.
     ``set_sizes``: samples by number of suspects, 0 to n.
     """
@@ -218,7 +218,7 @@ class Delay(CommonRate):
 
     The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the
     probability exp(-W / run length). In the second, each stream begins with `lead` healthy samples, so that memories
-    are filled; streams with an alarm among them are counted and left out.
+    are filled. Streams with an alarm among them are counted and left out.
     """
 
     streams = True
