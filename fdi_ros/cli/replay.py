@@ -30,7 +30,7 @@ from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.inspection.fitness import refuse_unfit
 from fdi_ros.inspection.starting_config import assumed_config
-from fdi_ros.mavlink.failover import failover_text
+from fdi_ros.mavlink.failover_replay import Change, failover_text
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
@@ -114,7 +114,10 @@ def run_replay(arguments: Namespace) -> int:
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
-        changes = [(one.at_s, one.channel, one.state) for one in summary.scores.events]
+        changes = [
+            Change(one.at_s, one.channel, one.state, one.error or 0.0)
+            for one in summary.scores.events
+        ]
         words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
         words += f"note: no --config, so assumed: {assumed}\n"

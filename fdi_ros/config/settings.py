@@ -583,6 +583,13 @@ MAVLINK = {
     "failover_limit": _of_node(
         1, "at most so many IMUs are out of use by failover at a time", 1, 3
     ),
+    "failover_min_size": _of_node(
+        0.03,
+        "smallest error for which an IMU is taken out of use: the autopilot flies with less",
+        0.0,
+        10.0,
+        unit="rad/s",
+    ),
     "failover_file": _of_node(
         "", "holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"
     ),

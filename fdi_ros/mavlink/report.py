@@ -3,14 +3,17 @@
 
 """What is told of a link: its diagnostics, and what a monitor declares as short texts for the ground station.
 
-Texts are STATUSTEXT, no more of them than a link bears; severities as ArduPilot uses them: CRITICAL for what the pilot
-must know now (as its "EKF variance"), WARNING for what has gone and may come back, INFO for good news. Suspicions are
-not announced. What changes while texts wait is said as it stands when its turn comes; channels of a unit that stand
-alike are one text.
+Texts are STATUSTEXT, at most as many as a link carries. Severities are ArduPilot's: CRITICAL
+for what endangers the flight, WARNING for what may pass, INFO for good news. A set of
+channels is a WARNING: in it, healthy channels are in doubt as well. So is a gyro with an
+error below `GRAVE`. Suspicions are not announced. A text that waits gives the state of when
+it is sent. Channels of a unit in the same state share one text. These texts give the
+monitor's state. What the autopilot uses is in the texts of failover.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from fdi_ros.mavlink.link import Link
@@ -185,10 +188,11 @@ EVERY = NS  # between two texts, ns
 AT_ONCE = 5  # texts that may follow one another at once after a quiet time
 SETTLE = NS // 5  # what changes within so long is put together, ns
 SILENT = 3 * NS  # a monitor that reports nothing for so long is silent, ns
+GRAVE = 0.03  # rad/s; ArduCopter flies with a smaller error of a gyro
 FROZEN = "FROZEN"  # in place of the state of a channel that is not declared: its unit gives old values
 _STATES = {
-    "FAULTY": (CRITICAL, "faulty, left out"),
-    "AMBIGUOUS": (CRITICAL, "one of them faulty"),
+    "FAULTY": (CRITICAL, "faulty"),
+    "AMBIGUOUS": (WARNING, "one of them faulty"),
     "STALE": (WARNING, "no data"),
     FROZEN: (WARNING, "frozen"),
 }  # by the state of a channel that is announced
@@ -223,6 +227,7 @@ class Announcer:
         self._said = dict(self._now)  # the same as the ground station knows it
         self._apart = dict.fromkeys(channels, "")
         """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
+        self._errors = dict.fromkeys(channels, math.inf)  # estimated, rad/s
         self._heard = 0
         self._changed: int | None = (
             None  # when the first of what has changed since the last texts did, ns
@@ -240,6 +245,8 @@ class Announcer:
                 self._note(WHOLE, (_format_whole(line), ""), now)
             elif line.name in self._apart and (state in _STATES or state in _FINE):
                 self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
+                error = abs(line.number("estimated error (rad/s)"))
+                self._errors[line.name] = error if error > 0.0 else math.inf
                 group = line.value("one of") if state == "AMBIGUOUS" else ""
                 self._note(line.name, (state if state in _STATES else "OK", group), now)
 
@@ -292,8 +299,10 @@ class Announcer:
                 else (INFO, "FDI: all is judged again")
             )
         if state == "AMBIGUOUS":
-            return CRITICAL, self._set_text(group)
-        severity, words = _STATES.get(state, (INFO, "in use again"))
+            return WARNING, self._set_text(group)
+        severity, words = _STATES.get(state, (INFO, "agrees again"))
+        if state == "FAULTY" and max(map(self._errors.__getitem__, names)) < GRAVE:
+            severity = WARNING
         who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
         return severity, f"FDI: {who} {words}"[:LENGTH]
 
@@ -306,7 +315,7 @@ class Announcer:
         if len(units) == 1 and len(names) == 3:
             return f"FDI: {units[0]} faulty (axis cannot be told apart)"[:LENGTH]
         if len(names) == 1:
-            return f"FDI: {group} faulty"[:LENGTH]
+            return f"FDI: {group} likely faulty"[:LENGTH]
         texts = [
             f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
         ]

@@ -30,6 +30,7 @@ from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
+from fdi_ros.mavlink.failover_policy import PolicySettings
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.protocol import ImuSample, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
@@ -37,6 +38,7 @@ from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
     INPUT,
+    NEWEST_SAMPLE,
     WHOLE,
     Level,
     StatusLine,
@@ -165,9 +167,9 @@ class AutopilotNode(CheckedNode):
             self.get_logger().warning(
                 "failover over an unsigned link: whoever reaches it can pass for the autopilot"
             )
-        return Failover(
-            self._vehicle, self.config.channel_names, params["failover_limit"], path
-        )
+        settings = PolicySettings(params["failover_limit"], params["failover_min_size"])
+        channels = self.config.channel_names
+        return Failover(self._vehicle, channels, settings, path, time.time)
 
     def live(self, stop: Stop) -> None:
         """Wait for the link, pass on what came, and give the executor its turn, until stopped: all in one thread."""
@@ -195,7 +197,6 @@ class AutopilotNode(CheckedNode):
             and not self._failover.is_done
             and time.monotonic() < end
         ):
-            self._failover.turn(time.monotonic_ns(), restore=True)
             self._link.wait(WAIT)
             self._turn()
 
@@ -237,6 +238,8 @@ class AutopilotNode(CheckedNode):
         for peer, data in received:
             now = time.monotonic_ns()
             for sample in self._vehicle.feed(peer, data, now):
+                if self._failover is not None:
+                    self._failover.feed(sample)
                 # By the time of the system.
                 stamp = sample.stamp + self._ahead
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:
@@ -284,9 +287,8 @@ class AutopilotNode(CheckedNode):
                 and topics == self._topics
             )
             failover.reported = now if agrees else 0
-            failover.errors = {
-                line.name: line.number("estimated error (rad/s)") for line in lines
-            }
+            stamp = whole.number(NEWEST_SAMPLE) if whole is not None else math.nan
+            failover.age = time.time() - stamp
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
@@ -297,7 +299,7 @@ class AutopilotNode(CheckedNode):
         self._failover.is_alone = all(
             self.count_publishers(topic) == 1 for topic in self._sole
         )
-        self._failover.declarations.hear(values[2 : 2 + count], now)
+        self._failover.evidence.hear(values[2 : 2 + count], now)
         self._failover.turn(now)
 
     def _on_restore(
@@ -323,6 +325,8 @@ class AutopilotNode(CheckedNode):
     def destroy_node(self) -> None:
         """Close the link too."""
         self._link.close()
+        if self._failover is not None:
+            self._failover.close()
         super().destroy_node()
 
 

@@ -11,6 +11,9 @@ sending, its gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in m
 Both send SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
 ArduPilot's parameters outlive a restart, come as float, are said to all whenever they are set, and again with their old
 value when that is refused; it flies with the first IMU that is in use.
+Seen in ArduCopter 4.6.3's own simulation: a read is answered up to 100 ms late, from another thread, with the value of
+when it was read (`late_reads`); EKF lane k follows IMU k, or the first IMU in use while IMU k is out (`lanes`); notch
+filters are allocated at the start, only for IMUs in use then (`notches`).
 """
 
 import contextlib
@@ -99,6 +102,9 @@ class Autopilot:
     )  # when each PARAM_SET came, ns, and what it said
     armed: bool = False
     sent: int = 0
+    late_reads: int = 0  # ns by which an answer to a read is late
+    bias: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Errors of the gyros, (IMU, axis) rad/s in FRD."""
 
     def __post_init__(self) -> None:
         self.motion = self.motion or gentle(self.units, self.seed)
@@ -120,6 +126,8 @@ class Autopilot:
         self.due: dict[int, int] = {}
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
+        self._answers: list[tuple[int, str, float]] = []  # when, ns; name and value
+        self.notches = self._allocate_notches()
         self._lock = threading.Lock()
 
     @property
@@ -129,10 +137,21 @@ class Autopilot:
             (k for k in range(self.units) if self.parameters[PARAMETERS[k]]), -1
         )
 
+    @property
+    def lanes(self) -> list[int]:
+        """IMU that each EKF lane follows, from 0."""
+        used = [bool(self.parameters[name]) for name in PARAMETERS[: self.units]]
+        return [k if used[k] else self.flies_with for k in range(self.units)]
+
+    def _allocate_notches(self) -> list[bool]:
+        known = [self.parameters.get(name, 0.0) for name in PARAMETERS[: self.units]]
+        return [bool(value) for value in known]
+
     def reboot(self, now: int) -> None:
         """Start anew: the clock begins at zero, intervals are forgotten."""
         with self._lock:
             self.boot, self._beat = now, 0
+            self.notches = self._allocate_notches()
             self.intervals.clear()
             self.due.clear()
 
@@ -155,6 +174,10 @@ class Autopilot:
 
     def _step(self, now: int) -> list[bytes]:
         out: list[bytes] = []
+        for at, name, value in self._answers:
+            if at <= now:
+                self._send_value(name, value, out)
+        self._answers = [one for one in self._answers if one[0] > now]
         if now - self._beat >= NS:
             self._beat = now
             kind = (
@@ -202,7 +225,7 @@ class Autopilot:
                 )
             return
         sampled = self._sampled(unit, now)
-        rate = self.motion((sampled - self.start) / NS)[unit]
+        rate = self.motion((sampled - self.start) / NS)[unit] + self.bias[unit]
         stamp = self.clock(sampled if self.stack == "px4" else now)
         if number == 105:
             self._send(
@@ -246,10 +269,14 @@ class Autopilot:
             self.sets.append((now, name, message.param_value))
             if name not in self.read_only:
                 self.parameters[name] = message.param_value
-        self.say_parameter(name, out)
+            self.say_parameter(name, out)
+            return
+        self._answers.append((now + self.late_reads, name, self.parameters[name]))
 
     def say_parameter(self, name: str, out: list[bytes]) -> None:
-        value = self.parameters[name]
+        self._send_value(name, self.parameters[name], out)
+
+    def _send_value(self, name: str, value: float, out: list[bytes]) -> None:
         self._send(
             self.mav.param_value_encode(
                 name.encode().ljust(16, b"\0"), value, 2, 1400, 65535

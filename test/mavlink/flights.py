@@ -1,11 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Random flights of the failover policy: `cd test && python -m mavlink.flights 10000`.
+"""Random flights of the failover policy: `cd test && python -m mavlink.flights 20000`.
 
-Faults come and go on several IMUs; messages are lost, late, doubled and overtake one another; somebody else sets the
-same parameters; link, monitor, autopilot and companion fall silent or start anew. At every step it is checked that
-nothing healthy and nothing last is taken out, and after the landing that all of ours is back.
+A `Flight` holds the truth: which IMUs the vehicle uses, and how wrong each gyro is. The
+policy sees it over a link that loses, delays and reorders messages, and through an
+autopilot that answers a read up to 100 ms late with the value of when it read it. Other
+stations set the same parameters. Link, monitor, autopilot and companion fail and start
+anew. After every step the truth is checked, not the policy's view of it.
 """
 
 import sys
@@ -14,172 +16,233 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdi_ros.mavlink.failover import (
+from fdi_ros.mavlink.failover import READ_EVERY, READ_HURRIED
+from fdi_ros.mavlink.failover_policy import (
+    FRESH,
     GROUNDED,
-    FailoverState,
-    FailoverUnit,
-    Known,
+    Imu,
+    Order,
+    PolicySettings,
+    PolicyState,
+    View,
     decide,
 )
 
 MS = 1_000_000
 NS = 1000 * MS
-STEP = 50 * MS
+STEP = 25 * MS
+LATE_ANSWER = 100 * MS  #: By so much an answer to a read is late at most, ns.
+OURS, OTHERS = "ours", "a station"
 
 
 class Flight:
-    """One flight and what its policy does."""
+    """One flight: the truth, what the policy sees, and the checks."""
 
     def __init__(self, seed: int) -> None:
         self.random = random = np.random.default_rng(seed)
         self.count = int(random.integers(2, 4))
-        self.limit = int(random.integers(1, self.count))
-        self.loss, self.slow = (
-            random.choice([0.0, 0.2, 0.5]),
-            int(random.choice([10, 100, 700])) * MS,
-        )
-        self.now, self.state, self.done = 100 * NS, FailoverState(), Counter[str]()
+        self.settings = PolicySettings(limit=int(random.integers(1, self.count)))
+        self.loss = float(random.choice([0.0, 0.2, 0.4]))
+        self.slow = int(random.choice([10, 100, 400])) * MS
+        self.now = 100 * NS
+        self.state = PolicyState.begin(self.count)
+        self.done = Counter[str]()
         self.under_way: list[tuple[int, Callable[[], None]]] = []
         every = range(self.count)
-        self.use, self.by = [True for _ in every], ["" for _ in every]
-        """The truth: which are in use, and who has set that last."""
-        self.said: list[tuple[bool | None, int]] = [(None, 0) for _ in every]
-        self.newest, self.touched = [0 for _ in every], [False for _ in every]
-        """When what was heard last was sent; whether somebody else was heard to change it in this flight."""
-        self.asked, self.wish = [0 for _ in every], [True for _ in every]
-        """When we set it last, and to what."""
-        self.faulty = [False for _ in every]
-        self.declared: list[int | None] = [None for _ in every]
-        self.ok, self.well = [True for _ in every], [0 for _ in every]
+        # The truth.
+        self.use = [True for _ in every]
+        self.by = ["" for _ in every]
+        self.error = [0.0 for _ in every]
+        self.notch = [True for _ in every]
+        self.armed = True
+        self.boots = 0
+        self.without_any = 0  # time without an IMU in use, ns
+        self.taken_by_others = -NS  # when a station last took an IMU out of use, ns
+        # The policy's view.
+        self.named = [False for _ in every]
+        self.agreed: list[int | None] = [0 for _ in every]
+        self.told: list[tuple[bool | None, int]] = [(None, 0) for _ in every]
+        self.newest = [0 for _ in every]
         self.delivers = [True for _ in every]
-        self.armed, self.linked, self.monitored, self.restore = True, True, True, False
-        self.disarmed, self.landed = 0, 0
+        self.linked = self.monitored = True
+        self.restore = self.hurry = False
+        self.disarmed = self.landed = 0
+        self.read_at = 0
 
     def draw(self, rate: float) -> bool:
-        """Whether something happens in this step that does so many times a second."""
+        """Whether an event of this rate, 1/s, happens in this step."""
         return self.random.random() < rate * STEP / NS
 
     def travel(self, arrive: Callable[[], None]) -> None:
+        """Send a message: it may be lost, come twice, and overtake others."""
         for _ in range(1 + (self.random.random() < 0.1)):
             if self.linked and self.random.random() >= self.loss:
-                self.under_way.append(
-                    (self.now + int(self.random.integers(1, self.slow)), arrive)
-                )
+                late = int(self.random.integers(1, self.slow))
+                self.under_way.append((self.now + late, arrive))
 
-    def send_text(self, k: int) -> None:
-        """The autopilot says a parameter; one that was overtaken is dropped by its sequence number."""
-        value, by, sent = self.use[k], self.by[k], self.now
+    def report(self, k: int, value: bool) -> None:
+        """The autopilot sends a parameter. The sequence number drops an overtaken one."""
+        sent = self.now
 
         def arrive() -> None:
-            if sent > self.newest[k]:
-                is_new = (
-                    self.said[k][0] not in (None, value)
-                    and self.now - self.asked[k] > 2 * NS + STEP
-                )
-                self.touched[k] |= is_new and by == "other"
-                self.said[k], self.newest[k] = (value, self.now), sent
+            if sent >= self.newest[k]:
+                self.newest[k] = sent
+                self.told[k] = value, self.now
 
         self.travel(arrive)
 
+    def answer(self, k: int) -> None:
+        """A read has arrived: the value is read now, and sent up to 100 ms later."""
+        value = self.use[k]
+        late = int(self.random.integers(0, LATE_ANSWER))
+        self.under_way.append((self.now + late, lambda: self.report(k, value)))
+
     def set_use(self, k: int, use: bool, by: str) -> None:
-        self.use[k], self.by[k] = use, by
-        self.send_text(k)
+        """A PARAM_SET has arrived."""
+        if by == OTHERS and self.use[k] and not use:
+            self.taken_by_others = self.now
+        self.use[k] = use
+        self.by[k] = by
+        self.report(k, use)
 
     def happen(self) -> None:
-        """What nobody has asked for."""
-        k = int(self.random.integers(self.count))
-        self.faulty[k] ^= self.draw(0.3)
-        if self.faulty[k] and self.declared[k] is None and self.draw(20):
-            self.declared[k], self.ok[k] = self.now, False
-        elif not self.faulty[k] and self.declared[k] is not None and self.draw(5):
-            self.declared[k] = None
-        elif self.declared[k] is None:
-            self.ok[k] = not self.draw(0.2)
-        self.well[k] = self.now if self.declared[k] is not None else self.well[k]
-        self.delivers[k] = not self.draw(0.1) and (self.delivers[k] or self.draw(20))
+        """Events that nobody has asked for."""
+        random = self.random
+        k = int(random.integers(self.count))
+        if self.draw(0.4):
+            sizes = (0.0, random.uniform(0.005, 0.03), random.uniform(0.1, 3.0))
+            self.error[k] = float(random.choice(sizes))
+        if not self.error[k]:
+            # An IMU that healed stays declared for a while. Some declarations are wrong.
+            self.named[k] = (self.named[k] and not self.draw(2.0)) or (
+                self.count == 3 and self.draw(0.05)
+            )
+        elif not self.named[k]:
+            self.named[k] = self.draw(20.0)
+        self.delivers[k] = not self.draw(0.1) and (self.delivers[k] or self.draw(20.0))
         if self.draw(0.05):
-            self.set_use(k, bool(self.random.random() < 0.5), "other")
+            self.set_use(k, bool(random.random() < 0.5), OTHERS)
         self.linked ^= self.draw(0.05 if self.linked else 1.0)
         self.monitored ^= self.draw(0.05 if self.monitored else 1.0)
         self.armed ^= self.draw(0.02 if self.armed else 0.5)
         self.restore = self.draw(0.02)
         if self.draw(0.01):
-            # A companion that starts anew knows what is ours, and takes all else as it finds it.
-            self.state = FailoverState.resumed(self.state.orders)
-            self.said, self.touched = [(None, 0)] * self.count, [False] * self.count
-        if self.draw(0.02):
-            # The autopilot starts anew: its parameters are as they were, and asked for again.
-            self.said = [(None, 0)] * self.count
+            # The companion starts anew: its file says which IMUs are ours.
+            ours = [j for j, one in enumerate(self.state.memories) if one.ours]
+            self.state = PolicyState.begin(self.count, ours)
+            self.told = [(None, 0)] * self.count
+            self.boots = 0
+        if not self.armed and self.draw(0.1):
+            # The autopilot starts anew: parameters outlive it, and it allocates a notch
+            # filter only for an IMU in use.
+            self.boots += 1
+            self.notch = list(self.use)
+            self.told = [(None, 0)] * self.count
+            self.newest = [self.now] * self.count
+
+    def look(self) -> View:
+        """Return the policy's view."""
+        imus = []
+        for k in range(self.count):
+            others = [abs(self.error[k] - self.error[j]) for j in range(self.count)]
+            size = min(others[:k] + others[k + 1 :])
+            apart = size >= self.settings.min_size
+            self.agreed[k] = None if apart else (self.agreed[k] or self.now)
+            imus.append(
+                Imu(
+                    use=self.told[k][0]
+                    if self.now - self.told[k][1] < 10 * NS
+                    else None,
+                    heard=self.told[k][1],
+                    named=self.named[k],
+                    ok=not self.named[k] and not self.error[k],
+                    delivers=self.delivers[k],
+                    size=size,
+                    agreed=self.agreed[k],
+                )
+            )
+        return View(
+            tuple(imus),
+            linked=self.linked,
+            armed=self.armed,
+            disarmed=self.disarmed,
+            monitored=self.monitored,
+            boots=self.boots,
+            restore=self.restore,
+        )
 
     def step(self) -> None:
         self.now += STEP
-        if not self.now // STEP % 20 and self.linked:
+        if not self.now // STEP % 40 and self.linked:
             self.landed = self.now if self.armed else self.landed
             self.disarmed = self.now - self.landed
         due = [arrive for at, arrive in self.under_way if at <= self.now]
         self.under_way = [one for one in self.under_way if one[0] > self.now]
         for arrive in due:
             arrive()
-        if self.disarmed >= GROUNDED:
-            # By the last heartbeat it is on the ground: what is heard till the next one was set there.
-            self.touched = [False] * self.count
-        k, begins = divmod(self.now // STEP % (10 * self.count), 10)
-        if not begins:
-            self.travel(lambda: self.send_text(k))
-        told = zip(
-            self.said, self.declared, self.ok, self.well, self.delivers, strict=True
-        )
-        units = tuple(FailoverUnit(*said, *rest) for said, *rest in told)
-        known = Known(
-            units, self.linked, self.armed, self.disarmed, self.monitored, self.restore
-        )
-        self.state, actions = decide(self.state, known, self.now, self.limit)
-        for action in actions:
-            self.done[action.kind] += 1
-            if action.kind == "set":
-                self.order(known, action.unit, action.use)
+        if self.now - self.read_at >= (READ_HURRIED if self.hurry else READ_EVERY):
+            self.read_at = self.now
+            for k in range(self.count):
+                self.travel(lambda k=k: self.answer(k))
+        view = self.look()
+        decision = decide(self.state, view, self.now, self.settings)
+        self.state = decision.state
+        self.hurry = decision.hurry
+        for _, condition in decision.words:
+            self.done[condition.name] += 1
+        for order in decision.orders:
+            self.check_order(order, view)
+            self.done["in use" if order.use else "out of use"] += 1
+            self.travel(lambda order=order: self.set_use(*order, by=OURS))
+        self.check_vehicle()
 
-    def order(self, known: Known, k: int, use: bool) -> None:
-        self.asked[k], self.wish[k] = self.now, use
-        if not use:
-            units = known.units
-            assert all((known.armed, known.linked, known.monitored))
-            assert units[k].declared is not None, "a healthy one"
-            assert self.now - units[k].declared <= 3 * NS, "declared long ago"
-            assert all(unit.use is not None for unit in units)
-            assert units[k].use, "out already"
-            healthy = {
-                j
-                for j, unit in enumerate(units)
-                if unit.use and unit.delivers and unit.ok
-            }
-            # What we have just set to be out may be out, though it was not heard yet.
-            assert (
-                healthy
-                - {
-                    j
-                    for j, at in enumerate(self.asked)
-                    if not self.wish[j] and self.now - at < 2 * NS
-                }
-                - {k}
-            )
-            out = [order for order in self.state.orders.values() if order.is_out]
-            assert len(out) <= self.limit < self.count
-            assert not self.touched[k], "somebody else's"
-        assert k in self.state.orders, "kept in mind before it is sent"
-        self.travel(lambda: self.set_use(k, use, "ours"))
+    def check_order(self, order: Order, view: View) -> None:
+        """Check an order against the truth when it is sent."""
+        k = order.imu
+        assert self.state.memories[k].ours, "kept in mind before it is sent"
+        if order.use:
+            return
+        assert self.armed
+        assert self.monitored
+        others = [self.error[j] for j in range(self.count) if j != k]
+        if self.count == 3:
+            # Two gyros that fail alike cannot be told from two healthy ones.
+            alike = abs(others[0] - others[1]) < self.settings.min_size
+            assert self.error[k] >= self.settings.min_size or (alike and all(others))
+            assert min(others) <= self.error[k] or (alike and all(others))
+        assert sum(one.ours for one in self.state.memories) <= self.settings.limit
+
+    def check_vehicle(self) -> None:
+        """Check that our hand has not taken the last IMU out of use."""
+        if any(self.use):
+            self.without_any = 0
+            return
+        if not self.without_any and OURS in self.by:
+            # Only a station that acts within the age of our reports can bring this about.
+            trip = FRESH + LATE_ANSWER + 2 * self.slow + STEP
+            assert self.now - self.taken_by_others <= trip, "the last one, by our hand"
+            self.done["station within a round trip"] += 1
+        self.without_any += STEP
+        if OURS in self.by and self.linked and not self.loss:
+            assert self.without_any <= 2 * NS, "none in use for long"
 
     def fly(self, seconds: float = 60.0) -> Counter[str]:
-        """Fly, land, and check that nothing of ours is left out."""
+        """Fly, land, and check that nothing of ours is left out without a reason."""
         for _ in range(round(seconds * NS / STEP)):
             self.happen()
             self.step()
-        self.loss, self.linked, self.armed, self.restore = 0.0, True, False, False
-        for _ in range(round(30 * NS / STEP)):
+        self.loss = 0.0
+        self.linked = self.monitored = True
+        self.armed = self.restore = False
+        for k in range(self.count):
+            self.delivers[k] = True
+        for _ in range(round((GROUNDED + 30 * NS) / STEP)):
             self.step()
-        assert not self.state.orders
-        for use, by in zip(self.use, self.by, strict=True):
-            assert use or by == "other", "not put back"
+        for k, memory in enumerate(self.state.memories):
+            ours = not self.use[k] and self.by[k] == OURS
+            still_bad = self.named[k] or self.agreed[k] is None
+            assert not ours or still_bad or memory.without_notch, "not put back"
+            assert not ours or memory.ours, "forgotten"
         return self.done
 
 

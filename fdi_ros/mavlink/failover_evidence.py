@@ -1,0 +1,248 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Evidence for failover: raw samples of the IMUs compared, beside the monitor's states.
+
+The monitor removes learned errors from the samples and remembers what it has declared.
+The raw comparison does neither: it shows by how much the autopilot's own gyros differ
+now. Failover needs both to take an IMU out of use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fdi_ros.core.states import ChannelState
+from fdi_ros.mavlink.failover_policy import Imu
+from fdi_ros.mavlink.protocol import MS, NS, Vector
+
+AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
+CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
+DECAY = 0.5  #: Time constant with which the largest size of late decays, s.
+LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
+VOTE = 2.0  #: In a set of several IMUs, the odd one must be so many ``min_size`` off.
+#: Difference from which an odd IMU is named after `QUICK`, rad/s. An autopilot whose primary
+#: gyro stands still is at 50 deg of tilt after 0.3 s.
+LARGE = 0.3
+QUICK = 40 * MS  #: Time for which a large difference must stand, ns.
+SIZED = (
+    4  #: Samples over which the size in a text is averaged: all from after the onset.
+)
+FAST = 2  #: Samples over which a large difference is averaged.
+WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
+ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
+#: States of channels that are enough of a doubt where a difference is large.
+LARGE_DOUBTS = {
+    ChannelState.SUSPECT,
+    ChannelState.AMBIGUOUS,
+    ChannelState.FAULTY,
+    ChannelState.STALE,
+}
+CERTAIN = 5.0  #: Standard deviations from which a size is known.
+SILENT = NS // 2  #: An IMU without samples for this time does not deliver, ns.
+
+
+class Difference(NamedTuple):
+    """Rate of one IMU less the rate of another, averaged over `AVERAGED`."""
+
+    mean: Vector  #: rad/s
+    std: Vector  #: Standard deviation of the mean, rad/s.
+
+    @property
+    def size(self) -> float:
+        """Largest component, rad/s."""
+        return max(map(abs, self.mean))
+
+
+class RawComparison:
+    """Differences between the raw rates of count IMUs.
+
+    Parameters
+    ----------
+    count
+        Number of IMUs.
+    interval
+        Time between two samples of an IMU, ns. Samples of two IMUs form a pair if
+        their stamps differ by less than 0.4 intervals.
+    """
+
+    def __init__(self, count: int, interval: int) -> None:
+        self._reach = 2 * interval // 5
+        self._last: list[tuple[int, Vector]] = [(-NS, (0.0, 0.0, 0.0))] * count
+        self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
+            (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
+        }
+
+    def feed(self, unit: int, stamp: int, rate: Vector) -> None:
+        """Take a sample of an IMU, from 0, at a stamp, ns; rate in rad/s."""
+        if unit >= len(self._last):
+            return
+        self._last[unit] = stamp, rate
+        for pair, rows in self._pairs.items():
+            if unit not in pair:
+                continue
+            (first_stamp, first), (second_stamp, second) = (self._last[k] for k in pair)
+            if abs(first_stamp - second_stamp) < self._reach:
+                x, y, z = (a - b for a, b in zip(first, second, strict=True))
+                rows.append((stamp, (x, y, z)))
+            while rows and rows[0][0] <= stamp - AVERAGED:
+                rows.popleft()
+
+    def between(
+        self, unit: int, other: int, now: int, last: int = 0
+    ) -> Difference | None:
+        """Return the difference of two IMUs at time now, ns; None: not compared of late.
+
+        last: samples that are averaged; 0: those of `AVERAGED`.
+        """
+        rows = list(self._pairs[min(unit, other), max(unit, other)])[-last:]
+        if len(rows) < last or not rows or now - rows[-1][0] > CURRENT:
+            return None
+        sign = 1.0 if unit < other else -1.0
+        count = len(rows)
+        columns = list(zip(*(row for _, row in rows), strict=True))
+        mean = [sign * sum(column) / count for column in columns]
+        # With one pair nothing is known of the noise.
+        scale = math.sqrt(count * (count - 1)) if count > 1 else 0.0
+        std = [
+            math.dist(column, [sign * centre] * count) / scale if scale else math.inf
+            for column, centre in zip(columns, mean, strict=True)
+        ]
+        return Difference((mean[0], mean[1], mean[2]), (std[0], std[1], std[2]))
+
+
+class Evidence:
+    """Joins the monitor's states and the raw comparison to an `Imu` for each IMU.
+
+    Parameters
+    ----------
+    count
+        Number of IMUs; the monitor has three channels for each.
+    interval
+        Time between two samples of an IMU, ns.
+    min_size
+        Smallest difference at which an IMU is apart, rad/s.
+    """
+
+    def __init__(self, count: int, interval: int, min_size: float) -> None:
+        self.heard = 0  #: When the monitor last sent its states, ns; 0: never.
+        self.begun = 0  #: Since when it has sent them without a break, ns.
+        self.raw = RawComparison(count, interval)
+        self.imus: tuple[Imu, ...] = (Imu(),) * count
+        self._min_size = min_size
+        self._states: list[set[float]] = [set()] * count
+        self._odd = -1  # the IMU that sets point to; -1: none
+        self._odd_since = 0
+        self._looked = 0
+
+    def hear(self, states: Sequence[float], now: int) -> None:
+        """Take the states of all channels, numbers of `ChannelState`, at time now, ns."""
+        if now - self.heard >= SILENT:
+            self.begun = now
+        self.heard = now
+        self._states = [set(states[k : k + 3]) for k in range(0, len(states), 3)]
+
+    def look(self, delivers: Sequence[bool], now: int) -> tuple[Imu, ...]:
+        """Return the IMUs at time now, ns, given which of them deliver samples."""
+        sizes = self._sizes(delivers, now, 0)
+        fast = self._sizes(delivers, now, FAST)
+        odd, lasting = self._odd_one(sizes, fast)
+        if odd != self._odd:
+            self._odd = odd
+            self._odd_since = now
+        held = math.exp(-(now - self._looked) / NS / DECAY)
+        self._looked = now
+        imus = []
+        for k, before in enumerate(self.imus):
+            # One difference that is unknown may be the one in which the IMU agrees.
+            known = delivers[k] and sizes[k] and not any(map(math.isnan, sizes[k]))
+            size = min(sizes[k]) if known else math.nan
+            agrees = size < self._min_size
+            faulty = ChannelState.FAULTY in self._states[k]
+            voted = k == odd and now - self._odd_since >= lasting
+            imus.append(
+                Imu(
+                    named=faulty or voted,
+                    ok=self._states[k] == {ChannelState.OK},
+                    delivers=delivers[k],
+                    size=max(size, before.size * held) if before.size > size else size,
+                    agreed=(before.agreed or now) if agrees else None,
+                )
+            )
+        self.imus = tuple(imus)
+        return self.imus
+
+    def _sizes(
+        self, delivers: Sequence[bool], now: int, last: int
+    ) -> list[list[float]]:
+        """Return the differences of each IMU to the others, rad/s; NaN: unknown."""
+        count = len(self.imus)
+        sizes: list[list[float]] = []
+        for k in range(count):
+            others = [j for j in range(count) if j != k and delivers[j]]
+            found = [self.raw.between(k, j, now, last) for j in others]
+            sizes.append([one.size if one else math.nan for one in found])
+        return sizes
+
+    def _odd_one(
+        self, sizes: Sequence[Sequence[float]], fast: Sequence[Sequence[float]]
+    ) -> tuple[int, int]:
+        """Return the IMU that is bad without a name, and for how long that must stand, ns.
+
+        Of three IMUs that is the one that is off while the two others agree, if the
+        monitor doubts it too; else the only IMU with a set. -1: none.
+        """
+        for k in range(3) if len(sizes) == 3 else ():
+            if self._is_odd(k, fast, LARGE, LARGE_DOUBTS):
+                return k, QUICK
+            if self._is_odd(k, sizes, VOTE * self._min_size, {ChannelState.AMBIGUOUS}):
+                return k, LASTING
+        sets = [
+            k for k, one in enumerate(self._states) if ChannelState.AMBIGUOUS in one
+        ]
+        return (sets[0] if len(sets) == 1 else -1), LASTING
+
+    def _is_odd(
+        self,
+        k: int,
+        sizes: Sequence[Sequence[float]],
+        least: float,
+        doubts: set[ChannelState],
+    ) -> bool:
+        """Return whether IMU k is off by `least`, rad/s, in doubt, and the others agree."""
+        size = _nearest(sizes[k])
+        alike = max(self._min_size, ALIKE * size)
+        agree = all(_nearest(sizes[j]) < alike for j in range(3) if j != k)
+        return agree and size >= least and bool(self._states[k] & doubts)
+
+    def error(self, unit: int, now: int) -> tuple[str, float] | None:
+        """Return the axis on which an IMU is off most, and by how much, rad/s.
+
+        Measured against the IMU that the monitor finds OK, or else against the nearest.
+        None: not known to `CERTAIN` standard deviations, or not of one axis.
+        """
+        found = [
+            (not imu.ok, difference.size, difference)
+            for k, imu in enumerate(self.imus)
+            if k != unit and (difference := self.raw.between(unit, k, now, SIZED))
+        ]
+        if not found:
+            return None
+        mean, std = min(found)[2]
+        axis = max(range(3), key=lambda k: abs(mean[k]))
+        others = [abs(mean[k]) for k in range(3) if k != axis]
+        if max(others) > WHOLE * abs(mean[axis]):
+            # A whole unit is off: its error is no more than the motion of the vehicle.
+            return None
+        if not abs(mean[axis]) > CERTAIN * std[axis]:
+            return None
+        return "xyz"[axis], mean[axis]
+
+
+def _nearest(sizes: Sequence[float]) -> float:
+    """Return the difference to the nearest of two other IMUs, rad/s; NaN: unknown."""
+    is_known = len(sizes) == 2 and not any(map(math.isnan, sizes))
+    return min(sizes) if is_known else math.nan

@@ -1,0 +1,98 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The file with the IMUs that failover left out of use: INS_USE outlives power and companion.
+
+A thread writes, because a slow card may hold fsync for seconds while the link must go on.
+"""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from fdi_ros.errors import ConfigError
+from fdi_ros.system.files import read_trusted, replacing
+
+LARGEST = 4096  #: Largest file that is read, bytes.
+
+
+class Saved(NamedTuple):
+    """Content of the file."""
+
+    system: int = 0  #: System id of the autopilot; 0: none yet.
+    out: tuple[int, ...] = ()  #: IMUs out of use by our orders, from 0.
+    booted: float = 0.0  #: Unix time at which the autopilot started, s.
+
+
+class FailoverFile:
+    """Reads and writes the file. Raises `ConfigError` at the start if either fails."""
+
+    def __init__(self, path: Path, count: int) -> None:
+        self._path = path
+        self.written = self._read(count)  #: Content on the disk.
+        self._write(self.written)
+        self._thread = ThreadPoolExecutor(max_workers=1)
+        self._job: Future[None] | None = None
+        self._retry = 0
+
+    def keep(self, saved: Saved, now: int) -> str:
+        """Write content that is new, beside this thread; return an error, or ""."""
+        error = ""
+        if self._job is not None and self._job.done():
+            cause = self._job.exception()
+            self._job = None
+            if cause is not None:
+                error = str(cause)
+                self._retry = now + 1_000_000_000
+        differs = saved[:2] != self.written[:2]
+        if differs and self._job is None and now >= self._retry:
+            self._job = self._thread.submit(self._write, saved)
+        return error
+
+    def close(self) -> None:
+        """Wait for the last write."""
+        self._thread.shutdown()
+
+    def _read(self, count: int) -> Saved:
+        try:
+            found = json.loads(read_trusted(self._path, LARGEST))
+            out = tuple(int(imu) - 1 for imu in found["out_of_use"])
+            if not set(out) <= set(range(count)):
+                raise ValueError
+            booted = float(found.get("autopilot_booted", 0.0))
+            return Saved(int(found["system_id"]), out, booted)
+        except FileNotFoundError:
+            return Saved()
+        except (
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+        ) as error:
+            raise ConfigError(
+                f"failover_file {self._path} does not list the IMUs out of use"
+            ) from error
+        except OSError as error:
+            raise ConfigError(
+                f"failover_file {self._path}: {error.strerror}"
+            ) from error
+
+    def _write(self, saved: Saved) -> None:
+        content = {
+            "system_id": saved.system,
+            "out_of_use": [imu + 1 for imu in saved.out],
+            "autopilot_booted": round(saved.booted, 1),
+        }
+        try:
+            with replacing(self._path) as file:
+                file.write(json.dumps(content).encode())
+        except OSError as error:
+            raise ConfigError(
+                f"failover_file {self._path} cannot be written: {error.strerror}"
+            ) from error
+        self.written = saved

@@ -1,0 +1,494 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rules of failover: which IMUs of an ArduPilot are to be out of use now.
+
+`decide` is a pure function, called at every tick (10 to 50 times a second). It takes
+the present view and its own memory, and returns orders, conditions to announce, and
+the next memory. It has no clock and no link. An order sets INS_USEk.
+
+Definitions
+    apart    raw rate differs from the nearest other IMU by ``min_size`` or more
+    bad      named by the monitor, and apart. What is only one of both is left in use.
+    sound    delivers, and the monitor finds it OK or it is not apart
+    ours     out of use by our order, or perhaps so: from the moment the order is sent
+             until the autopilot reports "in use" `SETTLED` after it
+    seen     INS_USE as reported. A change that we have not ordered counts once it has
+             stood for `LASTING`: ArduPilot may answer a read with the value from before
+             our order
+    held     wanted out of use
+
+Rules, in this order at each tick
+    1. Held IMUs go back in use if the operator asks, if no other IMU is left in use,
+       or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
+       is taken out in a flight. In flight that needs a live monitor. On the ground an
+       IMU that the monitor still names stays out. An IMU that was out when the
+       autopilot started has no notch filters: only the operator or rule 5 puts it back.
+    2. In flight, the worst bad IMU becomes held if `objection` finds nothing against
+       it. At most ``limit`` IMUs are ours.
+    3. With the limit reached, a bad IMU `WORSE` times as bad as a held one takes its
+       place: the held one goes back first, the bad one out once that is confirmed.
+    4. Orders are sent until the autopilot reports what is wanted. An order to take an
+       IMU out is sent only while rule 2 holds, so also each repetition needs a sound
+       other IMU whose "in use" was reported within `FRESH`.
+    5. If the autopilot reports no IMU in use, all of ours go back.
+
+An IMU that somebody else has set is left alone until the vehicle is disarmed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import NamedTuple
+
+from fdi_ros.mavlink.protocol import MS, NS
+
+FRESH = 200 * MS  #: Largest age of the report on which an IMU counts as a reserve, ns.
+SETTLED = 2 * NS  #: A parameter message sent so long ago has arrived or is lost, ns.
+#: A report against our order is ignored for this time after the order, ns: ArduPilot
+#: answers a read up to 100 ms late, with the value of when it read it.
+STALE_ANSWER = NS // 2
+LASTING = NS  #: A change that we have not ordered counts if it stands so long, ns.
+PAUSE = 2 * NS  #: Time that an IMU must not be apart before it goes back, ns.
+LONGEST_PAUSE = 16 * NS  #: Bound of the doubled pause, ns.
+WORSE = 2.0  #: Ratio of sizes from which a bad IMU takes the place of a held one.
+RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an order, ns.
+QUICK_TRIES = 10
+SLOW_RETRY = NS  #: Time between further copies, ns.
+GROUNDED = 2 * NS  #: The flight is over after so long disarmed, ns.
+REACTION = NS  #: A bad IMU in use is announced after this time, ns.
+UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
+ACQUAINTED = 5 * NS  #: Agreement needed once before failover is ready, ns.
+REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
+#: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
+#: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
+LOST_LANE = 1.5
+LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
+NEVER = -(10**18)  #: A time before all others, ns.
+
+
+class Condition(Enum):
+    """State of an IMU, or of the vehicle, that the pilot hears of when it begins."""
+
+    FINE = "in use and not bad"
+    DANGER = "bad, in use, armed"
+    OUT = "out of use by our order, armed"
+    STAYS_OUT = "out of use by our order on the ground, because it is still named"
+    REBOOT = "was out of use when the autopilot started: no notch filters"
+    STUCK_OUT = "ordered back, but not reported in use"
+    LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
+    APART = "apart for long, while two others agree"
+    DISAGREE = "no two IMUs agree for long"
+    LANES = "two or more EKF lanes are not lost"
+    LAST_LANE = "one EKF lane, or none, is not lost"
+
+
+REPEATED = {Condition.DANGER, Condition.LAST_LANE}  #: Announced every `REPEAT`.
+
+
+class PolicySettings(NamedTuple):
+    """Settings of failover."""
+
+    limit: int = 1  #: Largest number of IMUs out of use by our orders.
+    min_size: float = 0.03  #: Smallest error that is acted on, rad/s.
+
+
+class Imu(NamedTuple):
+    """One IMU now; times in ns."""
+
+    use: bool | None = None  #: Last report of its INS_USE; None: no recent report.
+    heard: int = NEVER  #: Time of that report.
+    named: bool = False  #: The monitor holds this IMU to be faulty.
+    ok: bool = False  #: The monitor finds all its channels OK.
+    delivers: bool = False  #: Its samples arrive.
+    size: float = float("nan")
+    """Largest raw difference to the nearest other IMU of late, rad/s; NaN: unknown."""
+    agreed: int | None = None  #: Not apart since this time; None: apart or unknown.
+
+
+class View(NamedTuple):
+    """What is known now; times in ns."""
+
+    imus: tuple[Imu, ...]
+    linked: bool = False  #: An ArduPilot that sends SCALED_IMU is heard.
+    armed: bool = False
+    disarmed: int = 0  #: How long all heartbeats have reported "disarmed".
+    monitored: bool = False  #: The right monitor is alive, and nobody imitates it.
+    boots: int = 0  #: Number of starts of the autopilot seen.
+    restore: bool = False  #: The operator asks now to put all of ours back.
+
+
+class Memory(NamedTuple):
+    """What the policy remembers of one IMU; times in ns."""
+
+    ours: bool = False
+    held: bool = False
+    seen: bool | None = None  #: INS_USE as last reported; None: not since the boot.
+    out_sent: int = NEVER  #: When the last order "out of use" was sent.
+    back_sent: int = NEVER  #: When the last order "in use" was sent.
+    tries: int = 0  #: Copies sent of the present order.
+    taken: int = 0  #: How often it was taken out in this flight.
+    left_alone: bool = False
+    without_notch: bool = False  #: Ours, and out of use at the autopilot's last start.
+    acquainted: bool = False  #: It has agreed with another IMU for `ACQUAINTED` once.
+    bad_since: int | None = None
+    apart_since: int | None = None
+    against_since: int | None = None  #: Since when reports contradict `seen`, ns.
+    lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
+
+
+class Order(NamedTuple):
+    """One parameter to set now."""
+
+    imu: int  #: From 0.
+    use: bool
+
+
+class Announced(NamedTuple):
+    """The last announcement about one IMU or the vehicle."""
+
+    condition: Condition
+    at: int  #: Time, ns.
+
+
+VEHICLE = -1  #: Key of the vehicle's own announcement beside those of the IMUs.
+
+
+class PolicyState(NamedTuple):
+    """Memory between two ticks."""
+
+    memories: tuple[Memory, ...]
+    announced: Mapping[int, Announced] = {}
+    boots: int = 0
+    at: int = NEVER  #: Time of the last tick.
+    lanes_lost: bool = False  #: One EKF lane or none is left, for `LASTING`.
+    lanes_since: int | None = None  #: Since when this is otherwise, ns.
+
+    @classmethod
+    def begin(
+        cls, count: int, ours: Sequence[int] = (), rebooted: bool = False
+    ) -> PolicyState:
+        """Return the state at a start of the companion.
+
+        Parameters
+        ----------
+        count
+            Number of IMUs.
+        ours
+            IMUs, from 0, that the last run left out of use.
+        rebooted
+            The autopilot may have started since then.
+        """
+        left = Memory(ours=True, held=True, without_notch=rebooted)
+        return cls(tuple(left if k in ours else Memory() for k in range(count)))
+
+
+class Decision(NamedTuple):
+    """Result of one tick."""
+
+    orders: tuple[Order, ...]
+    words: tuple[tuple[int, Condition], ...]  #: IMU, or `VEHICLE`, and its condition.
+    state: PolicyState
+    hurry: bool  #: All INS_USE should be read at once: an order may depend on them.
+
+
+def is_apart(imu: Imu, settings: PolicySettings) -> bool:
+    """Return whether the raw rate of an IMU differs from that of every other one."""
+    return imu.size >= settings.min_size
+
+
+def is_bad(imu: Imu, settings: PolicySettings) -> bool:
+    """Return whether an IMU is to be out of use. Unknown size: it is not."""
+    return imu.delivers and imu.named and is_apart(imu, settings)
+
+
+def is_sound(imu: Imu, settings: PolicySettings) -> bool:
+    """Return whether the autopilot can fly with an IMU alone."""
+    return imu.delivers and (imu.ok or imu.size < settings.min_size)
+
+
+def objection(
+    k: int,
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> str:
+    """Return what forbids an order to take IMU k out of use now; empty: nothing."""
+    others = [j for j in range(len(memories)) if j != k]
+    reserve = any(
+        view.imus[j].use
+        and now - view.imus[j].heard <= FRESH
+        and not memories[j].ours
+        and is_sound(view.imus[j], settings)
+        for j in others
+    )
+    checks = (
+        (view.linked, "no ArduPilot that sends each IMU"),
+        (view.armed, "not armed"),
+        (view.monitored, "the monitor is in doubt"),
+        (is_bad(view.imus[k], settings), "not bad"),
+        (view.imus[k].use, "not reported in use"),
+        (not memories[k].left_alone, "set by others"),
+        (sum(memories[j].ours for j in others) < settings.limit, "limit"),
+        (reserve, "no other IMU is sound and freshly reported in use"),
+    )
+    return next((words for holds, words in checks if not holds), "")
+
+
+def decide(
+    state: PolicyState, view: View, now: int, settings: PolicySettings
+) -> Decision:
+    """Return orders, conditions to announce and the next state at time now, ns."""
+    rebooted = view.boots != state.boots
+    memories = [
+        _remember(memory, imu, view, now, rebooted, settings)
+        for memory, imu in zip(state.memories, view.imus, strict=True)
+    ]
+    _note_lanes(memories, view, now - state.at, settings)
+    _release(memories, view, now)
+    _hold_worst(memories, view, now, settings)
+    orders = []
+    for k, memory in enumerate(memories):
+        if _is_due(k, memories, view, now, settings):
+            orders.append(Order(k, not memory.held))
+            sent = {"out_sent": now} if memory.held else {"back_sent": now}
+            memories[k] = memory._replace(ours=True, tries=memory.tries + 1, **sent)
+    next_state = PolicyState(
+        tuple(memories),
+        state.announced,
+        view.boots,
+        now,
+        *_lanes(state, memories, view, now),
+    )
+    announced = dict(state.announced)
+    words = []
+    for key, condition in _conditions(next_state, view, now):
+        last = announced.get(key)
+        is_new = condition != (
+            last.condition if last else _USUAL.get(key, Condition.FINE)
+        )
+        is_late = last and condition in REPEATED and now - last.at >= REPEAT
+        if is_new or is_late:
+            announced[key] = Announced(condition, now)
+            words.append((key, condition))
+    doubtful = any(
+        imu.named or (is_apart(imu, settings) and not imu.ok) for imu in view.imus
+    )
+    unsettled = any(
+        memory.against_since or (memory.ours and memory.seen == memory.held)
+        for memory in memories
+    )
+    return Decision(
+        orders=tuple(orders),
+        words=tuple(words),
+        state=next_state._replace(announced=announced),
+        hurry=(view.armed and doubtful) or unsettled,
+    )
+
+
+def _remember(
+    memory: Memory,
+    imu: Imu,
+    view: View,
+    now: int,
+    rebooted: bool,
+    settings: PolicySettings,
+) -> Memory:
+    """Update a memory from the present view, before any decision."""
+    if rebooted:
+        # Parameters outlive a boot. The next report shows how it began.
+        memory = memory._replace(
+            seen=None, against_since=None, lane_angle=0.0, without_notch=memory.ours
+        )
+    if view.restore and memory.ours:
+        memory = memory._replace(left_alone=True)
+    if view.disarmed >= GROUNDED:
+        memory = memory._replace(left_alone=False, taken=0, lane_angle=0.0)
+    if imu.use is not None:
+        memory = _hear(memory, imu.use, imu.heard)
+    agreed = imu.agreed is not None and now - imu.agreed >= ACQUAINTED
+    bad_since = (memory.bad_since or now) if is_bad(imu, settings) else None
+    apart_since = (memory.apart_since or now) if is_apart(imu, settings) else None
+    return memory._replace(
+        acquainted=memory.acquainted or agreed,
+        bad_since=bad_since,
+        apart_since=apart_since,
+    )
+
+
+def _hear(memory: Memory, use: bool, heard: int) -> Memory:
+    """Compare a report of INS_USE, received at heard, ns, with our orders."""
+    ordered_at = max(memory.out_sent, memory.back_sent)
+    ordered = None if ordered_at == NEVER else memory.back_sent > memory.out_sent
+    is_first = memory.seen is None and ordered is None
+    if use not in (memory.seen, ordered) and not is_first:
+        since = heard if memory.against_since is None else memory.against_since
+        if heard - ordered_at < STALE_ANSWER:
+            return memory
+        if heard - since < LASTING:
+            return memory._replace(against_since=since)
+    memory = memory._replace(against_since=None)
+    changed = memory.seen is not None and use != memory.seen
+    out_settled = heard - memory.out_sent >= SETTLED
+    if not memory.ours:
+        by_others = changed
+    elif memory.held:
+        # Out before and now in use: not by us. Never reported out: our order was lost,
+        # or, if this run sent none, somebody has put the IMU back.
+        by_others = use and (changed or memory.out_sent == NEVER)
+    else:
+        # Out again, long after our last order to take it out.
+        by_others = not use and changed and out_settled
+    is_over = use and (not memory.held or memory.out_sent != NEVER) and out_settled
+    if use and memory.seen is None and not memory.tries:
+        # The first report since the boot: the IMU was in use from the start.
+        memory = memory._replace(without_notch=False)
+    if by_others or (memory.ours and is_over):
+        left_alone = memory.left_alone or by_others
+        memory = memory._replace(ours=False, held=False, tries=0, left_alone=left_alone)
+    return memory._replace(seen=use)
+
+
+def _note_lanes(
+    memories: list[Memory], view: View, elapsed: int, settings: PolicySettings
+) -> None:
+    """Follow how far each EKF lane was misled in the time elapsed, ns.
+
+    Lane k follows IMU k, or the first IMU in use while IMU k is out.
+    """
+    first = next((k for k, imu in enumerate(view.imus) if imu.use), 0)
+    seconds = min(max(elapsed, 0), NS) / NS
+    for k, memory in enumerate(memories):
+        source = view.imus[k if view.imus[k].use else first]
+        angle = memory.lane_angle
+        if view.armed and source.delivers and is_apart(source, settings):
+            angle += source.size * seconds
+        elif angle < LOST_LANE:
+            angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
+        memories[k] = memory._replace(lane_angle=angle)
+
+
+def _release(memories: list[Memory], view: View, now: int) -> None:
+    """Rules 1 and 5: let go of IMUs that should be back in use."""
+    none_left = all(
+        memory.ours or imu.use is False
+        for memory, imu in zip(memories, view.imus, strict=True)
+    )
+    for k, memory in enumerate(memories):
+        imu = view.imus[k]
+        pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
+        agrees = imu.agreed is not None and now - imu.agreed >= pause
+        may = view.monitored if view.armed else not imu.named
+        if memory.held and (
+            view.restore
+            or none_left
+            or (agrees and may and imu.delivers and not memory.without_notch)
+        ):
+            memories[k] = memory._replace(held=False, tries=0)
+
+
+def _hold_worst(
+    memories: list[Memory], view: View, now: int, settings: PolicySettings
+) -> None:
+    """Rules 2 and 3: hold the worst bad IMU, or make room for it."""
+    bad = [
+        k
+        for k, imu in enumerate(view.imus)
+        if is_bad(imu, settings) and imu.use and not memories[k].held
+    ]
+    if not bad:
+        return
+    worst = max(bad, key=lambda k: view.imus[k].size)
+    why_not = objection(worst, memories, view, now, settings)
+    if not why_not:
+        memory = memories[worst]
+        memories[worst] = memory._replace(
+            held=True, tries=0, taken=memory.taken + (not memory.ours)
+        )
+    if why_not != "limit":
+        return
+    held = [k for k, memory in enumerate(memories) if memory.held]
+    least = min(held, key=lambda k: view.imus[k].size, default=worst)
+    if view.imus[worst].size >= WORSE * view.imus[least].size:
+        memories[least] = memories[least]._replace(held=False, tries=0)
+
+
+def _is_due(
+    k: int,
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> bool:
+    """Rule 4: return whether an order for IMU k is to be sent now."""
+    memory, imu = memories[k], view.imus[k]
+    last = memory.out_sent if memory.held else memory.back_sent
+    pause = RETRY if memory.tries < QUICK_TRIES else SLOW_RETRY
+    if not view.linked or (memory.tries and now - last < pause):
+        return False
+    if memory.held:
+        # Once it was reported out, another report is a late answer or another station.
+        is_open = memory.seen is not False
+        return is_open and not objection(k, memories, view, now, settings)
+    unanswered = not imu.use or imu.heard <= memory.back_sent
+    return memory.ours and unanswered
+
+
+def _lanes(
+    state: PolicyState, memories: Sequence[Memory], view: View, now: int
+) -> tuple[bool, int | None]:
+    """Return whether at most one EKF lane is left, and since when that is otherwise."""
+    pairs = list(zip(memories, view.imus, strict=True))
+    usable = sum(memory.ours or imu.use is True for memory, imu in pairs)
+    good = sum(
+        imu.use is True and memory.lane_angle < LOST_LANE for memory, imu in pairs
+    )
+    is_known = view.armed and all(imu.use is not None for imu in view.imus)
+    lost = good <= 1 < usable if is_known else state.lanes_lost
+    if lost == state.lanes_lost:
+        return lost, None
+    since = now if state.lanes_since is None else state.lanes_since
+    return (lost, None) if now - since >= LASTING else (not lost, since)
+
+
+_USUAL = {VEHICLE: Condition.LANES}  #: Needs no announcement at the start.
+
+
+def _conditions(
+    state: PolicyState, view: View, now: int
+) -> list[tuple[int, Condition]]:
+    """Return the condition of each IMU and of the vehicle."""
+    longest = [
+        memory.apart_since is not None and now - memory.apart_since >= UNNAMED
+        for memory in state.memories
+    ]
+    disagree = all(longest)
+    found = [
+        (k, _condition(memory, view.imus[k], view, now, longest[k] and not disagree))
+        for k, memory in enumerate(state.memories)
+    ]
+    lanes = Condition.LAST_LANE if state.lanes_lost else Condition.LANES
+    found.append((VEHICLE, Condition.DISAGREE if disagree else lanes))
+    return found
+
+
+def _condition(
+    memory: Memory, imu: Imu, view: View, now: int, apart: bool
+) -> Condition:
+    """Return the condition of one IMU: the first that applies."""
+    since = (now if memory.bad_since is None else memory.bad_since) + REACTION
+    is_out = memory.ours and memory.seen is False
+    in_use = memory.seen is not False
+    asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
+    checks = (
+        (view.armed and in_use and now >= since, Condition.DANGER),
+        (asked_back, Condition.STUCK_OUT),
+        (memory.without_notch, Condition.REBOOT),
+        (is_out and not view.armed and imu.named, Condition.STAYS_OUT),
+        (is_out, Condition.OUT),
+        (memory.left_alone, Condition.LEFT_ALONE),
+        (apart, Condition.APART),
+    )
+    return next((condition for holds, condition in checks if holds), Condition.FINE)

@@ -1,0 +1,64 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Texts of failover for the pilot: one sentence for each condition of an IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fdi_ros.mavlink.failover_policy import Condition
+from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
+
+
+class Words(NamedTuple):
+    """One sentence."""
+
+    severity: int  #: MAV_SEVERITY.
+    text: str  #: What follows "FDI: ", or for an IMU "FDI: IMU 1 ".
+
+
+WORDS = {
+    Condition.FINE: Words(INFO, "in use, no fault"),
+    Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
+    Condition.OUT: Words(CRITICAL, "out of use"),
+    Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
+    Condition.REBOOT: Words(CRITICAL, "no notch filter: reboot before flight"),
+    Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
+    Condition.LEFT_ALONE: Words(WARNING, "set by others, left alone"),
+    Condition.APART: Words(WARNING, "differs from the others"),
+    Condition.DISAGREE: Words(WARNING, "no two IMUs agree"),
+    Condition.LANES: Words(INFO, "two EKF lanes or more again"),
+    Condition.LAST_LANE: Words(CRITICAL, "one EKF lane left: land"),
+}
+
+
+def imu_name(imu: int, channels: Sequence[str]) -> str:
+    """Return the autopilot's name of an IMU, from 0, and its topic's: IMU 1 (imu_0)."""
+    name = channels[3 * imu].rpartition(".")[0]
+    return f"IMU {imu + 1} ({name})" if name else f"IMU {imu + 1}"
+
+
+def imu_text(
+    imu: int,
+    condition: Condition,
+    channels: Sequence[str],
+    error: tuple[str, float] | None = None,
+) -> str:
+    """Return the sentence for an IMU, from 0.
+
+    Parameters
+    ----------
+    channels
+        Channel names, three for each IMU.
+    error
+        Axis and size, rad/s, in REP-103 axes. The text has ArduPilot's: y to the right,
+        z down.
+    """
+    words = WORDS[condition].text
+    if error is not None:
+        axis, size = error
+        words += f" (gyro {axis} {size if axis == 'x' else -size:+.2f} rad/s)"
+    text = f"FDI: {imu_name(imu, channels)} {words}"
+    return (text if len(text) <= LENGTH else f"FDI: IMU {imu + 1} {words}")[:LENGTH]
