@@ -42,6 +42,7 @@ LATE = 1.0  #: Age of the newest judged sample from which the monitor is late, s
 LOSSY = 0.1  #: Largest share of lost messages at which failover is ready.
 SLOW = 300 * MS  #: Longest round trip at which failover is ready, ns.
 MONITOR_LATE = "the monitor is late"
+SIZING = 200 * MS  #: A text waits at most so long for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
 STEADY = 3 * NS  #: Readiness must have changed for this time to be announced, ns.
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns.
@@ -97,6 +98,7 @@ class Failover:
         self._booted: int | None = None  # when the autopilot started, ns
         self._read_at = -NS
         self._hurry = False
+        self._unsized: dict[int, int] = {}  # IMUs out of use, not announced yet: since
         self._counted = (0, 0, 0)  # time, ns; messages lost and received until then
         self._lost = math.nan  # share of messages lost of late
         self._ready: tuple[str, int] = ("", 0)  # the present reason, and since when
@@ -139,7 +141,12 @@ class Failover:
         for imu, use in decision.orders:
             self._vehicle.set_parameter(PARAMETERS[imu], float(use))
         for imu, condition in decision.words:
-            self._announce(imu, condition, now)
+            if condition == Condition.OUT:
+                self._unsized[imu] = now
+            else:
+                self._unsized.pop(imu, None)
+                self._announce(imu, condition)
+        self._announce_out(now)
         self._announce_readiness(view, now)
         booted = self._seconds() - (now - (self._booted or now)) / NS
         if error := self._file.keep(Saved(self._system, self.out, booted), now):
@@ -234,15 +241,23 @@ class Failover:
             restore=restore,
         )
 
-    def _announce(self, imu: int, condition: Condition, now: int) -> None:
+    def _announce(
+        self, imu: int, condition: Condition, error: tuple[str, float] | None = None
+    ) -> None:
         severity, words = WORDS[condition]
         if imu == VEHICLE:
             text = f"FDI: {words}"
         else:
-            shows = condition == Condition.OUT
-            error = self.evidence.error(imu, now) if shows else None
             text = imu_text(imu, condition, self._channels, error)
         self._say(severity, text)
+
+    def _announce_out(self, now: int) -> None:
+        """Announce IMUs that went out of use, once their errors are known or `SIZING` is over."""
+        for imu, since in list(self._unsized.items()):
+            error = self.evidence.error(imu, now)
+            if error is not None or now - since >= SIZING:
+                del self._unsized[imu]
+                self._announce(imu, Condition.OUT, error)
 
     def _say(self, severity: int, text: str) -> None:
         self._vehicle.send_text(severity, text)

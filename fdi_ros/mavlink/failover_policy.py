@@ -27,7 +27,8 @@ Rules, in this order at each tick
     2. In flight, the worst bad IMU becomes held if `objection` finds nothing against
        it. At most ``limit`` IMUs are ours.
     3. With the limit reached, a bad IMU `WORSE` times as bad as a held one takes its
-       place: the held one goes back first, the bad one out once that is confirmed.
+       place, if nothing but the limit is against it: the held one goes back first, the
+       bad one out once that is confirmed. A held IMU without samples is the least bad.
     4. Orders are sent until the autopilot reports what is wanted. An order to take an
        IMU out is sent only while rule 2 holds, so also each repetition needs a sound
        other IMU whose "in use" was reported within `FRESH`.
@@ -38,6 +39,7 @@ An IMU that somebody else has set is left alone until the vehicle is disarmed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
@@ -180,7 +182,9 @@ class PolicyState(NamedTuple):
         rebooted
             The autopilot may have started since then.
         """
-        left = Memory(ours=True, held=True, without_notch=rebooted)
+        # Reported out, as far as known: an order may still be under way.
+        seen = None if rebooted else False
+        left = Memory(ours=True, held=True, seen=seen, without_notch=rebooted)
         return cls(tuple(left if k in ours else Memory() for k in range(count)))
 
 
@@ -407,12 +411,24 @@ def _hold_worst(
         memories[worst] = memory._replace(
             held=True, tries=0, taken=memory.taken + (not memory.ours)
         )
-    if why_not != "limit":
+    unlimited = settings._replace(limit=len(memories))
+    if why_not != "limit" or objection(worst, memories, view, now, unlimited):
         return
     held = [k for k, memory in enumerate(memories) if memory.held]
-    least = min(held, key=lambda k: view.imus[k].size, default=worst)
-    if view.imus[worst].size >= WORSE * view.imus[least].size:
+    sizes = {k: _held_size(view.imus[k]) for k in held}
+    least = min(held, key=sizes.__getitem__, default=worst)
+    if view.imus[worst].size >= WORSE * sizes.get(least, math.inf):
         memories[least] = memories[least]._replace(held=False, tries=0)
+
+
+def _held_size(imu: Imu) -> float:
+    """Return how bad an IMU is that is out of use, rad/s; unknown: infinite.
+
+    One without samples has size 0: the autopilot does not use it whatever INS_USE is.
+    """
+    if not imu.delivers:
+        return 0.0
+    return math.inf if math.isnan(imu.size) else imu.size
 
 
 def _is_due(

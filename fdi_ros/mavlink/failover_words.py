@@ -24,7 +24,7 @@ WORDS = {
     Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
     Condition.OUT: Words(CRITICAL, "out of use"),
     Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
-    Condition.REBOOT: Words(CRITICAL, "no notch filter: reboot before flight"),
+    Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
     Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
     Condition.LEFT_ALONE: Words(WARNING, "set by others, left alone"),
     Condition.APART: Words(WARNING, "differs from the others"),
@@ -56,7 +56,8 @@ def imu_text(
         Axis and size, rad/s, in REP-103 axes. The text has ArduPilot's: y to the right,
         z down.
     """
-    words = WORDS[condition].text
+    # ArduPilot's parameters are INS_USE, INS_USE2, INS_USE3.
+    words = WORDS[condition].text.format(imu + 1 if imu else "")
     if error is not None:
         axis, size = error
         words += f" (gyro {axis} {size if axis == 'x' else -size:+.2f} rad/s)"

@@ -5,6 +5,7 @@
 
 import json
 import threading
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -98,6 +99,16 @@ class Monitored(Conversation):
         return [bool(parameters[name]) for name in PARAMETERS]
 
 
+def kept(folder: Path, expected: tuple[int, list[int]] = (1, [1])) -> tuple:
+    """System and IMUs in the file, which a thread writes beside the link."""
+    end = time.monotonic() + 5.0
+    found: tuple = ()
+    while found != expected and time.monotonic() < end:
+        content = json.loads((folder / "out.json").read_text())
+        found = content["system_id"], content["out_of_use"]
+    return found
+
+
 @pytest.fixture
 def flying(tmp_path: Path) -> Monitored:
     autopilot = Autopilot("ardupilot", late_reads=80 * MS)
@@ -118,15 +129,14 @@ def test_a_bad_imu_is_out_soon_and_back_two_seconds_after_it_agrees(
     assert {order[1:] for order in autopilot.sets} == {("INS_USE", 0.0)}
     assert autopilot.flies_with == 1
     assert flying.texts[-1].startswith("IMU 1 (imu_1) out of use (gyro y +0.3")
-    kept = json.loads((tmp_path / "out.json").read_text())
-    assert (kept["system_id"], kept["out_of_use"]) == (1, [1])
+    assert kept(tmp_path) == (1, [1])
     # The monitor still names it: in flight its raw values decide, as it costs an EKF lane.
     flying.fault(1, 0.0, seconds=1.5)
     assert flying.in_use == [False, True, True]
     flying.run(1.5)
     assert flying.in_use == [True, True, True]
     assert flying.run(4.0).texts[-1] == "IMU 1 (imu_1) in use, no fault"
-    assert json.loads((tmp_path / "out.json").read_text())["out_of_use"] == []
+    assert kept(tmp_path, (1, [])) == (1, [])
 
 
 def test_a_healthy_flight_has_no_order_and_no_critical_text(flying: Monitored) -> None:
@@ -255,10 +265,10 @@ def test_an_imu_that_somebody_else_has_set_is_left_alone(
     autopilot.parameters["INS_USE"] = 1.0
     count = len(autopilot.sets)
     flying.run(3.0)
-    assert "IMU 1 (imu_1) set by others, left alone" in flying.texts
-    assert autopilot.sets[count + 1 :] == []
+    assert autopilot.sets[count:] == []
     assert flying.in_use[0]
     assert flying.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
+    assert flying.heal(1, 2.0).texts[-1] == "IMU 1 (imu_1) set by others, left alone"
 
 
 def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -> None:
@@ -333,7 +343,7 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     autopilot.boot = again.now - 5 * NS
     again.run(15.0)
     assert not again.in_use[0], "no IMU without a notch filter by our hand"
-    assert "IMU 1 no notch filter: reboot before flight" in again.texts
+    assert "IMU 1 no notch: set INS_USE 1 and reboot" in again.texts
     assert "reboot before flight" in again.failover.status(again.now)[1]
     autopilot.parameters["INS_USE"] = 1.0
     again.run(5.0)
@@ -420,8 +430,7 @@ def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> N
     first.loss, second.loss = 1.0, 0.0
     talk.run(15.0)
     assert talk.vehicle.system == 2
-    kept = json.loads((tmp_path / "out.json").read_text())
-    assert (kept["system_id"], kept["out_of_use"]) == (1, [1])
+    assert kept(tmp_path) == (1, [1])
     assert not second.sets
     first.loss, second.loss = 0.0, 1.0
     talk.heal(1, 20.0)
@@ -499,3 +508,27 @@ def test_the_orders_of_failover_in_a_recording() -> None:
         " again at 124.0 s; IMU 2 (imu_2) out of use at 140.3 s"
     )
     assert failover_text(begin, CHANNELS[:4]) == ""
+
+
+def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:
+    """Of two IMUs both are bad: the one that is out stays out."""
+    autopilot = Autopilot("ardupilot", units=2)
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(3.0)
+    talk.fault(2, 0.1, seconds=2.0)
+    talk.fault(1, 1.0, seconds=3.0)
+    assert [value for _, _, value in autopilot.sets][-1] == 0.0
+    assert not autopilot.parameters["INS_USE2"]
+    assert autopilot.parameters["INS_USE"]
+    assert talk.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
+
+
+def test_an_imu_without_samples_gives_its_slot_away(flying: Monitored) -> None:
+    autopilot = flying.autopilots[0]
+    flying.fault(3, 0.2, seconds=2.0)
+    autopilot.units = 2
+    flying.states[6:] = [STALE] * 3
+    flying.run(1.5)
+    flying.fault(1, 0.6, seconds=2.0)
+    assert flying.in_use[:2] == [False, True]
