@@ -85,7 +85,7 @@ class Failover:
         self.reported = 0
         #: Nobody else publishes on the topics of the monitor and of this node.
         self.is_alone = False
-        #: Age of the newest sample judged when the monitor last reported, s; NaN: unknown.
+        #: Age of the newest judged sample when it was reported, s; NaN: unknown.
         self.age = math.nan
         self.evidence = Evidence(count, interval, settings.min_size)
         self._file = FailoverFile(path, count)
@@ -245,11 +245,8 @@ class Failover:
         self, imu: int, condition: Condition, error: tuple[str, float] | None = None
     ) -> None:
         severity, words = WORDS[condition]
-        if imu == VEHICLE:
-            text = f"FDI: {words}"
-        else:
-            text = imu_text(imu, condition, self._channels, error)
-        self._say(severity, text)
+        of_imu = imu_text(imu, condition, self._channels, error)
+        self._say(severity, f"FDI: {words}" if imu == VEHICLE else of_imu)
 
     def _announce_out(self, now: int) -> None:
         """Announce IMUs that went out of use, once their errors are known or `SIZING` is over."""

@@ -257,8 +257,12 @@ def decide(
     for k, memory in enumerate(memories):
         if _is_due(k, memories, view, now, settings):
             orders.append(Order(k, not memory.held))
-            sent = {"out_sent": now} if memory.held else {"back_sent": now}
-            memories[k] = memory._replace(ours=True, tries=memory.tries + 1, **sent)
+            memories[k] = memory._replace(
+                ours=True,
+                tries=memory.tries + 1,
+                out_sent=now if memory.held else memory.out_sent,
+                back_sent=memory.back_sent if memory.held else now,
+            )
     next_state = PolicyState(
         tuple(memories),
         state.announced,

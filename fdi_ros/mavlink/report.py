@@ -196,6 +196,7 @@ _STATES = {
     "STALE": (WARNING, "no data"),
     FROZEN: (WARNING, "frozen"),
 }  # by the state of a channel that is announced
+_QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
 NOTHING_SEEN = "no further fault would be seen"
 
@@ -215,9 +216,18 @@ def _format_whole(line: StatusLine) -> str:
 
 
 class Announcer:
-    """Decides which texts are sent, and when, about channels in units of three; others are not listened to."""
+    """Decides which texts are sent, and when, about channels in units of three.
 
-    def __init__(self, channels: Sequence[str]) -> None:
+    Parameters
+    ----------
+    channels
+        Names of the channels; reports on others are ignored.
+    brief
+        Failover sends texts of its own: sets and good news stay in the diagnostics.
+    """
+
+    def __init__(self, channels: Sequence[str], brief: bool = False) -> None:
+        self._brief = brief
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
         self._now: dict[str, tuple[str, str]] = {
             **dict.fromkeys(channels, ("OK", "")),
@@ -264,7 +274,12 @@ class Announcer:
         if self._changed is not None and now - self._changed < SETTLE:
             return []
         self._changed = None
-        pending = [(self._text(names), names) for names in self._alike()]
+        alike = self._alike()
+        if self._brief:
+            quiet = [names for names in alike if self._now[names[0]][0] in _QUIET]
+            self._said |= {name: self._now[name] for names in quiet for name in names}
+            alike = [names for names in alike if names not in quiet]
+        pending = [(self._text(names), names) for names in alike]
         # The gravest first.
         told = sorted(pending, key=lambda one: one[0][0])[: int(self._tokens)]
         self._tokens -= len(told)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 Values = tuple[tuple[str, str], ...]
 
 PREFIX = "fdi_node: "  # what names begin with where no node gives its full name, without the first slash, and a colon
-NEWEST_SAMPLE = "newest sample (stamp, s)"  #: Key of the newest judged sample's stamp.
 WHOLE = "monitor"  # name of the line about all, after the prefix
 INPUT = "input "  # what the name of the line about an input topic begins with, after the prefix
 FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
@@ -338,7 +337,6 @@ def _whole_values(status: Status) -> Values:
         ("statistic", _figure(status.statistic)),
         ("threshold", _figure(status.threshold)),
         ("samples", str(status.samples)),
-        (NEWEST_SAMPLE, f"{status.stamp / 1e9:.3f}"),
         ("fused rate", "yes" if status.has_rate else "no"),
         ("faults seen on", ", ".join(status.can_detect) or "none"),
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),

@@ -38,7 +38,6 @@ from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
     INPUT,
-    NEWEST_SAMPLE,
     WHOLE,
     Level,
     StatusLine,
@@ -95,7 +94,8 @@ class AutopilotNode(CheckedNode):
         channels = config.channel_names or [
             f"{name}.{axis}" for name in names for axis in "xyz"
         ]
-        self._announcer = Announcer(channels) if params["statustext"] else None
+        brief = params["failover"] != "off"
+        self._announcer = Announcer(channels, brief) if params["statustext"] else None
         self._sends_values: bool = params["named_values"]
         # In full, as it stands in diagnostics: without the first slash.
         self._monitor = expand_topic_name(
@@ -287,8 +287,6 @@ class AutopilotNode(CheckedNode):
                 and topics == self._topics
             )
             failover.reported = now if agrees else 0
-            stamp = whole.number(NEWEST_SAMPLE) if whole is not None else math.nan
-            failover.age = time.time() - stamp
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
@@ -300,6 +298,8 @@ class AutopilotNode(CheckedNode):
             self.count_publishers(topic) == 1 for topic in self._sole
         )
         self._failover.evidence.hear(values[2 : 2 + count], now)
+        # The last two values are the stamp of the sample: whole seconds, nanoseconds.
+        self._failover.age = time.time() - (values[-2] + values[-1] / 1e9)
         self._failover.turn(now)
 
     def _on_restore(

@@ -91,7 +91,7 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(
         assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
         assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
         strike()
-        told = (2, "FDI: imu_2.y faulty, left out")
+        told = (2, "FDI: imu_2.y faulty")
         assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
         assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
         assert autopilot.values["fdi_limit"] > 0
@@ -149,7 +149,10 @@ def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(
 ) -> None:
     autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
-    file.write_text('{"system_id": 1, "out_of_use": [2]}')
+    booted = time.time() + autopilot.boot / NS
+    file.write_text(
+        f'{{"system_id": 1, "out_of_use": [2], "autopilot_booted": {booted}}}'
+    )
     with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (
         ears,
         _,
