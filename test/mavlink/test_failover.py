@@ -268,7 +268,7 @@ def test_an_imu_that_somebody_else_has_set_is_left_alone(
     assert autopilot.sets[count:] == []
     assert flying.in_use[0]
     assert flying.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
-    assert flying.heal(1, 2.0).texts[-1] == "IMU 1 (imu_1) set by others, left alone"
+    assert "IMU 1 (imu_1) set by others, left alone" in flying.heal(1, 2.0).texts
 
 
 def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -> None:
@@ -521,7 +521,7 @@ def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:
     assert [value for _, _, value in autopilot.sets][-1] == 0.0
     assert not autopilot.parameters["INS_USE2"]
     assert autopilot.parameters["INS_USE"]
-    assert talk.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
+    assert "IMU 1 (imu_1) faulty AND IN USE: land" in talk.texts
 
 
 def test_an_imu_without_samples_gives_its_slot_away(flying: Monitored) -> None:
