@@ -3,31 +3,40 @@
 
 """Time alignment: messages of 1 to 4 sensor units to samples, by their stamps.
 
-Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives
-the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
-one: `enter`, then `next_sample` until there is none.
+Decisions come from stamps in arrival order alone: no clock and no timer, so that a
+recording played through it gives the samples that the live node formed. One message is
+entered, then the samples that it completes are taken out one by one: `enter`, then
+`next_sample` until there is none.
 
-Where a sample is formed: at the stamp of a message, if there is none between it and the message before of the same
-unit. So samples come at the rate of the fastest unit, whatever the phases. What the other units give at that stamp:
+Where a sample is formed: at the stamp of a message, if there is none between it and the
+message before of the same unit. So samples come at the rate of the fastest unit,
+whatever the phases. What the other units give at that stamp:
 
-- a message within ``max_skew`` (and nearer than half the message interval) counts as of that instant, as it is, once;
-- else the line between the messages before and after, if they are near enough (`MAX_BRIDGE`, `MAX_STEPS`);
+- a message within ``max_skew`` (and nearer than half the message interval) counts as of
+  that instant, as it is, once;
+- else the line between the messages before and after, if they are near enough
+  (`MAX_BRIDGE`, `MAX_STEPS`);
 - else nothing: NaN, not received.
 
-A sample is formed as soon as every live unit has delivered for its stamp, or beyond. The wait is at most the message
-interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of the others, once; and never longer than
-`MAX_PENDING` messages.
+A sample is formed as soon as every live unit has delivered for its stamp, or beyond.
+The wait is at most the message interval of the slowest unit; if one falls silent,
+``timeout`` by the stamps of the others, once; and never longer than `MAX_PENDING`
+messages.
 
-Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` behind the common time,
-the newest stamp that two units have reached, and not ahead of all other units by more. So of three units or more, one
-whose clock is fast, slow, jumps or is random leaves the base alone; of two, the newest counts, but where one falls
-behind by ``timeout`` without a jump the other may be fast. Until it comes back, or a third delivers, neither is
-believed: samples are formed, without values (`are_parted`). Only units that deliver count: one does until another has
-gone on for ``timeout`` since its last message. When all leave the base together (a clock set back, a pause of the whole
-system) it has moved. That is accepted once every live unit stands within ``timeout`` of the others there, or one has
-gone on there for ``timeout`` while no other delivered. After a step back, ``shift`` is added to the stamps of samples.
+Which stamps are accepted: a stamp belongs to the common time base if it is at most
+``timeout`` behind the common time, the newest stamp that two units have reached, and
+not ahead of all other units by more. So of three units or more, one whose clock is
+fast, slow, jumps or is random leaves the base alone; of two, the newest counts, but
+where one falls behind by ``timeout`` without a jump the other may be fast. Until it
+comes back, or a third delivers, neither is believed: samples are formed, without values
+(`are_parted`). Only units that deliver count: one does until another has gone on for
+``timeout`` since its last message. When all leave the base together (a clock set back,
+a pause of the whole system) it has moved. That is accepted once every live unit stands
+within ``timeout`` of the others there, or one has gone on there for ``timeout`` while
+no other delivered. After a step back, ``shift`` is added to the stamps of samples.
 
-Delays that are set are taken off before all of this; estimated ones after it (`fdi_ros.core.restamping`).
+Delays that are set are taken off before all of this; estimated ones after it
+(`fdi_ros.core.restamping`).
 """
 
 from __future__ import annotations
@@ -44,7 +53,9 @@ from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, U
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
-MAX_BRIDGE = 0.25  # longest span that is interpolated, over the timeout: a unit that lost four messages is hardly there
+# longest span that is interpolated, over the timeout: a unit that lost four messages is
+# hardly there
+MAX_BRIDGE = 0.25
 MAX_STEPS = (
     2.5  # and in usual message intervals: one lost message is bridged, two are not
 )
@@ -56,7 +67,8 @@ _NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
 _IDLE, _FORMING, _RESTARTING = range(3)
 
 
-# Messages in --------------------------------------------------------------------------------------------------------
+# Messages in
+# --------------------------------------------------------------------------------------------------------
 
 
 @compiled
@@ -211,10 +223,10 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
             new = new and aligner.units[i].end == 0
         elif is_live(aligner, i):
             here += 1
-    # The first stamp of all makes a base: most of the units may have another one from the beginning.
-    return (
-        here < there and new if here else there > 1 or stamp - unit.off_first >= timeout
-    )
+    if here:
+        # The first stamp of all makes a base: most units may have another one from the start.
+        return here < there and new
+    return there > 1 or stamp - unit.off_first >= timeout
 
 
 @compiled
@@ -262,7 +274,8 @@ def _restart(aligner: Aligner) -> None:
         unit.off = False
 
 
-# Samples out --------------------------------------------------------------------------------------------------------
+# Samples out
+# --------------------------------------------------------------------------------------------------------
 
 
 @compiled
@@ -377,7 +390,8 @@ def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
     return -1
 
 
-# Many messages ------------------------------------------------------------------------------------------------------
+# Many messages
+# ------------------------------------------------------------------------------------------------------
 
 
 @compiled
@@ -391,8 +405,9 @@ def align_messages(
 ) -> tuple[int, int]:
     """Enter messages (M,) in order of arrival from number `start` on, as long as there is room for samples (S,).
 
-    Of each: unit, stamp, ns, rate (M, 3) rad/s; the `Aligner` is in rows (1,). Returned are the number of the next
-    message to be entered, and of samples formed. Fewer than S: all is done.
+    Of each: unit, stamp, ns, rate (M, 3) rad/s; the `Aligner` is in rows (1,). Returned
+    are the number of the next message to be entered, and of samples formed. Fewer than
+    S: all is done.
     """
     aligner, count = rows[0], 0
     while count < len(samples):
@@ -411,9 +426,9 @@ def align_messages(
 class Alignment:
     """Aligns the messages of a number of units.
 
-    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent for longer than this by the
-    stamps of the others is not waited for, ns. ``delays``: by how much the stamps of each unit are late, s, (units,);
-    empty: not at all.
+    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent
+    for longer than this by the stamps of the others is not waited for, ns. ``delays``:
+    by how much the stamps of each unit are late, s, (units,); empty: not at all.
     """
 
     def __init__(

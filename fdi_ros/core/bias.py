@@ -3,21 +3,24 @@
 
 """Bias of each channel: fixed, or averaged over a first time at rest.
 
-The average is robust. Values are taken eight at a time, without the largest and the smallest; the means of these groups
-are averaged over fifteen portions of the time; the bias is the mean of the portions without a fifth of them at either
-end. So neither single spikes nor a few disturbed portions reach it.
+The average is robust. Values are taken in groups of eight, without the largest and the
+smallest. The means of the groups are averaged over fifteen portions of the time. The
+bias is the mean of the portions without a fifth at either end. So neither single spikes
+nor a few disturbed portions reach it.
 
-Whether it was rest is tested for each channel by itself (mean and scatter), and for the channels together. A turn lies
-in the part of all channels that a body rate can explain; biases and noise, one channel as good as another, lie as much
-in each dimension of that part as in each of the others. So with C the mean square of the first part per dimension (3)
-and P that of the second (k - 3 of k channels):
+Whether it was rest is tested for each channel by itself (mean and scatter), and for the
+channels together. A turn lies in the part of all channels that a body rate can explain;
+biases and noise, one channel as good as another, lie as much in each dimension of that
+part as in each of the others. So with C the mean square of the first part per dimension
+(3) and P that of the second (k - 3 of k channels):
 
-- averages: C / s^2 is F-distributed with 3 and k degrees of freedom, s^2 = (3 USUAL^2 + (k - 3) P) / k, as the size of
-  the biases is not known but for a prior, scaled inverse chi-square about `USUAL` with 3 degrees of freedom (Gelman et
-  al., Bayesian Data Analysis, 3rd ed., 3.3);
-- deviations of the 15 portions from their mean: C / P is F-distributed with 42 and 14 (k - 3) degrees of freedom,
-  however coloured the noise, if it is not slower than the portions. No more than the noise of one sample is let pass:
-  vibration below it is not rotation.
+- averages: C / s^2 is F-distributed with 3 and k degrees of freedom. The size of the
+  biases is known by a prior alone, scaled inverse chi-square about `USUAL` with 3 degrees
+  of freedom (Gelman et al., Bayesian Data Analysis, 3rd ed., 3.3):
+  s^2 = (3 USUAL^2 + (k - 3) P) / k.
+- deviations of the 15 portions from their mean: C / P is F-distributed with 42 and
+  14 (k - 3) degrees of freedom in noise of any colour that is not slower than the
+  portions. Vibration below the noise of one sample is not rotation, and passes.
 """
 
 from __future__ import annotations
@@ -30,21 +33,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
+from fdi_ros.core.algebra import along, square
 from fdi_ros.core.parity import apply_gain, eliminate_rate
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, ValueGroup
 from fdi_ros.model.samples import MAX_RATE, Array
 
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
-"""Where the bias comes from; or why the last average was refused."""
-LEAST_ROWS = 10  # samples that an average takes at least: fewer may be a single group, and show no scatter
-LEAST_GIVEN = 4  # a channel gives one value in so many samples at least: a unit may be slower than the others
+"""Origin of the bias, or why the last average was refused."""
+# samples that an average takes at least: fewer may be a single group, and show no
+# scatter
+LEAST_ROWS = 10
+# a channel gives at least one value in this many samples: units may be slower than
+# others
+LEAST_GIVEN = 4
 GROUP = 8  # values taken together, of which the largest and the smallest are left out
-MIDDLE_SQUARE = 0.3995  # mean square of the middle six of eight normal values about their mean, in variances of one
-EFFICIENCY = 0.82  # variance of the plain mean over that of this one, in white noise: 0.934 by groups, 0.88 by portions
+# mean square of the middle six of eight normal values about their mean, in variances of
+# one
+MIDDLE_SQUARE = 0.3995
+# variance of the plain mean over this mean in white noise: 0.934 by groups, 0.88 by
+# portions
+EFFICIENCY = 0.82
 USUAL = 0.005  # size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s
 PRIOR = 3  # degrees of freedom of that: it may be half to four times as much
-FALSE_TURN = 0.003  # probability that biases are taken for a turn: such a vehicle is refused until they are given
-FALSE_SWAY = 0.001  # that noise is taken for motion: less, since it costs another average each time
+# probability that biases are taken for a turn: such a vehicle is refused until they are
+# given
+FALSE_TURN = 0.003
+# that noise is taken for motion: less, since it costs another average each time
+FALSE_SWAY = 0.001
 
 
 def restart_bias(core: NDArray[Any]) -> None:
@@ -87,8 +102,8 @@ def update_bias(
 ) -> bool:
     """Take one sample into the average; return whether it was used: False if with it the bias is learned.
 
-    ``good``: bits of the channels that are finite and in range. ``lost``: of those declared faulty or taken out, which
-    are no evidence about rest, and keep their bias.
+    ``good``: bits of the channels that are finite and in range. ``lost``: of those
+    declared faulty or taken out, which are no evidence about rest, and keep their bias.
     """
     average, n, z = core.bias, core.settings.n, core.now.aligned
     if average.started and stamp >= average.start + average.duration:
@@ -123,7 +138,7 @@ def begin(average: Bias, n: int, stamp: int) -> None:
 
 @compiled
 def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None:
-    """Take a value of channel i; with the last of a group its middle goes to the portion."""
+    """Take a value of channel i. The last of a group adds the middle of the group to the portion."""
     if group.count == 0:
         group.total = group.squares = 0.0
         group.low = group.high = value
@@ -144,7 +159,7 @@ def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None
 
 @compiled
 def middle_mean(values: Array, count: int) -> float:
-    """Mean of the first values without a fifth of them at either end; they are sorted in place."""
+    """Mean of the first values without a fifth at either end. Sorts them in place."""
     for k in range(1, count):
         value, j = values[k], k
         while j > 0 and values[j - 1] > value:
@@ -220,7 +235,7 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
     average.started = False
     average.heard, average.restless = heard, heard & ~at_rest
     moved = moves_together(core, subsets[at_rest], at_rest, resting)
-    # One channel that does not look at rest is a bad channel; if more do, the vehicle moves.
+    # One restless channel is a bad channel. More of them are a moving vehicle.
     if restless <= 1 and resting >= 3 and average.rows >= LEAST_ROWS and not moved:
         for i in range(n):
             if at_rest >> i & 1:
@@ -269,16 +284,16 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
 @compiled
 def split(core: Core, mask: int) -> tuple[float, float, float]:
     """Length of the rate that explains ``bias.part``; sums of squares of what it explains, and of the rest."""
-    axes, part, rate = core.settings.sensors.axes, core.bias.part, core.now.others_rate
+    axes, part, rate = core.settings.sensors.axes, core.bias.part, core.bias.turn
     apply_gain(core.now.parity.gain, core.settings.n, part, rate)
     explained = other = 0.0
     for i in range(core.settings.n):
         if mask >> i & 1:
-            along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
-            explained += along * along
-            other += (part[i] - along) * (part[i] - along)
+            turn = along(axes[i], rate)
+            explained += turn * turn
+            other += (part[i] - turn) * (part[i] - turn)
     return (
-        math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]),
+        math.sqrt(square(rate)),
         explained,
         other,
     )

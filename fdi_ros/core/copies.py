@@ -3,9 +3,10 @@
 
 """Units that are one sensor.
 
-Two gyros differ by their noise. Where a linear map of three channels explains to rounding what three others change
-by, from sample to sample, these are a copy, perhaps turned, scaled or some samples later: a topic that was mapped
-twice. A copy agrees with its original whatever is wrong with it, so it is left out.
+Two gyros differ by their noise. Where a linear map of three channels explains to
+rounding what three others change by, from sample to sample, these are a copy, perhaps
+turned, scaled or some samples later: a topic that was mapped twice. A copy agrees with
+its original whatever is wrong with it, so it is left out.
 """
 
 from __future__ import annotations
@@ -21,24 +22,31 @@ from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
 #
-# Two gyros differ by their noise. Where a linear map of three channels explains to rounding what three others change
-# by, from sample to sample, these are a copy, perhaps turned, scaled or some samples later: a topic that was mapped
+# Two gyros differ by their noise. Where a linear map of three channels explains to
+# rounding what three others change
+# by, from sample to sample, these are a copy, perhaps turned, scaled or some samples
+# later: a topic that was mapped
 # twice. A copy agrees with its original whatever is wrong with it, so it is left out.
 
 
-PERIOD = 1_000_000_000  # from one comparison to the next, ns: a copy is found on the ground, and in no hurry
-ROWS = 24  # changes that are compared; quantised values of two gyros at rest may agree by chance in fewer
-FEW = ROWS // 3  # of these so many first: mostly they tell that there is no copy
-MAX_LAG = 20  # samples by which a copy may come later: a second topic of one driver is not held up for longer
+# from one comparison to the next, ns: a copy is found on the ground, and in no hurry
+PERIOD = 1_000_000_000
+ROWS = 24  # changes compared: fewer quantised values of two gyros at rest may agree by chance
+FEW = ROWS // 3  # compared first, as they usually exclude a copy
+# samples by which a copy may come later: a second topic of one driver is not held up
+# for longer
+MAX_LAG = 20
 HITS = 2  # comparisons that make a copy: one alone may be of values that hardly change
-LEAST_NOISE = 0.02  # of what the noise makes: smaller changes are smooth, and what explains them may be the motion
+# of what the noise makes: smaller changes are smooth, and what explains them may be the
+# motion
+LEAST_NOISE = 0.02
 
 
 @compiled
 def update_copies(
     copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int
 ) -> None:
-    """Compare all pairs of units, once in `PERIOD`; ``copies.found`` is set where one is a copy and was none before."""
+    """Compare all pairs of units, once in `PERIOD`; ``copies.found``: a new copy was found."""
     if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
         return
     copies.stamp = stamp
@@ -84,7 +92,7 @@ def is_copy(
 
 @compiled
 def first_of_three(members: int) -> int:
-    """Return the first of three successive channels; -1 if these are others."""
+    """Return the first of three successive channels; -1 if ``members`` are other channels."""
     for i in range(MAX_CHANNELS):
         if members == 7 << i:
             return i
@@ -97,9 +105,10 @@ def sum_changes(
 ) -> bool:
     """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
 
-    Of the newest samples, until so many as wanted have changed. ``source``, ``target``: first channel of the unit that
-    may be the original, and of the one that may be the copy, later by ``lag`` samples. Return whether there are so
-    many, in no more than twice so many samples.
+    The newest samples are summed until ``wanted`` changes are found; return whether
+    they are found within twice as many samples. ``source``, ``target``: first channel
+    of the unit that may be the original, and of the unit that may be the copy, later by
+    ``lag`` samples.
     """
     change, products, count = copies.change, copies.products, 0
     for i in range(6):
@@ -139,9 +148,9 @@ def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -
 def is_explained(
     copies: Copies, settings: PathSettings, target: int, count: int
 ) -> bool:
-    """Whether a linear map of the changes of one unit gives those of the other, ``count`` of them, and these are noise.
+    """Whether a linear map of the changes of one unit explains those of the other, and they are noise.
 
-    The products of both are reduced by those of the first, one channel after the other: what is left is unexplained.
+    Elimination of the channels of the first unit leaves the unexplained part of the second.
     """
     products, noise, size, trace = copies.products, 0.0, 0.0, 0.0
     for i in range(3):

@@ -3,8 +3,9 @@
 
 """From alarms to declarations, and back.
 
-All memory of declarations lives here, and is bounded: the last samples of one window, a few figures per channel. A
-fault after ten hours is declared as fast as one after a second.
+All memory of declarations lives here, and is bounded: the last samples of one window, a
+few figures per channel. A fault after ten hours is declared as fast as one after a
+second.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.records import Decision, Evidence, PathSettings
 from fdi_ros.model.samples import MAX_RATE
 
-RETURN_MEAN = 0.5  # noise_std that a channel's mean over the clean time is off by where it returns: else it is a fault
+# noise_std that a channel's mean over the clean time is off by where it returns: else
+# it is a fault
+RETURN_MEAN = 0.5
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
-"""Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
-these, those of an alarm that isolates; and channels whose fault would have shown."""
+"""Sets of channels kept for each sample: suspects of the alarm, suspects that count
+towards a declaration, suspects of an alarm that isolates, and channels whose fault
+would have shown."""
 UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED, INTERMITTENT = range(6)
 WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
 """Why a channel was declared: numbers, and the words for them in files."""
@@ -38,14 +42,15 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
         (doubtful, counted, counted if evidence.isolated else 0, evidence.checked),
     )
     decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
-    # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
+    # The first sample is one after an interruption: a set that was restored stands
+    # until it is clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
         decision.last_doubt = evidence.stamp
     faulty, undecided = confirm(decision, settings)
     broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
     faulty |= evidence.certain & ~decision.faulty
     if settings.by_evidence:
-        # A set follows the evidence, and ends with it; one by votes stays.
+        # A set by evidence ends with the evidence. A set by votes stays.
         decision.voted |= undecided
         if evidence.stamp - decision.last_doubt >= settings.clean_time:
             decision.voted = 0
@@ -115,7 +120,7 @@ def push(
 
 @compiled
 def at_least(decision: Decision, settings: PathSettings, kind: int, least: int) -> int:
-    """Bits of the channels that are in the sets of a kind of so many samples of the window at least."""
+    """Bits of the channels in the sets of a kind in at least ``least`` samples of the window."""
     mask = 0
     for i in range(settings.n):
         if decision.count[kind, i] >= least:
@@ -127,9 +132,11 @@ def at_least(decision: Decision, settings: PathSettings, kind: int, least: int) 
 def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
     """Channels that the alarms of the window declare faulty, and a set one of which is.
 
-    A channel is faulty when at least `alarms` of the last `window` samples suspected it and at least half that many
-    suspected nothing but faulty channels with it. When the alarms are as many but do not single it out, the channels
-    that at least half of them suspected are undecided together, and so they are when all the window disagrees about it.
+    A channel is faulty when at least `alarms` of the last `window` samples suspected it
+    and at least half that many suspected nothing but faulty channels with it. When the
+    alarms are as many but do not single it out, the channels that at least half of them
+    suspected are undecided together. The same holds when all alarms of the window
+    disagree.
     """
     half = (settings.alarms + 1) // 2
     enough = at_least(decision, settings, COUNTED, settings.alarms)
@@ -140,7 +147,8 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
         if not undecided:
             undecided = at_least(decision, settings, COUNTED, 1)
     if undecided & (undecided - 1) == 0:
-        # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
+        # Most alarms name this channel alone, though none calls it isolated: no other
+        # channel is confused with it.
         faulty |= undecided & enough
     return faulty, 0 if faulty else undecided
 
@@ -151,7 +159,7 @@ def follow_declared(
 ) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
     for i in range(settings.n):
-        # That of one that is not declared counts from its declaration, not from that of another.
+        # The clean time of a channel begins with its own declaration.
         is_declared = decision.faulty >> i & 1 and not settings.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
             decision.last_bad[i] = decision.renewed[i] = evidence.stamp
@@ -164,7 +172,7 @@ def follow_declared(
 
 @compiled
 def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> int:
-    """Bits of the declared channels that have agreed for the clean time, and in the mean of one or two of these."""
+    """Bits of the declared channels that have agreed for the clean time, and in the mean over one or two."""
     returns = 0
     for i in range(settings.n):
         if (
@@ -200,7 +208,7 @@ def forget_kind(decision: Decision, settings: PathSettings, kind: int) -> None:
 
 @compiled
 def forget_alarms(decision: Decision, settings: PathSettings) -> None:
-    """Forget the alarms of the window. What was checked stays known; it is the last kind."""
+    """Forget the alarms of the window, but not which channels were checked, the last kind."""
     decision.alarms = 0
     for kind in range(CHECKED):
         forget_kind(decision, settings, kind)

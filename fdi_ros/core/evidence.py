@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What one sample says to the decision: the verdict of the detector, stuck, drifted and broken channels."""
+"""Evidence of one sample for the decision: verdict of the detector, stuck, drifted and broken channels."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ from fdi_ros.core.records import Core, Current, PathSettings, SampleInput
 from fdi_ros.core.repeated import add_stuck, update_stuck
 from fdi_ros.core.sensors import variance_of
 
-SURE_DRIFT = 4.0  # standard deviations by which a bias is beyond its limit: by chance it is so once in 30 000
+# standard deviations by which a bias is beyond its limit: by chance it is so once in 30
+# 000
+SURE_DRIFT = 4.0
 
 
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
-    """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
+    """Fill in the evidence except the suspects of the verdict; return bits of stuck channels."""
     settings, health, now, evidence = (
         core.settings,
         core.health,
@@ -51,7 +53,8 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             clear |= 1 << i
         evidence.error[i] = now.corrected[i] - now.along[i]
         if may_return and now.plain >> i & 1:
-            # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+            # The prediction of n - 1 channels is at worst as uncertain as the channel
+            # itself on a sane mounting.
             variance = 2 * variance_of(
                 settings.sensors, i, now.along[i], core.acceleration.value
             )
@@ -81,7 +84,8 @@ def fill_suspects(core: Core, stuck: int) -> None:
         else:
             evidence.undecided = bits_of(verdict.suspects, n)
     for u in range(settings.units):
-        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        # All values of a unit are old: its driver or its bus repeats them, and no
+        # channel is worse than the others.
         if settings.members[u] & stuck & now.repeated:
             stuck |= settings.members[u]
     update_drifted(settings, core.sample, now)
@@ -97,7 +101,7 @@ def fill_suspects(core: Core, stuck: int) -> None:
 
 @compiled
 def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
-    """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
+    """Find channels whose bias surely exceeds ``max_drift``, and add them to the suspects of the verdict."""
     now.evidence.drifted, estimate = 0, sample.estimate
     if settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):

@@ -11,6 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
+from fdi_ros.core.algebra import along, dot
 from fdi_ros.core.parity import apply_gain, covariance_of, fill_parity
 from fdi_ros.core.records import (
     Acceleration,
@@ -29,7 +30,7 @@ from fdi_ros.core.subsets import fill_rate
 
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left."""
+    """Fuse the usable channels without the doubtful ones; with them, or not at all, if too few are left."""
     settings, last, now = core.settings, core.last, core.now
     n = settings.n
     now.fused = choose_fused(settings, core.health, now, subsets, doubtful)
@@ -53,10 +54,8 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         # The rate is stated for the instant of the earliest unit, and the true one lies
         # anywhere between that and the instant of the latest.
         for a in range(3):
-            now.others_rate[a] = (
-                core.sample.estimate.spread * core.acceleration.value[a]
-            )
-        add_square(last.covariance, now.others_rate, 1.0 / 3.0)
+            now.doubt[a] = core.sample.estimate.spread * core.acceleration.value[a]
+        add_square(last.covariance, now.doubt, 1.0 / 3.0)
         update_common_error(core)
     else:
         for k in range(6):
@@ -65,7 +64,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 @compiled
 def update_lag(core: Core) -> None:
-    """Find the instant that the rate is of, where units are late before the stamp; instants only ever go forwards."""
+    """Find the instant of the rate, which lies before the stamp where units are late. Instants only increase."""
     true = core.now.evidence.stamp - round(1e9 * core.sample.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
@@ -96,7 +95,7 @@ def choose_fused(
         if doubtful & trusted and not settings.publish_under_doubt:
             now.withheld, trusted = True, 0
     if now.all_repeat and not is_at_rest(settings, now):
-        # A vehicle that turns does not give the same bits twice: what is repeated is old.
+        # A turning vehicle does not repeat values bit for bit: repeated values are old.
         now.withheld, trusted = True, 0
     return trusted
 
@@ -106,13 +105,10 @@ def update_residuals(settings: PathSettings, now: Current, last: OutputRow) -> N
     """Differences of the channels from the fused rate, and from that with weights as expected."""
     axes = settings.sensors.axes
     for i in range(settings.n):
-        along = tested = 0.0
-        for a in range(3):
-            along += axes[i, a] * last.rate[a]
-            tested += axes[i, a] * now.plain_rate[a]
-        known = math.isfinite(now.corrected[i])
-        last.residual[i] = now.corrected[i] - along if known else math.nan
-        now.tested[i] = now.corrected[i] - tested if known else math.nan
+        last.residual[i] = now.tested[i] = math.nan
+        if math.isfinite(now.corrected[i]):
+            last.residual[i] = now.corrected[i] - along(axes[i], last.rate)
+            now.tested[i] = now.corrected[i] - along(axes[i], now.plain_rate)
 
 
 @compiled
@@ -126,12 +122,11 @@ def update_gain(
     """Variance of every channel, and the gain of the channels fused."""
     n, sensors = settings.n, settings.sensors
     for i in range(n):
-        h, rate = sensors.axes[i], now.plain_rate
         now.variance[i] = estimate.variance[i]
         if not estimate.known:
             # The sample was not judged: the estimate is of an earlier motion.
-            along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
-            expected = variance_of(sensors, i, along, acceleration.value)
+            rate_along = along(sensors.axes[i], now.plain_rate)
+            expected = variance_of(sensors, i, rate_along, acceleration.value)
             now.variance[i] = max(now.variance[i], expected)
         now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
         for a in range(3):
@@ -161,10 +156,10 @@ def add_units(
     for u in range(settings.units):
         if doubted >> u & 1:
             rest = now.usable & ~settings.members[u]
-            fill_rate(subsets[rest], settings.n, rest, now.corrected, now.others_rate)
+            fill_rate(subsets[rest], settings.n, rest, now.corrected, now.doubt)
             for a in range(3):
-                now.others_rate[a] -= last.rate[a]
-            add_square(last.covariance, now.others_rate, 1.0 / whole)
+                now.doubt[a] -= last.rate[a]
+            add_square(last.covariance, now.doubt, 1.0 / whole)
 
 
 @compiled
@@ -179,40 +174,31 @@ def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
 
 @compiled
 def update_common_error(core: Core) -> None:
-    """Split what is not known of the errors into what passes for rate, and what shows in the residuals.
+    """Split the uncertainty of the errors into the part that passes for rate and the part in the residuals.
 
-    With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G) C (I - H G)'`` the roots of the
-    diagonal in ``core.remaining``.
+    With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G)
+    C (I - H G)'`` the roots of the diagonal in ``core.remaining``.
     """
-    n, axes, taken = (
-        core.settings.n,
-        core.settings.sensors.axes,
-        core.now.parity.weighted,
-    )
+    n, axes = core.settings.n, core.settings.sensors.axes
+    gain, common, shared = core.now.gain, core.now.common, core.now.shared_error
+    covariance = core.sample.estimate.covariance
     for i in range(n):
         for a in range(3):
-            total = 0.0
-            for j in range(n):
-                total += core.now.gain[a, j] * core.sample.estimate.covariance[i, j]
-            taken[i, a] = total
+            shared[i, a] = dot(gain[a], covariance[i], n)
     k = 0
     for a in range(3):
         for c in range(a, 3):
-            total = 0.0
-            for i in range(n):
-                total += core.now.gain[a, i] * taken[i, c]
-            core.now.common[k] = total
+            common[k] = dot(gain[a], shared[:, c], n)
             k += 1
-    b = core.now.common
     for i in range(n):
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
-        square = (
-            x * x * b[0]
-            + y * y * b[3]
-            + z * z * b[5]
-            + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
+        along_axis = (
+            x * x * common[0]
+            + y * y * common[3]
+            + z * z * common[5]
+            + 2.0 * (x * y * common[1] + x * z * common[2] + y * z * common[4])
         )
-        mixed = x * taken[i, 0] + y * taken[i, 1] + z * taken[i, 2]
+        mixed = along(axes[i], shared[i])
         core.remaining[i] = math.sqrt(
-            max(core.sample.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0)
+            max(covariance[i, i] - 2.0 * mixed + along_axis, 0.0)
         )

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks of each value by itself: missing, not finite, out of range, frozen; and values that come and go."""
+"""Checks of single values: missing, not finite, out of range, frozen, intermittent."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
 def receive(
     settings: PathSettings, health: Health, i: int, stamp: int, z: float
 ) -> int:
-    """Remember a value that was received of channel i; return what is wrong with it by itself."""
+    """Remember a value received of channel i; return its `Condition`."""
     # Across a hole it is unknown what the value was: a run begins anew.
     step = stamp - health.received_stamp[i]
     hole = step > settings.stale_time
@@ -78,13 +78,19 @@ def receive(
 
 
 SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0
-"""ns and values over which the share that is not finite is averaged, the longer: 50 tell 15 % from 25 %."""
-DOUBTED_SHARE = 0.15  # from which a channel is left out of the rate: drivers drop up to 10 % of single values
+"""ns and values over which the share that is not finite is averaged, the longer: 50
+tell 15 % from 25 %."""
+# from which a channel is left out of the rate: drivers drop up to 10 % of single values
+DOUBTED_SHARE = 0.15
 INTERMITTENT_SHARE = (
     0.25  # from which it is faulty: 2.5 standard deviations of the average above that
 )
-RETURNING = 3  # a value that is not finite, and the next two, are left out of the rate: they are no better
-LEAST_LEAVES = 4.0  # times that a channel went away lately where it comes and goes: a hole or two are none of it
+# a value that is not finite, and the next two, are left out of the rate: they are no
+# better
+RETURNING = 3
+LEAST_LEAVES = (
+    4.0  # least recent losses of an intermittent channel: one or two holes do not count
+)
 
 
 @compiled
@@ -99,7 +105,8 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
 
 
 COMPLETE_SHARE, COMPLETE_TIME = 0.02, 4 * SHARE_TIME
-"""A unit that lacked so few samples, one of a whole average, for so long is no slow one, and may come to flicker."""
+"""A unit with at most this share of lost samples over this time, ns, is not slow.
+Losses then are flicker."""
 
 
 @compiled
@@ -110,7 +117,7 @@ def follow_presence(
     adaptation_gain = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     for i in range(n):
         if health.begun == 1:
-            # Nothing is known of it.
+            # Nothing is known of the channel yet.
             health.absent[i], health.complete_stamp[i] = 1.0, stamp
         health.absent[i] += adaptation_gain * (
             (0.0 if received[i] else 1.0) - health.absent[i]

@@ -11,13 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import call, compiled
+from fdi_ros.core.algebra import along
 from fdi_ros.core.records import Bank, Core, Current, SampleInput, SampleVerdict
 
 UNPREPARED, REFUSED = (
     -1,
     -2,
-)  # instead of a row: not prepared yet; the method cannot run on these channels
-LARGEST_RATE = 1e6  # rad/s; methods of a paper take a larger finite value for this, so that squares stay finite
+)  # instead of a row: not prepared yet, or refused by the method
+LARGEST_RATE = (
+    1e6  # rad/s; larger finite values are clipped, so that squares stay finite
+)
 
 
 @compiled
@@ -45,9 +48,9 @@ def clear_verdict(verdict: SampleVerdict, n: int) -> None:
 def judge_sample(
     bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict
 ) -> bool:
-    """Judge a sample by those of all values z (n,) that are in its mask; all else but its values is filled in already.
+    """Judge a sample by the values z (n,) of the channels in its mask. The other fields must be filled in.
 
-    False, and nothing is done, if the constants for these channels are unprepared.
+    Return False, without judging, if the constants of the set are unprepared.
     """
     mask, judged = sample.mask, bank.judged
     row = 0 if bank.takes_any else bank.row[mask]
@@ -108,19 +111,16 @@ def is_prepared(bank: Bank, mask: int) -> bool:
 def judge_corrected(core: Core, bank: Bank) -> None:
     """Judge the corrected values by another method than the estimator's own, into ``now.verdict``.
 
-    The method was prepared for the noise expected. Residuals are divided by the root of the excess of the noise of the
-    moment over it, so the method keeps its false-alarm rate. Noise and outliers stay those of the estimator.
+    The method was prepared for the noise expected. Residuals are divided by the root of
+    the excess of the noise of the moment over it, so the method keeps its false-alarm
+    rate. Noise and outliers stay those of the estimator.
     """
     now, asked, axes = core.now, core.now.asked, core.settings.sensors.axes
     scale = math.sqrt(max(core.sample.estimate.excess, 1.0))
     asked.stamp, asked.mask = core.sample.stamp, core.sample.mask
     for i in range(core.settings.n):
-        along = (
-            axes[i, 0] * now.rate[0]
-            + axes[i, 1] * now.rate[1]
-            + axes[i, 2] * now.rate[2]
-        )
-        now.scaled[i] = along + (now.corrected[i] - along) / scale
+        expected = along(axes[i], now.rate)
+        now.scaled[i] = expected + (now.corrected[i] - expected) / scale
     judge_sample(bank, asked, now.scaled, now.verdict)
     for i in range(core.settings.n):
         now.verdict.error[i] *= scale

@@ -3,28 +3,34 @@
 
 """Protection level of the fused rate.
 
-Where a name, or a set, may be wrong, other channels may be faulty in place of those left out. D are channels that are
-left out as faulty, W those fused and D together, all of which give a value. A rival h says that D is healthy and that
-one or two others, R, are faulty. With u = A z and gain G of W (`fdi_ros.core.parity`), its error and rate are those of
+A name or a set may be wrong: other channels may be faulty in place of the channels left
+out. D are the channels left out as faulty, W the union of D and the fused channels. A
+rival hypothesis h assumes that D is healthy and that one or two others, R, are faulty.
+With u = A z and gain G of W (`fdi_ros.core.parity`), its error and rate are those of
 solution separation (`fdi_ros.monitor.integrity`):
 
-    f_h = A_RR^-1 u_R,    x_h = G z - G_R f_h,    P_h = P_W + G_R A_RR^-1 G_R',    chi_h = z' A z - u_R' f_h.
+    f_h = A_RR^-1 u_R,    x_h = G z - G_R f_h,    P_h = P_W + G_R A_RR^-1 G_R',    chi_h
+    = z' A z - u_R' f_h.
 
-Against the name its odds in this sample are ``o_h exp(-(chi_h - chi_0) / 2)``, o_h those of its faults beside a single
-one. So the level of an axis is at least ``|x_0 - x_h| + q sigma_h``, with the Chernoff bound ``Q(q) <= exp(-q^2 / 2)``
-on the risk shared by all rivals. Samples are judged one by one: what others have shown before makes no rival unlikely.
+Against the name its odds in this sample are ``o_h exp(-(chi_h - chi_0) / 2)``, o_h
+those of its faults beside a single one. So the level of an axis is at least ``|x_0 -
+x_h| + q sigma_h``, with the Chernoff bound ``Q(q) <= exp(-q^2 / 2)`` on the risk shared
+by all rivals. Samples are judged one by one: what others have shown before makes no
+rival unlikely.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import fill_parity
+from fdi_ros.core.algebra import along, dot_in
+from fdi_ros.core.parity import fill_parity, gained_rate
 from fdi_ros.core.records import Core, Parity, Subset
+from fdi_ros.core.subsets import number_in
 from fdi_ros.model.samples import Array
 
 
@@ -34,9 +40,10 @@ def fill_growth(
 ) -> None:
     """How many times noise_std^2 the square of each channel's error in a sample is, into growth (n,).
 
-    ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): what is not known of each channel's bias, standard
-    deviation, rad/s. How these hang together is not known: an axis with gains G is off by up to ``sum |G_i| std(b_i)``
-    (as by the nominal biases of Blanch et al. 2015), whose square is at most n times that of independent ones.
+    ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): standard deviation
+    of each channel's unknown bias, rad/s. Their correlation is unknown: an axis with
+    gains G is off by up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch
+    et al. 2015), whose square is at most n times the one of independent biases.
     """
     for i in range(n):
         growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (
@@ -48,10 +55,11 @@ def fill_growth(
 def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
     """Protection level (3,) of the channels in mask, rad/s, from the growth of their errors (n,).
 
-    For fixed shares of the risk the level is the largest of functions that are concave in the variances and of degree
-    1/2: of each the tangent is an upper bound, and among the tangents at multiples of noise_std^2 the best one gives
-    ``level sqrt(sum_i p_i growth_i)`` with weights p that sum to one. ``subset.share`` has the largest p_i of all these
-    functions.
+    For fixed shares of the risk the level is the largest of functions that are concave
+    in the variances and of degree 1/2: of each the tangent is an upper bound, and among
+    the tangents at multiples of noise_std^2 the best one gives ``level sqrt(sum_i p_i
+    growth_i)`` with weights p that sum to one. ``subset.share`` has the largest p_i of
+    all these functions.
     """
     least, most = math.inf, 0.0
     for i in range(n):
@@ -81,16 +89,12 @@ def passes_test(
         if mask >> i & 1:
             least = min(least, growth[i])
     for i in range(n):
-        # Mostly that is all that has to be looked at.
+        # Usually this cheap bound decides.
         if mask >> i & 1 and not abs(residual[i]) <= subset.limit[i] * math.sqrt(least):
             before = after = 0.0
             for j in range(n):
                 if mask >> j & 1:
-                    taken = (
-                        axes[i, 0] * subset.gain[j, 0]
-                        + axes[i, 1] * subset.gain[j, 1]
-                        + axes[i, 2] * subset.gain[j, 2]
-                    )
+                    taken = along(axes[i], subset.gain[j])
                     part = ((1.0 if i == j else 0.0) - taken) * noise_std[j]
                     before += part * part
                     after += part * part * growth[j]
@@ -99,7 +103,9 @@ def passes_test(
     return passes
 
 
-APART = 1e-3  # least share of a variance in its parity, and of A_ii A_jj in the determinant: else none shows, or alike
+# least share of a variance in its parity, and of A_ii A_jj in the determinant: else
+# none shows, or alike
+APART = 1e-3
 
 
 @compiled
@@ -116,6 +122,17 @@ def cover_rivals(core: Core) -> None:
         cover(core, doubted, chi)
 
 
+class Rival(NamedTuple):
+    """A rival of the declaration: one or two of the fused channels are faulty."""
+
+    first: int
+    second: int  #: the same channel where it is one
+    error: tuple[float, float]  #: estimated, rad/s
+    variance: tuple[float, float]  #: of the errors, (rad/s)^2
+    covariance: float  #: of the two, (rad/s)^2
+    log_odds: float  #: over its share of the risk
+
+
 @compiled
 def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
     """Chi-square z' A z of the channels in mask."""
@@ -129,76 +146,88 @@ def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
 
 @compiled
 def cover(core: Core, out: int, chi: float) -> None:
-    """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not."""
-    n, now, parity, prior = (
-        core.settings.n,
-        core.now,
-        core.now.parity,
-        core.settings.prior,
-    )
-    mask, count, free = now.fused | out, 0, -1.0
-    fill_parity(parity, core.settings.sensors, mask, now.uncertainty)
+    """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not.
+
+    ``chi``: chi-square of the channels fused.
+    """
+    n, now, information = core.settings.n, core.now, core.now.parity.information
+    mask = now.fused | out
+    fill_parity(now.parity, core.settings.sensors, mask, now.uncertainty)
     for i in range(n):
-        count += now.fused >> i & 1
-        free += out >> i & 1
-        now.rival[i] = 0.0
-        for j in range(n):
-            if mask >> j & 1:
-                now.rival[i] += parity.information[i, j] * now.corrected[j]
+        now.rival[i] = dot_in(information[i], now.corrected, n, mask)
     # Each channel of a set takes a degree of freedom out of chi.
-    base = (
-        0.5 * (chi - chi_of(parity, n, mask, now.corrected))
-        + free
-        - math.log(core.settings.risk / (count * count))
-    )
+    gained = 0.5 * (chi - chi_of(now.parity, n, mask, now.corrected))
+    rivals = number_in(now.fused, n) ** 2
+    free = number_in(out, n) - 1.0
+    base = gained + free - math.log(core.settings.risk / rivals)
     for i in range(n):
-        a, u = parity.information[i, i], now.rival[i]
-        # Else no residual shows the channel; or two look alike, and one is enough.
-        if now.fused >> i & 1 and a * now.uncertainty[i] > APART:
-            cover_one(
-                core, i, i, (u / a, 0.0), (1.0 / a, 0.0, 0.0), base + 0.5 * u * u / a
-            )
-        for j in range(i):
-            b, c, v = parity.information[j, j], parity.information[i, j], now.rival[j]
-            if now.fused >> i & now.fused >> j & 1 and a * b - c * c > APART * a * b:
-                det = a * b - c * c
-                f = (b * u - c * v) / det, (a * v - c * u) / det
-                odds = (
-                    base + 0.5 * (f[0] * u + f[1] * v) + math.log(prior[i] + prior[j])
-                )
-                cover_one(core, i, j, f, (b / det, a / det, -c / det), odds)
+        if now.fused >> i & 1:
+            cover_single(core, i, base)
+            for j in range(i):
+                if now.fused >> j & 1:
+                    cover_pair(core, i, j, base)
 
 
 @compiled
-def cover_one(
-    core: Core,
-    i: int,
-    j: int,
-    f: tuple[float, float],
-    p: tuple[float, float, float],
-    odds: float,
-) -> None:
-    """Raise the level where channels i, j have errors f of covariance p (ii, jj, ij), of log odds over their risk."""
-    now, last = core.now, core.last
-    for a in range(3 if odds > 0.0 else 0):
-        g, h, rate = now.parity.gain[a, i], now.parity.gain[a, j], 0.0
-        for k in range(core.settings.n):
-            if now.parity.gain[a, k] != 0.0:
-                rate += now.parity.gain[a, k] * now.corrected[k]
-        off = abs(last.rate[a] - rate + g * f[0] + h * f[1])
-        variance = (
-            now.parity.inverse[a, a] + g * g * p[0] + h * h * p[1] + 2.0 * g * h * p[2]
+def cover_single(core: Core, i: int, base: float) -> None:
+    """Raise the level for a fault of channel i; ``base``: log odds where it explains nothing."""
+    information, u = core.now.parity.information[i, i], core.now.rival[i]
+    # With less no residual shows the channel.
+    if information * core.now.uncertainty[i] > APART:
+        log_odds = base + 0.5 * u * u / information
+        cover_rival(
+            core,
+            Rival(
+                i, i, (u / information, 0.0), (1.0 / information, 0.0), 0.0, log_odds
+            ),
         )
-        last.level[a] = max(last.level[a], off + math.sqrt(2.0 * odds * variance))
+
+
+@compiled
+def cover_pair(core: Core, i: int, j: int, base: float) -> None:
+    """Raise the level for faults of channels i and j; base as in `cover_single`."""
+    information, prior = core.now.parity.information, core.settings.prior
+    a, b, c = information[i, i], information[j, j], information[i, j]
+    u, v = core.now.rival[i], core.now.rival[j]
+    determinant = a * b - c * c
+    # Of two that look alike one is enough.
+    if determinant > APART * a * b:
+        error = (b * u - c * v) / determinant, (a * v - c * u) / determinant
+        explained = 0.5 * (error[0] * u + error[1] * v)
+        log_odds = base + explained + math.log(prior[i] + prior[j])
+        variance = b / determinant, a / determinant
+        cover_rival(core, Rival(i, j, error, variance, -c / determinant, log_odds))
+
+
+@compiled
+def cover_rival(core: Core, rival: Rival) -> None:
+    """Widen the level of each axis to what holds if a rival is true."""
+    if rival.log_odds <= 0.0:
+        return
+    now, last, parity = core.now, core.last, core.now.parity
+    for a in range(3):
+        g, h = parity.gain[a, rival.first], parity.gain[a, rival.second]
+        rate = gained_rate(parity.gain[a], now.corrected, core.settings.n)
+        off = abs(last.rate[a] - rate + g * rival.error[0] + h * rival.error[1])
+        variance = (
+            parity.inverse[a, a]
+            + g * g * rival.variance[0]
+            + h * h * rival.variance[1]
+            + 2.0 * g * h * rival.covariance
+        )
+        bound = off + math.sqrt(2.0 * rival.log_odds * variance)
+        last.level[a] = max(last.level[a], bound)
 
 
 @compiled
 def update_level(core: Core, subsets: NDArray[Any]) -> None:
     """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
 
-    It is that of the rate with weights as expected, in the motion of this sample; by how much the fused rate differs
-    from that; and what passes for rate and shows in no residual. There is none without a fused rate, while a doubtful
-    channel has to be fused for want of others, and where the separation test fails, whatever the verdict is.
+    It is that of the rate with weights as expected, in the motion of this sample; by
+    how much the fused rate differs from that; and what passes for rate and shows in no
+    residual. There is none without a fused rate, while a doubtful channel has to be
+    fused for want of others, and where the separation test fails, whatever the verdict
+    is.
     """
     last, now, subset = core.last, core.now, subsets[core.now.fused]
     passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused
@@ -218,7 +247,7 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             )
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
-            # The instant may be that of any unit.
+            # The instant of any unit may be the right one.
             apart = core.sample.estimate.spread * core.acceleration.value[a]
             last.level[a] += abs(apart)
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:

@@ -3,8 +3,9 @@
 
 """One live message at a time: into the alignment, and through the sample path what it completes.
 
-Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), made of its reading and `receive_stamped` or
-`receive_arrived`. The samples that are complete then go through `process`.
+Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), made of its
+reading and `receive_stamped` or `receive_arrived`. The samples that are complete then
+go through `process`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ from fdi_ros.core.records import Aligner, Live
 from fdi_ros.model.samples import Bytes
 
 WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
-"""Bits of what taking and working a message returns: a sample was worked; it has a fused rate; it brought
-events; another is to be worked; the path wants something prepared (before the next call, which goes on with the
-sample if none was worked); the message was refused."""
+"""Bits of what taking and working a message returns: a sample was worked; it has a
+fused rate; it brought events; another is to be worked; the path wants something
+prepared (before the next call, which goes on with the sample if none was worked); the
+message was refused."""
 NEVER = -1  # instead of a stamp
-AHEAD_OF_CLOCK = 1_000_000_000  # ns that a live stamp may be: clocks of two computers differ, and simulators step
-STEP_BACK = 100_000_000  # ns; a clock set back by more is followed, less is waited out: NTP slews that within minutes
+# ns that a live stamp may be: clocks of two computers differ, and simulators step
+AHEAD_OF_CLOCK = 1_000_000_000
+# ns; a clock set back by more is followed, less is waited out: NTP slews that within
+# minutes
+STEP_BACK = 100_000_000
 
 
 @compiled
@@ -35,8 +40,9 @@ def receive_stamped(
 ) -> int:
     """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
 
-    ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it arrived, ns; 0: not known. What
-    is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
+    ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it
+    arrived, ns; 0: not known. What is ahead of the clock by more than `AHEAD_OF_CLOCK`
+    cannot have been measured yet: it is counted and left.
     """
     inlet = live.inlets[unit]
     inlet.received += 1
@@ -90,8 +96,8 @@ def process(
 ) -> int:
     """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
 
-    ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and ``integrity`` the messages to be
-    published about it.
+    ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and
+    ``integrity`` the messages to be published about it.
     """
     monitor, main = live[0], path.core[0]
     if not monitor.ready:

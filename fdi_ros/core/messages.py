@@ -3,12 +3,14 @@
 
 """Elements of CDR messages: reading and writing what all kinds of messages share, and the messages that are published.
 
-Reading takes only what is needed out of the bytes, whatever else they hold; what is special to one kind of message is
-in its source (`fdi_ros.core.sources`). Writing fills a template. Bytes may come from anywhere: every length in them is
-checked against the bytes that are there before it is believed.
+Reading takes only what is needed out of the bytes, whatever else they hold; what is
+special to one kind of message is in its source (`fdi_ros.core.sources`). Writing fills
+a template. Bytes may come from anywhere: every length in them is checked against the
+bytes that are there before it is believed.
 
-Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the second of which is 1 for little and
-0 for big endian; then the fields, each aligned to its own size counted from after the encapsulation.
+Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the
+second of which is 1 for little and 0 for big endian; then the fields, each aligned to
+its own size counted from after the encapsulation.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
 ENCAPSULATION = 4  # bytes before the first field
 IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
-"""Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
+"""Doubles of an Imu: all, and those before the angular velocity: orientation and its
+covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
 LAST_STAMP = (
@@ -46,7 +49,8 @@ class MessageError(FdiError):
     """The bytes are no such message, or not of the length that is expected."""
 
 
-# Bytes --------------------------------------------------------------------------------------------------------------
+# Bytes
+# --------------------------------------------------------------------------------------------------------------
 
 
 @compiled
@@ -86,7 +90,8 @@ def _write_doubles(
         _write_double(out, at + 8 * i, values[places[i]])
 
 
-# Reading ------------------------------------------------------------------------------------------------------------
+# Reading
+# ------------------------------------------------------------------------------------------------------------
 
 
 @compiled
@@ -101,8 +106,8 @@ def place_after_header(
 ) -> int:
     """Return where values stand among the doubles that follow a std_msgs/Header; or what is wrong, negative.
 
-    The message lies in ``data`` from ``offset`` on. ``before``, ``total``: doubles before the values, and all that
-    there must be.
+    The message lies in ``data`` from ``offset`` on. ``before``, ``total``: doubles
+    before the values, and all that there must be.
     """
     if not is_cdr(data, offset, length):
         return -NO_CDR
@@ -122,7 +127,8 @@ def read_rate(
 ) -> int:
     """Read three of the doubles that follow a std_msgs/Header into rate (3,), and return its stamp, ns.
 
-    Or what is wrong, negative: then the rate is left as it was. Other parameters as for `place_after_header`.
+    Or what is wrong, negative: then the rate is left as it was. Other parameters as for
+    `place_after_header`.
     """
     at = place_after_header(data, offset, length, before, total)
     if at < 0:
@@ -182,15 +188,16 @@ def as_batch(data: bytes) -> tuple[Bytes, Int, Int]:
     )
 
 
-# Writing ------------------------------------------------------------------------------------------------------------
+# Writing
+# ------------------------------------------------------------------------------------------------------------
 
 
 @compiled
 def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) -> None:
     """Write stamp, ns, rate (3,) rad/s and covariance into one serialised Imu, made from an `ImuTemplate`.
 
-    ``at``: where the rate begins, as the template says. Of the covariance the upper triangle is given, (6,) (rad/s)^2.
-    Little endian.
+    ``at``: where the rate begins, as the template says. Of the covariance the upper
+    triangle is given, (6,) (rad/s)^2. Little endian.
     """
     seconds, rest = stamp // _NS, stamp % _NS
     for k in range(4):
@@ -263,8 +270,8 @@ class ImuTemplate:
 class ChannelsTemplate:
     """Serialised std_msgs/Float64MultiArray of a fixed number of values, at least 1.
 
-    With labels, one for each value and without commas, the array has one dimension: its label holds all of them,
-    separated by commas.
+    With labels, one for each value and without commas, the array has one dimension: its
+    label holds all of them, separated by commas.
     """
 
     def __init__(self, count: int, labels: Sequence[str] = ()) -> None:

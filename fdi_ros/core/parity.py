@@ -1,34 +1,37 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a sample shows of the errors of its channels once the body rate is eliminated.
+"""Information about the errors of channels once the body rate is eliminated.
 
-With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but its prior N(0, K^-1),
-K = k I:
+With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate
+w but its prior N(0, K^-1), K = k I:
 
     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
 
-A is the information about d that the redundancy holds (a projector where M = I and k = 0), G the weighted least
-squares. No basis of the null space is needed, and a channel that is absent is a row left out: rows and columns of the
-channels that are not in a set are zero.
+A is the information about d that the redundancy holds (a projector where M = I and k =
+0), G the weighted least squares. No basis of the null space is needed, and a channel
+that is absent is a row left out: rows and columns of the channels that are not in a set
+are zero.
 """
 
 from __future__ import annotations
 
-import math
-
 from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
+from fdi_ros.core.algebra import along, dot, invert
 from fdi_ros.core.records import Parity, Sensors
 from fdi_ros.model.samples import MAX_RATE, Array
 
 #
-# With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but its prior N(0, K^-1),
+# With values ``y = H w + d``, the errors d of covariance M, and nothing known of the
+# rate w but its prior N(0, K^-1),
 # K = k I:
 #
 #     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
 #
-# A is the information about d that the redundancy holds (a projector where M = I and k = 0), G the weighted least
-# squares. No basis of the null space is needed, and a channel that is absent is a row left out: rows and columns of the
+# A is the information about d that the redundancy holds (a projector where M = I and k
+# = 0), G the weighted least
+# squares. No basis of the null space is needed, and a channel that is absent is a row
+# left out: rows and columns of the
 # channels that are not in a set are zero.
 
 
@@ -38,55 +41,11 @@ UNKNOWN_RATE = (
 
 
 @compiled
-def factorise(a: Array, size: int, factor: Array) -> float:
-    """Cholesky factor of a symmetric positive definite matrix; return the log of its determinant."""
-    log = 0.0
-    for i in range(size):
-        for j in range(i + 1):
-            total = a[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                # Rounding may leave less than zero of a singular matrix.
-                factor[i, i] = math.sqrt(max(total, 1e-300))
-                log += 2.0 * math.log(factor[i, i])
-            else:
-                factor[i, j] = total / factor[j, j]
-    return log
-
-
-@compiled
-def invert(a: Array, size: int, out: Array) -> float:
-    """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
-
-    The lower triangle of a is read. ``out`` takes both triangles; on the way the factor, then its inverse.
-    """
-    log = factorise(a, size, out)
-    for i in range(size):
-        for j in range(i):
-            total = 0.0
-            for k in range(j, i):
-                total -= out[i, k] * out[k, j]
-            out[i, j] = total / out[i, i]
-        out[i, i] = 1.0 / out[i, i]
-    for i in range(size):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(i, size):
-                total += out[k, i] * out[k, j]
-            out[i, j] = out[j, i] = total
-    return log
-
-
-@compiled
 def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
     """Work out W H, and of ``H' W H + K`` the lower triangle."""
     for i in range(n):
         for a in range(3):
-            total = 0.0
-            for j in range(n):
-                total += parity.weight[i, j] * axes[j, a]
-            parity.weighted[i, a] = total
+            parity.weighted[i, a] = dot(parity.weight[i], axes[:, a], n)
     for a in range(3):
         for b in range(a + 1):
             total = known if a == b else 0.0
@@ -97,15 +56,12 @@ def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
 
 @compiled
 def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
-    """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
+    """Work out A and G from W; ``known``: prior information k of the rate, s^2/rad^2."""
     update_normal(parity, n, axes, known)
     invert(parity.normal, 3, parity.inverse)
     for a in range(3):
         for i in range(n):
-            total = 0.0
-            for b in range(3):
-                total += parity.inverse[a, b] * parity.weighted[i, b]
-            parity.gain[a, i] = total
+            parity.gain[a, i] = along(parity.inverse[a], parity.weighted[i])
     for i in range(n):
         for j in range(i + 1):
             total = parity.weight[i, j]
@@ -130,7 +86,7 @@ def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) ->
 def fill_joint_parity(
     parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float
 ) -> None:
-    """Work out A and G for errors of a covariance (n, n), (rad/s)^2; ``known`` of the rate: k in s^2/rad^2."""
+    """Work out A and G for errors of a covariance (n, n), (rad/s)^2, with prior information k of the rate."""
     n, count = sensors.n, 0
     for i in range(n):
         if mask >> i & 1:
@@ -152,14 +108,20 @@ def fill_joint_parity(
 
 
 @compiled
+def gained_rate(gain: Array, values: Array, n: int) -> float:
+    """Rate about one axis from its gains (n,) and values (n,), rad/s; values without gain may be NaN."""
+    total = 0.0
+    for i in range(n):
+        if gain[i] != 0.0:
+            total += gain[i] * values[i]
+    return total
+
+
+@compiled
 def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
     """Rate (3,) of values (n,), rad/s: those of channels left out are not read."""
     for a in range(3):
-        total = 0.0
-        for i in range(n):
-            if gain[a, i] != 0.0:
-                total += gain[a, i] * values[i]
-        rate[a] = total
+        rate[a] = gained_rate(gain[a], values, n)
 
 
 @compiled
@@ -174,9 +136,6 @@ def covariance_of(
             for i in range(n):
                 if gain[a, i] != 0.0 or gain[b, i] != 0.0:
                     total += gain[a, i] * gain[b, i] * variance[i]
-                    part = 0.0
-                    for j in range(n):
-                        part += gain[b, j] * together[i, j]
-                    total += gain[a, i] * part
+                    total += gain[a, i] * dot(gain[b], together[i], n)
             out[k] = total
             k += 1

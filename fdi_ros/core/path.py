@@ -3,12 +3,12 @@
 
 """The sample path: one sample through the monitor, in order.
 
-    values -> checks -> bias -> rate -> estimator and its detector -> other method -> decision -> fused rate -> states
-    -> protection level
+    values -> checks -> bias -> rate -> estimator and its detector -> other method ->
+    decision -> fused rate -> states -> protection level
 
-`prepare_sample` is the path up to the detector, `conclude_sample` the rest. Between them the sample waits if the
-constants of the detector for just the channels present are still to be prepared, which happens once for each set of
-channels.
+`prepare_sample` is the path up to the detector, `conclude_sample` the rest. Between
+them the sample waits if the constants of the detector for just the channels present are
+still to be prepared, which happens once for each set of channels.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.acceleration import differentiate_rate
+from fdi_ros.core.algebra import along
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, update_bias
 from fdi_ros.core.copies import update_copies
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
@@ -41,11 +42,13 @@ from fdi_ros.core.states import alive, left_out, out_of_use, update_states, writ
 from fdi_ros.core.subsets import fill_rate
 
 NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
-NOISIER = (
-    1.4  # and times that of any other: vibration of the body comes to no channel alone
-)
-RAIL_MARGIN = 0.9  # of the range: where the others predict less, a value out of it is a fault and no manoeuvre
-RAIL_LIMIT = 10.0  # ranges that the detector sees of a value out of range at most: any shows as well
+# and this many times every other channel: body vibration never shows on one channel
+# only
+NOISIER = 1.4
+# share of the range: where the others predict less, a value out of range is a fault
+RAIL_MARGIN = 0.9
+# ranges that the detector sees of a value out of range at most: any shows as well
+RAIL_LIMIT = 10.0
 WAITING = -1  # instead of a number of events
 
 
@@ -58,7 +61,7 @@ class Path(NamedTuple):
     guard_memory: NDArray[np.uint8]  #: bytes of its states
     method: NDArray[
         Any
-    ]  #: detector whose alarms declare, (1,) `Bank`; the same one, or another
+    ]  #: detector whose alarms declare, (1,) `Bank`: the guard or another
     method_memory: NDArray[np.uint8]  #: bytes of its states
 
 
@@ -73,11 +76,12 @@ def run(
 ) -> tuple[int, int, bool]:
     """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
 
-    Work ends when fewer than n of ``events``, `EventRow`, are free; with `stop_at_event` after the first sample that
-    brings one. Returned are the row at which it ended, N if all is done; the number of events; and whether something
-    must be prepared. If it is the detector, for ``sample.mask`` of the core, the row was not worked, and
-    ``now.waiting`` is set; if the row before it lacks its level, the channels fused are in ``core.wanted``; or
-    ``core.copies.found`` is set.
+    Work ends when fewer than n of ``events``, `EventRow`, are free; with
+    `stop_at_event` after the first sample that brings one. Returned are the row at
+    which it ended, N if all is done; the number of events; and whether something must
+    be prepared. If it is the detector, for ``sample.mask`` of the core, the row was not
+    worked, and ``now.waiting`` is set; if the row before it lacks its level, the
+    channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
     core, count = path.core[0], 0
     for k in range(start, len(samples)):
@@ -125,8 +129,9 @@ def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
 def prepare_sample(path: Path, sample: Sample) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see.
 
-    The checks are on the values as delivered, so that what is wrong is met at once; where units are late the
-    values judged are those of an earlier instant, of this and earlier samples that were checked, too.
+    The checks see the values as delivered, so that they act at once. Where units are
+    late the values judged are those of an earlier instant, of this and earlier samples
+    that were checked, too.
     """
     core, subsets = path.core[0], path.subsets
     settings, now, stamp = core.settings, core.now, sample.stamp
@@ -169,7 +174,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
 
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
-    """Values of one instant, into ``now.aligned``; return bits of those there are and in range, and of those well."""
+    """Fill ``now.aligned`` with values of one instant; return bits of channels in range, and of those fine."""
     settings, aligned = core.settings, core.now.aligned
     delivered = inside = plain = fine = 0
     for i in range(settings.n):
@@ -196,7 +201,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 
 @compiled
 def learn_bias(path: Path, stamp: int, plain: int) -> None:
-    """Take a sample for the bias; whether it was taken is in ``now.learned_from``."""
+    """Offer a sample to the start-up average; ``now.learned_from``: the average took the sample."""
     core, subsets = path.core[0], path.subsets
     bias = core.bias
     core.now.learned_from = update_bias(core, subsets, stamp, plain, left_out(core))
@@ -223,7 +228,7 @@ def apply_estimate(core: Core) -> None:
 
 @compiled
 def update_noisy(settings: PathSettings, now: Current) -> None:
-    """Find channels that are much noisier than expected, and than all others but those they cannot be told from."""
+    """Find channels that are much noisier than expected, and than all distinguishable others."""
     n, noise, sensors = settings.n, now.verdict.noise, settings.sensors
     now.noisy = 0
     for i in range(n):
@@ -253,7 +258,8 @@ def begin_bias(core: Core) -> None:
         step = core.health.step[i] if core.health.step[i] > 0.0 else largest
         std = settings.turn_on if motion or lost >> i & 1 else settings.learned[i]
         if not motion and step > settings.sensors.noise_std[i]:
-            # Noise does not take a sensor over coarse steps: at rest it was off by up to half of one all the time.
+            # Noise does not take a sensor over coarse steps: at rest it was off by up
+            # to half of one all the time.
             std = math.sqrt(std * std + step * step / 12.0)
         core.remaining[i] = core.sample.bias_std[i] = std
         core.correction[i] = 0.0
@@ -263,16 +269,15 @@ def begin_bias(core: Core) -> None:
 def fill_input(core: Core, out: int) -> None:
     """Find the rate along each axis, and choose what the detector sees.
 
-    It sees usable values, and those out of range that no manoeuvre explains.
-    A hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to come back from its limit, and
-    the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
+    It sees usable values, and those out of range that no manoeuvre explains. A
+    hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to
+    come back from its limit, and the manoeuvre is beyond what the error model was made
+    for: what disagrees meanwhile is left out, but not declared.
     """
     now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
     core.sample.mask = now.usable
     for i in range(core.settings.n):
-        now.along[i] = (
-            axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
-        )
+        now.along[i] = along(axes[i], rate)
         now.input[i] = now.aligned[i] - core.bias.value[i]
         if (
             core.health.condition[i] == OUT_OF_RANGE
@@ -302,13 +307,14 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous
     changed = decide(settings, core.decision, now.evidence)
-    # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too
-    # little would be left: then only what is in doubt from now on.
+    # What this sample has declared is out of use from it on. What was in doubt before
+    # is left out once more, unless too
+    # little would be left: then only channels in doubt from now on.
     now.usable &= ~core.decision.faulty
     now.doubtful = core.decision.suspicion | before | core.decision.ambiguous
     enough = not changed or subsets[now.usable & ~now.doubtful].spare
     fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
-    # What is known of the sensors holds whatever is declared.
+    # The estimator keeps its states whatever is declared.
     if changed and not settings.guard_declares:
         forget(path.method[0], path.method_memory)
     living = alive(core)

@@ -3,8 +3,8 @@
 
 """Every record of the sample path, in the order of a sample; `Core` is what one monitor has and remembers.
 
-What the settings give is in `PathSettings`, what is only of the sample on its way in `Current`; most of the rest is
-memory. Methods have records of their own.
+Settings are in `PathSettings`, figures of the present sample alone in `Current`. Most
+of the rest is memory. Methods have records of their own.
 """
 
 from __future__ import annotations
@@ -39,9 +39,11 @@ MAX_PENDING = 1024  # messages of one unit that wait at most
 RING = (
     MAX_PENDING + 2
 )  # messages kept of one unit: those that wait, one too many, and the one before them
-RESTAMP_SAMPLES = 1024  # kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
+# kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
+RESTAMP_SAMPLES = 1024
 BIAS_PORTIONS = 15  # into which the time of the average at the start is divided
-ACCELERATION_SAMPLES = 1024  # that the window of the angular acceleration spans; of a longer one the last count
+# that the window of the angular acceleration spans; of a longer one the last count
+ACCELERATION_SAMPLES = 1024
 DECISION_SAMPLES = 1000  # samples in the longest window of the votes
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
@@ -51,7 +53,7 @@ class Inlet:
     """What was counted of one input topic."""
 
     received: Whole  # messages
-    malformed: Whole  # of them
+    malformed: Whole  # messages
     error: Whole  # why the last malformed one was refused
     stamp: Whole  # of the last good message, ns; `NEVER` where there was none
     lag: Whole  # least lag behind the other inputs since `NEVER` was written here, ns
@@ -85,14 +87,14 @@ class Accepted:
 class Unit:
     """One stream of messages: the last one that samples have passed, and those that wait.
 
-    Messages are numbered from 0 in each time base; that of number k lies at k % `RING`.
+    Messages are numbered from 0 in each time base. Message k lies at k % `RING`.
     """
 
     begin: Whole  # number of the first that waits; the one before it is the last passed
     end: Whole  # number of the next
     used: Whole  # number after the last that entered a sample as it is
     usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
-    newest: Whole  # stamp of the last accepted, ns; if there is one
+    newest: Whole  # stamp of the last accepted message, ns, if any
     lag: Whole  # how far the last stood behind the common time, ns
     heard: Flag  # there was a message
     before: Whole  # stamp of the last message, accepted or not, ns
@@ -103,8 +105,8 @@ class Unit:
     leapt: Flag  # its stamps jumped back by more than the timeout, and none was accepted since
     parted: Flag  # without a jump it has fallen behind the common time by more than the timeout
     off: Flag  # the last messages stood outside the time base
-    off_first: Whole  # stamp since which they go on there, ns
-    off_last: Whole  # stamp of the last of them, ns
+    off_first: Whole  # first stamp of the present run outside the time base, ns
+    off_last: Whole  # last stamp of the run, ns
     off_rate: Vector  # rad/s
     counters: Counters
     messages: Annotated[list[Accepted], RING]
@@ -124,7 +126,9 @@ class Aligner:
     last: Whole  # stamp of the last sample, ns
     shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
     restarts: Whole  # times that the time base began anew
-    phase: Whole  # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base moves after it
+    # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base
+    # moves after it
+    phase: Whole
     force: Whole  # samples up to this stamp are formed without waiting, ns
     moved_to: Whole  # stamp outside the time base where it begins anew, ns
     rate: Vector  # of the message that is entered, rad/s
@@ -143,7 +147,7 @@ class Sample:
 
 @record
 class Sensors:
-    """The channels of one set, in order, without gaps: what every method needs of them."""
+    """Error model of the channels of one set, in order, without gaps."""
 
     n: Whole  # channels
     axes: Axes  # sensitivity axes in the body frame
@@ -164,24 +168,27 @@ class Estimate:
     """What the estimator knows of the errors of the sensors in a sample."""
 
     known: Flag  # the rest is of this sample
-    checked: Mask  # channels of which what is not known hides no fault
-    corrected: Channels  # values less what is known of their errors, rad/s
+    checked: Mask  # channels whose uncertainty hides no fault
+    corrected: Channels  # values less their estimated errors, rad/s
     variance: Channels  # of their noise at the moment, (rad/s)^2
-    covariance: Square  # of what is not known of their errors, (rad/s)^2
-    excess: Real  # largest variance of a residual over the one expected, at least 1; only where it is asked for
+    covariance: Square  # of the estimated errors, (rad/s)^2
+    # largest variance of a residual over the one expected, at least 1; only where it is
+    # asked for
+    excess: Real
     bias: Channels  # of each, beyond the one at the start, rad/s
     bias_std: Channels  # standard deviation of that, rad/s
-    late: Units  # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
+    # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
+    late: Units
     behind: Real  # by how much the values lie before the stamp, if the earliest unit is in time, s
     spread: Real  # largest delay between units, s
 
 
 @record
 class SampleInput:
-    """A sample of one set of channels, and what is known of it: values in order, without gaps.
+    """A sample of one set of channels: values in order, without gaps.
 
-    Of a method that takes any set of channels: of all channels, those in ``mask`` are there. Other masks and `bias_std`
-    are of all channels that there are.
+    Of a method that takes any set of channels: of all channels, those in ``mask`` are
+    there. Other masks and `bias_std` are of all channels that there are.
     """
 
     stamp: Whole  # ns
@@ -190,12 +197,15 @@ class SampleInput:
     out: Mask  # channels taken out of use, which may be there all the same
     beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
     acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
-    interrupted: Flag  # there is a hole in the stream before this sample
-    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
-    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
+    bias_std: Channels  # standard deviation of each channel's bias at first, rad/s
+    interrupted: Flag  # a hole in the stream precedes this sample
+    held: Flag  # a manoeuvre has just driven a channel out of range: evidence is void
+    # a unit gives old values against the motion of the others: no evidence is taken
+    repeated: Flag
     wants_excess: Flag  # another method is to judge the corrected values
-    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors; until the next one it stands
+    # filled by the method, if it estimates the errors of the sensors; until the next
+    # one it stands
+    estimate: Estimate
 
 
 @record
@@ -220,7 +230,7 @@ class Bank:
     n: Whole  # channels of all
     takes_any: Flag  # the first row serves all sets of channels
     period: Whole  # of samples without stamps, ns
-    clock: Whole  # stamp of the next of these, ns
+    clock: Whole  # stamp of the next sample without one, ns
     judge: Whole  # address of the method's function
     constants: Whole  # address of the first row
     constants_size: Whole  # bytes of a row
@@ -234,7 +244,7 @@ class Bank:
 
 
 class Condition(IntEnum):
-    """What is wrong with one value by itself; the larger number wins."""
+    """Defect of a single value. The larger number wins."""
 
     FINE = 0
     MISSING = 1
@@ -268,7 +278,9 @@ class Health:
     complete: Mask  # channels that were so for long
     returning: Counts  # values that are still left out of the rate after one that is not finite
     leaves: Channels  # how often lately one that is not finite came after one that is
-    step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any
+    # smallest change of the value so far, rad/s: the step of a quantised sensor; 0
+    # before any
+    step: Channels
 
 
 @record
@@ -307,7 +319,7 @@ class Copies:
     change: Annotated[NDArray[np.float64], "f8", (6,)]  # of either's channels, rad/s
     products: Annotated[
         NDArray[np.float64], "f8", (6, 6)
-    ]  # of these, summed, (rad/s)^2
+    ]  # sums of products of the changes, (rad/s)^2
 
 
 @record
@@ -336,13 +348,16 @@ class Bias:
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
-    known: Mask  # channels of which it is valid: the others were lost, silent or restless at that time
+    # channels of which it is valid: the others were lost, silent or restless at that
+    # time
+    known: Mask
     duration: Whole  # of the average, ns
     centre: Channels  # what each average is expected about, rad/s
     max_rate: Real  # mean at rest, rad/s
     max_std: Channels  # at rest, rad/s
     turn_ratio: Channels  # largest C / s^2 at rest of k channels, at k - 1
-    sway_ratio: Channels  # largest C / P of the portions' deviations at rest of k channels, at k - 1
+    # largest C / P of the portions' deviations at rest of k channels, at k - 1
+    sway_ratio: Channels
     learning: Flag
     started: Flag  # an average has begun
     start: Whole  # stamp of its first sample, ns
@@ -354,7 +369,7 @@ class Bias:
     average: Channels  # of the last average, rad/s
     scatter: Channels  # of the last average, rad/s
     heard: Mask  # channels that gave enough values in the last average
-    restless: Mask  # those of them that were not at rest
+    restless: Mask  # heard channels that were not at rest
     common_rate: Real  # that the averages agree on, rad/s
     max_common_rate: Real  # at rest, with biases as those seemed to be, rad/s
     sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
@@ -364,6 +379,7 @@ class Bias:
         NDArray[np.float64], "f8", (BIAS_PORTIONS,)
     ]  # values being sorted
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
+    turn: Vector  # the rate that explains them, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
 
 
@@ -378,7 +394,8 @@ class Subset:
     refused: Flag  # enough channels, and the method cannot run on them
     detectable: Mask  # channels whose fault the method sees
     has_level: Flag  # level and limit were worked out
-    level: Vector  # protection level of each body axis while all errors are as noise_std says, rad/s
+    # protection level of each body axis while all errors are as noise_std says, rad/s
+    level: Vector
     limit: Channels  # largest residual that passes the separation test then, rad/s
     share: Axes  # row i: weight of the variance of channel i in the level of each axis, at most
 
@@ -395,8 +412,9 @@ class TimedRate:
 class Acceleration:
     """Rates of the last samples.
 
-    The acceleration is the difference of the rate to the latest sample at least `window` older that had one. Over one
-    sample at 1 kHz a fault's own step would make so much of it that the timing term hides the fault.
+    The acceleration is the difference of the rate to the latest sample at least
+    `window` older that had one. Over one sample at 1 kHz a fault's own step would make
+    so much of it that the timing term hides the fault.
     """
 
     window: Whole  # ns
@@ -438,7 +456,7 @@ class Evidence:
     drifted: Mask  # channels whose bias is surely beyond what a bias may be
     judged: Flag  # there was a verdict
     held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
-    interrupted: Flag  # there is a hole in the stream before this sample
+    interrupted: Flag  # a hole in the stream precedes this sample
     checked: Mask  # channels whose fault would have shown
     agrees: Mask  # channels that agree with the others; looked at for declared ones
     broken: Mask  # channels that have given nothing but non-finite values for long
@@ -450,11 +468,11 @@ class Evidence:
 
 @record
 class Decision:
-    """What is declared, and the alarms of the last window."""
+    """Declarations, and the alarms of the last window."""
 
     faulty: Mask  # declared faulty
     ambiguous: Mask  # a set one of which is faulty
-    voted: Mask  # of it, by votes
+    voted: Mask  # part of the set declared by votes
     why: Flags  # why each channel was declared
     at: Whole  # place of the last sample in the window
     sets: Annotated[
@@ -462,7 +480,7 @@ class Decision:
     ]  # of each sample of the window, by kind
     count: Annotated[
         NDArray[np.int64], "i8", (4, MAX_CHANNELS)
-    ]  # of these in whose set a channel is, by kind
+    ]  # samples of the window whose set holds a channel, by kind
     alarms: Whole  # samples of the window with an alarm that counts
     last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
     renewed: Stamps  # when the sum of its errors was begun, ns
@@ -480,15 +498,17 @@ class OutputRow:
 
     stamp: Whole  # ns
     instant: Whole  # that the rate is of, ns: before the stamp, where units are late
-    rate: Vector  # fused body rate, rad/s; NaN where there is none
-    covariance: Symmetric  # of the fused rate, (rad/s)^2; NaN where there is none
-    valid: Flag  # there is a fused rate
+    rate: Vector  # fused body rate, rad/s; NaN without one
+    covariance: Symmetric  # of the fused rate, (rad/s)^2; NaN without one
+    valid: Flag  # a fused rate exists
     alarm: Flag  # the detector's, before confirmation
     state: Flags  # `ChannelState` after the sample
     statistic: Real  # the detector's; NaN where the sample could not be judged
     threshold: Real  # the detector's; NaN where the sample could not be judged
-    residual: Channels  # bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing
-    level: Vector  # protection level of the fused rate, rad/s; infinite where there is none
+    # bias-free channel minus fused rate along its axis, rad/s; NaN where either is
+    # missing
+    residual: Channels
+    level: Vector  # protection level of the fused rate, rad/s; infinite where unknown
 
 
 @record
@@ -507,7 +527,7 @@ class EventRow:
 
 @record
 class PathSettings:
-    """What the samples do not change; some of it a change of the detector does."""
+    """Settings, which samples do not change. A change of the detector changes some."""
 
     n: Whole  # channels
     sensors: Sensors
@@ -524,20 +544,26 @@ class PathSettings:
     stale_time: Whole  # ns
     recovery_time: Whole  # ns
     # When a fault is declared, and whether it is forgiven:
-    by_evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
+    # an alarm is accumulated evidence, and declares at once; votes count for stuck
+    # channels only
+    by_evidence: Flag
     alarms: Whole  # that confirm a fault
     window: Whole  # samples among which they count
     latch: Flag
     clean_time: Whole  # ns
     mean_limit: Channels  # largest mean error of a channel that returns, rad/s
-    return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
+    # largest difference of a channel that agrees again, in its standard deviations
+    return_limit: Real
     # Of estimate and fusion:
     publish_under_doubt: (
         Flag  # a rate of channels under doubt, where they cannot be left out
     )
-    guard_declares: Flag  # the alarms of the estimator's own detector declare, not those of another method
+    # the alarms of the estimator's own detector declare, not those of another method
+    guard_declares: Flag
     max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
-    risk: Real  # allowed probability of an error above the level at a sample; 0: there is no level
+    risk: (
+        Real  # allowed probability of an error above the level at a sample; 0: no level
+    )
     reach: Real  # standard deviations that it stands for
     prior: Channels  # odds that a channel is faulty unnoticed
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
@@ -556,24 +582,33 @@ class Current:
         Flag  # the bias was learned from the sample, and nothing else is done with it
     )
     aligned: Channels  # values of the instant that it stands for, rad/s
-    corrected: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
+    # values less errors estimated at the last sample, after the estimator now, rad/s
+    corrected: Channels
     input: Channels  # values of all channels as the detector takes them, rad/s
     plain: Mask  # delivered and in range
-    in_use: Mask  # of these, those in use
-    usable: Mask  # of these, those that are well by themselves
+    in_use: Mask  # plain and in use
+    usable: Mask  # in use and fine by themselves
     doubtful: Mask  # channels suspected, or of a set, in this sample or just before
     fused: Mask  # channels whose least-squares rate is given
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
-    others_rate: Vector  # of the channels by which motion is measured in `update_stuck`, rad/s; and room
+    others_rate: (
+        Vector  # of the channels by which motion is measured in `update_stuck`, rad/s
+    )
+    doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
+    shared_error: (
+        Axes  # C G', covariance of each channel's error with the rate's, (rad/s)^2
+    )
     prediction: (
         Channels  # of each channel by the others, rad/s; NaN where they give none
     )
     variance: (
         Channels  # of noise and what else differs from sample to sample, (rad/s)^2
     )
-    uncertainty: Channels  # `variance` and the variance of what is not known of the errors, (rad/s)^2
+    uncertainty: (
+        Channels  # `variance` plus the variance of the estimated errors, (rad/s)^2
+    )
     parity: Parity
     rival: Channels  # A z of channels fused and left out, s/rad
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate
@@ -581,9 +616,7 @@ class Current:
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
     lagging: Vector  # change of the rate up to the instant that is stated, rad/s
     plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
-    growth: (
-        Channels  # error variance, with that of the bias that remains, in noise_std^2
-    )
+    growth: Channels  # error variance with the remaining bias, in noise_std^2
     guard: SampleVerdict  # of the estimator's own detector
     verdict: SampleVerdict  # of the method that declares
     scaled: Channels  # corrected values with residuals in the noise expected, rad/s
@@ -600,18 +633,22 @@ class Core:
     bias: Bias
     line: DelayBuffer
     copies: Copies
-    sample: SampleInput  # of the channels that the detector sees, and what it estimates of them
+    sample: SampleInput  # input of the estimator and its detector, with the estimate
     unit_rate: Annotated[
         NDArray[np.float64], "f8", (MAX_UNITS, 3)
     ]  # when each unit last gave a new value, rad/s
     correction: (
         Channels  # last estimated error of each channel, taken off its value, rad/s
     )
-    remaining: Channels  # what residuals show of the unknown errors of each channel, standard deviation, rad/s
+    # what residuals show of the unknown errors of each channel, standard deviation,
+    # rad/s
+    remaining: Channels
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
-    reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
+    # prediction of each channel by the others when its present value was first seen,
+    # rad/s; or NaN
+    reference: Channels
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
     samples: Whole  # so far

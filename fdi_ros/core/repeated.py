@@ -3,10 +3,12 @@
 
 """Values that repeat while others move.
 
-A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much
-longer time, or against motion that the others see along this channel's axis: then the channel is stuck, or the values
-of a whole unit are old. The others are evidence of motion only if they agree: in a sample with an alarm that does not
-isolate the channel that repeats, it is not called stuck, and so neither of two parallel ones because of the other.
+A value that repeats is no defect by itself: a quantised sensor at rest repeats for
+minutes. It counts after a much longer time, or against motion that the others see along
+this channel's axis: then the channel is stuck, or the values of a whole unit are old.
+The others are evidence of motion only if they agree: in a sample with an alarm that
+does not isolate the channel that repeats, it is not called stuck, and so neither of two
+parallel ones because of the other.
 """
 
 from __future__ import annotations
@@ -14,37 +16,45 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.algebra import along, square
 from fdi_ros.core.records import Core, Current, Health, PathSettings, Subset
 from fdi_ros.core.subsets import fill_rate
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
-LEAST_MOTION = 6.0  # standard deviations, beyond one step, that the others move by while a stuck value repeats
-STEPS = 3.0  # of a quantised sensor: it repeats its value by chance until the body has moved by so many
+# standard deviations, beyond one step, that the others move by while a stuck value
+# repeats
+LEAST_MOTION = 6.0
+# of a quantised sensor, which repeats its value by chance until the body has moved this
+# far
+STEPS = 3.0
 RESTS, AT_REST = 3.0, 1e-3
-"""At rest the rate is within three standard deviations of a channel, and a step of MAVLink in rad/s, of zero."""
-COARSE_STEP = 0.5  # standard deviations: noise takes a value over smaller steps with nearly every sample
+"""At rest the rate is within three standard deviations of a channel, and a step of
+MAVLink in rad/s, of zero."""
+# standard deviations: noise takes a value over smaller steps with nearly every sample
+COARSE_STEP = 0.5
 ALL_REPEAT = 100_000_000
-"""ns that all channels repeat their values before none of them is believed: what a link may hold up. In coarse steps
-``stuck_time``, if that is longer: gyros without noise repeat for longer in a steady turn."""
+"""ns that all channels repeat their values before none of them is believed: what a link
+may hold up. In coarse steps ``stuck_time``, if that is longer: gyros without noise
+repeat for longer in a steady turn."""
 
 
 @compiled
 def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
-    """Predict each channel from the others of a subset, into ``now.prediction``, rad/s; NaN: they say nothing."""
+    """Predict each channel from the others of a subset, into ``now.prediction``, rad/s; NaN: not predicted."""
     axes, rate = settings.sensors.axes, now.others_rate
     for i in range(settings.n):
-        along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        expected = along(axes[i], rate)
         share = subset.sensitivity[i]
         if share > MIN_SENSITIVITY**2:
-            residual = now.input[i] - along
-            now.prediction[i] = along + residual - residual / share
+            residual = now.input[i] - expected
+            now.prediction[i] = expected + residual - residual / share
         else:
-            now.prediction[i] = along if share == 0 else math.nan
+            now.prediction[i] = expected if share == 0 else math.nan
 
 
 @compiled
 def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
-    """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
+    """Largest step of the quantised channels, rad/s. The step of a channel that never changed is unknown."""
     step = 0.0
     for i in range(settings.n):
         if now.usable >> i & 1:
@@ -56,7 +66,7 @@ def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
 def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
     n, now, stuck = core.settings.n, core.now, 0
-    # Of values as they came: what is newly known of the errors is no motion.
+    # Use uncorrected values: a change of the estimated errors is not motion.
     fill_rate(subset, n, mask, now.input, now.others_rate)
     leave_one_out(core.settings, now, subset)
     step = largest_step(core.settings, core.health, now)
@@ -82,7 +92,7 @@ def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
 
 @compiled
 def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
-    """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
+    """Add stuck channels to the suspects of the verdict. Statistic and alarm stay unchanged."""
     verdict = now.verdict
     if evidence and not verdict.alarm:
         verdict.isolated = True
@@ -98,7 +108,8 @@ def update_repeated(core: Core) -> int:
     """Channels of the units that give old values: all of theirs again, while the others have measured motion."""
     members, sensors, found = core.settings.members, core.settings.sensors, 0
     for u in range(core.settings.units):
-        # A unit with a channel that gives nothing, or nothing in range, is none of these: what it gives is new, or the
+        # A unit with a channel that gives nothing, or nothing in range, is none of
+        # these: what it gives is new, or the
         # sample is without it. One of which a channel was declared may well be one.
         fresh, moved = members[u] & ~core.now.plain != 0, False
         for i in range(core.settings.n):
@@ -121,23 +132,19 @@ def update_repeated(core: Core) -> int:
 
 @compiled
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
-    """Whether the rate of the channels in use is that of a vehicle at rest."""
-    square = (
-        now.rate[0] * now.rate[0]
-        + now.rate[1] * now.rate[1]
-        + now.rate[2] * now.rate[2]
-    )
+    """Whether the channels in use show a vehicle at rest."""
     least = RESTS * settings.largest_noise + AT_REST
-    return square < least * least
+    return square(now.rate) < least * least
 
 
 @compiled
 def all_repeat(
     settings: PathSettings, health: Health, now: Current, stamp: int
 ) -> bool:
-    """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
+    """Whether all channels have repeated their values, bit for bit, so long that the data source must have stalled.
 
-    A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
+    A real gyro toggles its last bits even at rest, unless they are coarse. All gyros at
+    once do not stand still.
     """
     step, noise = largest_step(settings, health, now), settings.largest_noise
     # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.

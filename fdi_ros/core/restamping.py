@@ -3,9 +3,10 @@
 
 """Samples to one instant, by the delays of the units.
 
-A delay that is estimated in flight leaves the stamps alone: where those of unit u are late by T_u, the value of the
-instant t is the one stamped t + T_u. So a sample stands for the instant that lies the largest delay back; the unit that
-is late most gives it as it is, the others what lies between their samples around that.
+A delay that is estimated in flight leaves the stamps alone: where those of unit u are
+late by T_u, the value of the instant t is the one stamped t + T_u. So a sample stands
+for the instant that lies the largest delay back. The latest unit gives its values as
+they are, the others are interpolated between their samples.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ def restamp(
     plain: int,
     out: Array,
 ) -> int:
-    """Keep a sample, and give the values of the instant that it now stands for, into ``out`` (n,); NaN: none.
+    """Keep a sample; fill ``out`` (n,) with the values of the instant for which the sample stands, NaN where missing.
 
-    ``received``, ``plain``: bits of the values received, and of those finite and in range; ``late`` (units,): by how
-    much the stamps of each unit are late, s. Returned are the bits of the channels that have a value, of the instant
-    that the largest delay lies before the stamp.
+    ``received``, ``plain``: bits of the values received, and of those finite and in
+    range; ``late`` (units,): by how much the stamps of each unit are late, s. Returned
+    are the bits of the channels that have a value, of the instant that the largest
+    delay lies before the stamp.
     """
     n, units, members, stamp = (
         settings.n,
@@ -64,10 +66,11 @@ def restamp(
 
 @compiled
 def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array) -> int:
-    """Values of some channels at a stamp, into ``out``; return bits of those that there are.
+    """Interpolate some channels at a stamp, into ``out``; return bits of the channels that have a value.
 
-    By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not
-    there yet, by the line through the inner ones. Between a value in range and one out of it, or none, there is none.
+    By the cubic through the two samples before and the two after it; where one of the
+    outer two is missing, or not there yet, by the line through the inner ones. Between
+    a value in range and one out of it, or none, there is none.
     """
     k = line.count - 1
     oldest = max(line.count - RESTAMP_SAMPLES, 0)
@@ -106,7 +109,7 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
                 else math.nan
             )
             if curved >> i & 1:
-                # What is left over of the outer two, over s (1 - s), is a line through two values.
+                # The remainder of the outer two, over s (1 - s), is a line through two values.
                 rise = after.values[i] - before.values[i]
                 low = (first.values[i] - before.values[i] - a * rise) / (a * (1.0 - a))
                 high = (last.values[i] - before.values[i] - b * rise) / (b * (1.0 - b))

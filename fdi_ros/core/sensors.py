@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.algebra import along
 from fdi_ros.core.records import Sensors
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -21,13 +22,8 @@ def variance_of(
     sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]
 ) -> float:
     """Error variance of a channel, (rad/s)^2, from the rate along its own axis, rad/s."""
-    axis = sensors.axes[i]
     scale = sensors.scale_std[i] * rate_along
-    timing = sensors.timing_std[i] * (
-        axis[0] * acceleration[0]
-        + axis[1] * acceleration[1]
-        + axis[2] * acceleration[2]
-    )
+    timing = sensors.timing_std[i] * along(sensors.axes[i], acceleration)
     return sensors.noise_std[i] * sensors.noise_std[i] + scale * scale + timing * timing
 
 

@@ -3,9 +3,10 @@
 
 """What arrives: the kinds of input, each named in a row of `fdi_ros.config.settings.INPUTS`.
 
-A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and three compiled functions, which
-are listed in `Source`. They are functions of the kind's own, and not arguments of a common one: so Numba compiles each
-once and keeps the result, and no call is added to the way of a sample.
+A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and
+three compiled functions, which are listed in `Source`. They are functions of the kind's
+own, and not arguments of a common one: so Numba compiles each once and keeps the
+result, and no call is added to the way of a sample.
 """
 
 from __future__ import annotations
@@ -51,20 +52,23 @@ from fdi_ros.model.samples import Array, Bytes, Int
 class Source(ABC):
     """One kind of input, with the settings of one monitor.
 
-    What needs no settings is on the class: the messages of a recording are read before there are any.
+    What needs no settings is on the class: the messages of a recording are read before
+    there are any.
     """
 
     type: ClassVar[str]  #: of its messages: ``sensor_msgs/msg/Imu``
     stamped: ClassVar[bool]
-    """Whether messages carry the stamp of their measurement, and those of several units are aligned by it; else they
-    are stamped when they arrive, and each is a sample of all channels."""
+    """Whether messages carry the stamp of their measurement, and those of several units
+    are aligned by it; else they are stamped when they arrive, and each is a sample of
+    all channels."""
     topic_counts: ClassVar[range]  #: numbers of topics that a monitor takes
     value_counts: ClassVar[
         range
     ]  #: numbers of values that a message may have to be the gyros of a monitor
     called: ClassVar[str]  #: a message in words: ``an Imu``
 
-    # Compiled, per kind -------------------------------------------------------------------------------------------
+    # Compiled, per kind
+    # -------------------------------------------------------------------------------------------
 
     @staticmethod
     @abstractmethod
@@ -85,11 +89,13 @@ class Source(ABC):
     ) -> int:
         """Take in one live message, its bytes, of the input topic ``inlet``, which arrived at ``stamp``, ns.
 
-        ``aligner``, ``live``: as for `fdi_ros.core.live.process`. Returned is `fdi_ros.core.live.MORE` if a sample is
-        ready to be worked, `MALFORMED` if the message was refused, else 0.
+        ``aligner``, ``live``: as for `fdi_ros.core.live.process`. Returned is
+        `fdi_ros.core.live.MORE` if a sample is ready to be worked, `MALFORMED` if the
+        message was refused, else 0.
         """
 
-    # Messages -----------------------------------------------------------------------------------------------------
+    # Messages
+    # -----------------------------------------------------------------------------------------------------
 
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
@@ -147,11 +153,13 @@ class Source(ABC):
         packed = struct.pack(f"{byte_order(data)}{len(values)}d", *values)
         return b"".join((data[:at], packed, data[at + len(packed) :]))
 
-    # Settings -----------------------------------------------------------------------------------------------------
+    # Settings
+    # -----------------------------------------------------------------------------------------------------
 
     names: tuple[str, ...]  #: what each topic brings, as an operator sees it
     units: tuple[str, ...] = ()
-    """Names of the three-axis units that the channels belong to; empty: which of them share one is not known."""
+    """Names of the three-axis units that the channels belong to; empty: which of them
+    share one is not known."""
     timeout: float  #: time after which a topic is silent, s
     max_lag = math.inf  #: how far the stamps of a topic may stay behind the others, s
     delays: tuple[
@@ -219,7 +227,8 @@ class ArraySource(Source):
         self.names, self.timeout = config.topics, config.stale_timeout
 
 
-# sensor_msgs/Imu ------------------------------------------------------------------------------------------------------
+# sensor_msgs/Imu
+# ------------------------------------------------------------------------------------------------------
 
 
 NO_RATE = FIRST_OWN  #: an Imu that measures no angular rate, by its covariance
@@ -281,7 +290,8 @@ class ImuSource(UnitSource):
         return super().explain(code, data, count)
 
 
-# std_msgs/Float64MultiArray -------------------------------------------------------------------------------------------
+# std_msgs/Float64MultiArray
+# -------------------------------------------------------------------------------------------
 
 
 _MANY = 1 << 31
@@ -375,7 +385,8 @@ def _array_receive(
 class ChannelsSource(ArraySource):
     """The values of std_msgs/Float64MultiArray messages.
 
-    The layout may have any dimensions and a ``data_offset``; strides that leave gaps between values are refused.
+    The layout may have any dimensions and a ``data_offset``; strides that leave gaps
+    between values are refused.
     """
 
     type = "std_msgs/msg/Float64MultiArray"

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""State of each channel, and the reason for it, from what is declared and what its values show by themselves."""
+"""State of each channel and the reason, from the declarations and the condition of its values."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ from fdi_ros.core.records import Core, Subset
 
 
 class ChannelState(IntEnum):
-    """State of one channel; the number is what ``~/integrity`` carries."""
+    """State of one channel, the number in ``~/integrity``."""
 
     OK = 0  # delivers, is checked against the others and agrees
     SUSPECT = 1  # left out of the fused rate for now: under suspicion, not confirmed
-    AMBIGUOUS = (
-        2  # one of a named set of channels is faulty; the evidence cannot tell which
-    )
+    AMBIGUOUS = 2  # one channel of a named set is faulty, undecided which
     FAULTY = 3  # declared faulty and left out
     STALE = 4  # gives nothing, or nothing new
     UNCHECKED = 5  # delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run
@@ -31,7 +29,7 @@ class ChannelState(IntEnum):
 
 
 class Reason(str, Enum):
-    """Why a channel is in its state, in words; records hold the place in this list."""
+    """Reason of a state, in words. Records hold the index in this list."""
 
     NONE = ""
     DISAGREES = "disagrees with the others"
@@ -61,7 +59,7 @@ _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _C
     range(8, len(REASONS))
 )
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
-"""State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
+"""State by `Condition`; OK where the condition implies none."""
 _OF_CONDITION = (
     _DISAGREES,
     _DISAGREES,
@@ -109,7 +107,7 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
     """State of every channel; checked: bits of the channels whose fault would have been declared."""
     for i in range(core.settings.n):
         bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
-        # What comes later tells more of the channel.
+        # Later rules override earlier ones.
         state = OK if checked & bit and not core.now.all_repeat else UNCHECKED
         if suspicion & bit:
             state = SUSPECT

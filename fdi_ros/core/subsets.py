@@ -3,7 +3,8 @@
 
 """Sets of channels, and what depends on the set alone: its least-squares rate and what a method can do with it.
 
-A set has one bit for each channel, from the first up; its number is its place in tables of all sets.
+A set has one bit for each channel, from the first up; its number is its place in tables
+of all sets.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from fdi_ros.model.geometry import (
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 
-MIN_SPARE_RATIO = 0.1  # worst over best axis of the rest, below which leaving out costs more than a wider covariance
+# worst over best axis of the rest, below which leaving out costs more than a wider
+# covariance
+MIN_SPARE_RATIO = 0.1
 
 
 def mask_of(channels: Iterable[int]) -> int:
@@ -106,6 +109,15 @@ def prepare_capability(
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
     seen = bits[runs] & (np.sqrt(np.clip(share, 0, None)) >= MIN_SENSITIVITY)
     subsets["detectable"][runs] = (seen << np.arange(n)).sum(axis=1)
+
+
+@compiled
+def number_in(mask: int, n: int) -> int:
+    """Return how many of n channels are in a set."""
+    count = 0
+    for i in range(n):
+        count += mask >> i & 1
+    return count
 
 
 @compiled

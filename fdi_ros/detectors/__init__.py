@@ -3,7 +3,8 @@
 
 """Which channels disagree: one file per method of a paper, one row per method in `DETECTORS`.
 
-The table names classes without importing them: help and completion need the names alone, a monitor one class.
+The table names classes without importing them: help and completion need the names
+alone, a monitor one class.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ def create_detector(
     Raises
     ------
     DetectorError
-        If there is no such detector, it does not take an option, or it cannot run on this geometry.
+        If there is no such detector, it does not take an option, or it cannot run on
+        this geometry.
     ConfigError
         If an option is out of its range.
     """

@@ -3,12 +3,14 @@
 
 """The contract of a detector: samples in, verdicts out; it never votes, logs, or holds on to what has ended.
 
-A method is a class that prepares constants, once, from geometry and noise, and a compiled function that judges one
-sample with them. Both stand in the method's own module:
+A method is a class that prepares constants, once, from geometry and noise, and a
+compiled function that judges one sample with them. Both stand in the method's own
+module:
 
 - ``Constants``: a record whose first field is ``sensors: Sensors``; filled by the class, in NumPy.
 - ``State``: a record of what the method remembers between samples; all zero is a fresh one.
-- ``judge(constants, state, sample, verdict)``: compiled, called for each sample through its address.
+- ``judge(constants, state, sample, verdict)``: compiled, called for each sample through
+  its address.
 """
 
 from __future__ import annotations
@@ -46,8 +48,8 @@ MOST_ROWS = 512  # sets of channels for which constants are kept at most
 class Verdict(NamedTuple):
     """Verdicts of a detector on N samples of n channels.
 
-    A sample it could not judge (too few channels present for this method) has a NaN statistic and threshold and
-    no alarm: not judged is not healthy.
+    A sample it could not judge (too few channels present for this method) has a NaN
+    statistic and threshold and no alarm: not judged is not healthy.
     """
 
     statistic: Array  #: (N,) the figure compared with the threshold
@@ -55,10 +57,12 @@ class Verdict(NamedTuple):
     alarm: Mask  #: (N,) at least one channel is faulty
     suspects: Mask  #: (N, n) the channels that may be faulty; none without alarm
     isolated: Mask
-    """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the evidence cannot tell which."""
+    """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the
+    evidence cannot tell which."""
     error: Array  #: (N, n) estimated error of each suspect, rad/s; 0 elsewhere
     scores: Array
-    """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a channel not judged."""
+    """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a
+    channel not judged."""
 
 
 @record
@@ -71,8 +75,9 @@ class NoState:
 class Detector(ABC):
     """Base of all detectors: checks the shape, and judges a sample with absent channels by the channels left.
 
-    A channel whose value is NaN or infinite is absent from that sample. For each set of channels present constants of
-    the same method and options are prepared once, and a memory of its own is kept.
+    A channel whose value is NaN or infinite is absent from that sample. For each set of
+    channels present constants of the same method and options are prepared once, and a
+    memory of its own is kept.
 
     Parameters
     ----------
@@ -89,7 +94,8 @@ class Detector(ABC):
     State: type = NoState
     judge: Callback
     takes_any: ClassVar[bool] = False
-    """One row of constants and one memory serve all sets of channels; else each set has its own."""
+    """One row of constants and one memory serve all sets of channels; else each set has
+    its own."""
     sample_rate = 100.0  #: Hz, of samples without stamps
 
     def __init__(
@@ -167,7 +173,8 @@ class Detector(ABC):
                 self._fewer[mask] = None
                 self.refusals[mask] = str(error)
             if len(self._fewer) > MOST_ROWS:
-                # A stream of random absences must not fill the memory: the oldest set is built again if it comes.
+                # A stream of random absences must not fill the memory: the oldest set
+                # is built again if it comes.
                 self._fewer.pop(next(iter(self._fewer)))
         return self._fewer[mask]
 
@@ -177,14 +184,15 @@ class Detector(ABC):
         Parameters
         ----------
         z
-            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A finite value beyond
-            `LARGEST_RATE` counts as that.
+            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A
+            finite value beyond `LARGEST_RATE` counts as that.
         acceleration
-            Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing term; None is zero.
+            Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing
+            term; None is zero.
 
         Returns
         -------
-        Verdict on each sample, one after the other: how a stream is cut into blocks changes nothing.
+        Verdict on each sample. How a stream is cut into blocks changes nothing.
 
         Raises
         ------
@@ -224,7 +232,8 @@ class Detector(ABC):
 class _Rows:
     """Constants and memories of a detector and of its kin on fewer channels, one row each.
 
-    Compiled code reaches them by their address: they never move. Room for all rows costs no memory until it is used.
+    Compiled code reaches them by their address: they never move. Room for all rows
+    costs no memory until it is used.
     """
 
     def __init__(self, detector: Detector) -> None:

@@ -3,9 +3,10 @@
 
 """The case that evidence opens: whether it stands against the noise of its own time.
 
-As a case is opened, the states go back to before the onset (`predict_from`), and the mean since then is to be explained
-(`fdi_ros.detectors.naming`) against all that is not known of the sensors. A case lasts until its evidence has gone, or
-its channels are left out.
+As a case is opened, the states go back to before the onset (`predict_from`), and the
+mean since then is to be explained (`fdi_ros.detectors.naming`) against all that is not
+known of the sensors. A case lasts until its evidence has gone, or its channels are left
+out.
 """
 
 from __future__ import annotations
@@ -54,27 +55,36 @@ from fdi_ros.estimator.noise import BLOCK, SCALES, update_unknown
 from fdi_ros.estimator.snapshots import is_after_hole, move_biases, predict_from
 
 STANDS = 0.6
-"""Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case: less
-than the sums need, as what is not known is counted here in full."""
+"""Share of the logarithm of the run length that a hypothesis has, against all that is
+not known, to open a case: less than the sums need, as what is not known is counted here
+in full."""
 ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
-RENAME = 16  # channels are named again when the time since the onset has grown by this part: little is new before
+# channels are named again when the time since the onset has grown by this part: little
+# is new before
+RENAME = 16
 SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
 SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
-"""s that a name must stand, of one channel, where at most `FEW_CHECKS` check it, and of two: several faults look like
-one at first, and with so few checks three faults explain anything."""
+"""s that a name must stand, of one channel, where at most `FEW_CHECKS` check it, and of
+two: several faults look like one at first, and with so few checks three faults explain
+anything."""
 FEW_CHECKS = 3
 CLEAR = 5000.0
-"""Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
-five standard deviations, (0.05^2) 2 CLEAR = 25."""
+"""Log odds of a single fault from which it is named at once: a second error a twentieth
+as large would show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS, TURNED = 6.0, 0.3
-"""What is left of other channels in a block, if only those named are faulty: within so many standard deviations, that
-noise does not reach in a flight, and so much of the others' error, as axes are learned while they are watched."""
+"""What is left of other channels in a block, if only those named are faulty: within so
+many standard deviations, that noise does not reach in a flight, and so much of the
+others' error, as axes are learned while they are watched."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
-"""All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
+"""All biases may move by so many rad/s within so many s (warming, rectified vibration):
+that is no fault."""
 DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
-"""A slow drift is looked for over so many s (480), as long as states are kept, and half as long, so many times."""
-LARGEST_STEP = 0.015  # by so much at once at most: motors that start move biases by some 5 mrad/s, and no more
+"""A slow drift is looked for over so many s (480), as long as states are kept, and half
+as long, so many times."""
+# by so much at once at most: motors that start move biases by some 5 mrad/s, and no
+# more
+LARGEST_STEP = 0.015
 FASTEST = (
     2.5  # and so many times as fast as that for a moment: warming is quickest at first
 )
@@ -155,7 +165,8 @@ def look_for_case(params: Constants, state: State) -> None:
 def look_for_drift(params: Constants, state: State) -> None:
     """Open a case where the rate of change of a bias is none of those that biases have.
 
-    What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the square of a normal value.
+    What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the
+    square of a normal value.
     """
     kf, case, layout, worst = state.estimator, state.case, params.layout, 0.0
     if case.moved > 0.0 and kf.seconds - case.moved_at < LONGEST_DRIFT:
@@ -231,8 +242,9 @@ def open_case(params: Constants, state: State) -> None:
 def shows_others(params: Constants, state: State, named: int) -> bool:
     """Whether single blocks since the onset show errors of other channels than those named.
 
-    The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
-    its own way in every block, however large it is in each.
+    The mean of two that come and go, or that began one after the other, may look like a
+    third. That of a channel points its own way in every block, however large it is in
+    each.
     """
     kf, case, scale = state.estimator, state.case, state.scales[BLOCK]
     information, n = kf.block_information, params.sensors.n
@@ -282,38 +294,59 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
 @compiled
 def name_channels(params: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
-    kf, case, n = state.estimator, state.case, params.sensors.n
-    inference = case.inference
+    kf, case, inference = state.estimator, state.case, state.case.inference
     size = kf.samples - case.onset + 1
     if size * params.period > LONG_TIME:
         # A drift is largest at last.
         size = size // 2 + 1
-    set_mean(params, kf, inference, size)
-    explain(params, inference)
-    # By so much of the error found the model may be wrong.
-    misfit = MISFIT * inference.largest
-    for i in range(n):
-        inference.covariance[i, i] += misfit * misfit
-    explain(params, inference)
-    std = 0.0 if case.isolated else moved_by(inference, n)
+    explain_mean(params, kf, inference, size)
+    std = 0.0 if case.isolated else moved_by(inference, params.sensors.n)
     if std > 0.0 and let_biases_move(params, state, std):
         return
     case.next = kf.samples + max(size // RENAME, 1)
     if inference.common and shows_others(params, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
     case.suspects = inference.union
+    isolate(params, kf, case)
+    leave_aside(params, state)
+
+
+@compiled
+def explain_mean(
+    params: Constants, kf: Estimator, inference: Inference, size: int
+) -> None:
+    """Explain the mean of the last ``size`` samples, by a model that may be wrong by a share of the error found."""
+    set_mean(params, kf, inference, size)
+    explain(params, inference)
+    misfit = MISFIT * inference.largest
+    for i in range(params.sensors.n):
+        inference.covariance[i, i] += misfit * misfit
+    explain(params, inference)
+
+
+@compiled
+def isolate(params: Constants, kf: Estimator, case: Case) -> None:
+    """Call channels faulty that all likely hypotheses have had in common for long enough."""
+    inference = case.inference
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, kf.samples
-    settled = SETTLED if checks(inference.mask, n) > FEW_CHECKS else SETTLED_AMONG_FEW
-    if inference.common & (inference.common - 1):
-        settled = SETTLED_TOGETHER
-    elif inference.log_odds >= CLEAR:
-        settled = 0.0
-    if inference.common and (kf.samples - case.since) * params.period >= settled:
+    stood = (kf.samples - case.since) * params.period
+    if inference.common and stood >= time_to_settle(params, inference):
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0
-    leave_aside(params, state)
+
+
+@compiled
+def time_to_settle(params: Constants, inference: Inference) -> float:
+    """How long a name must stand, s."""
+    if inference.common & (inference.common - 1):
+        return SETTLED_TOGETHER
+    if inference.log_odds >= CLEAR:
+        return 0.0
+    if checks(inference.mask, params.sensors.n) > FEW_CHECKS:
+        return SETTLED
+    return SETTLED_AMONG_FEW
 
 
 @compiled

@@ -3,9 +3,10 @@
 
 """Which channels explain a mean: the odds of every hypothesis, and the smallest set that holds the culprit.
 
-The mean y (n,) of the values over some time, less what is known of their errors, is ``H w + D f + e`` with e normal of
-covariance M, f the errors and D (n, k) the directions of a hypothesis: a channel, a pair, a unit as a whole, its gain,
-its delay. docs/methods.md#naming has the mathematics, in the same symbols.
+The mean y (n,) of the values over some time, less what is known of their errors, is
+``H w + D f + e`` with e normal of covariance M, f the errors and D (n, k) the directions of
+a hypothesis: a channel, a pair, a unit as a whole, its gain, its delay.
+docs/methods.md#naming has the mathematics, in the same symbols.
 """
 
 from __future__ import annotations
@@ -29,34 +30,48 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, invert
+from fdi_ros.core.algebra import along, dot, dot_in, invert, square
+from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.core.records import Matrix, Parity
-from fdi_ros.estimator.error_states import fill_signals, project, subtract_errors
+from fdi_ros.estimator.error_states import (
+    Projection,
+    fill_signals,
+    project,
+    subtract_errors,
+)
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
-from fdi_ros.estimator.noise import BLOCK, BURST, MOTION
+from fdi_ros.estimator.noise import BLOCK, BURST, MOTION, Noise
 from fdi_ros.model.geometry import ROUNDING
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""
 COINCIDENCE = 0.1
-"""Prior odds of all pairs of one channel together, and of each way in which any unit is wrong, against a channel. It
-is large for what it stands for: of three parallel gyros, two with the same fault look like the third with the
-opposite one, and only the odds of such a coincidence keep a healthy gyro from being named."""
+"""Prior odds of all pairs of one channel together, and of each way in which any unit is
+wrong, against a channel. It is large for what it stands for: of three parallel gyros,
+two with the same fault look like the third with the opposite one, and only the odds of
+such a coincidence keep a healthy gyro from being named."""
 TWO_CHECKS = COINCIDENCE / 2
-"""Of the odds of pairs where there are two checks: two of five explain anything, and no fault would ever be named."""
+"""Of the odds of pairs where there are two checks: two of five explain anything, and no
+fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.01
-"""Of a unit that is wrong as a whole: gain, as by a wrong range, and delay in s, as of a clock that was set."""
-SPREAD = 1.3  # logarithm that each amplitude costs, for sizes that may be anything over four decades
-MISFIT = 0.004  # share of the largest error by which the model may be wrong: axes and scale factors
+"""Of a unit that is wrong as a whole: gain, as by a wrong range, and delay in s, as of
+a clock that was set."""
+LEAST_PRESENCE = (
+    0.9  # share of the samples that a channel has delivered where its mean counts
+)
+# logarithm that each amplitude costs, for sizes that may be anything over four decades
+SPREAD = 1.3
+# share of the largest error by which the model may be wrong: axes and scale factors
+MISFIT = 0.004
 FIT, FIT_PER_CHECK = 6.0, 2.5
-"""Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom. Noise alone exceeds
-it once in 240 at most."""
+"""Chi-square of what is left unexplained at most: so much, and so much for each degree
+of freedom. Noise alone exceeds it once in 240 at most."""
 SET_MARGIN = 5.0
-"""A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
-that it holds none of them is far less likely."""
+"""A set holds all that are wrong with a probability of being incomplete of so many
+times what a name may be wrong by: that it holds none of them is far less likely."""
 UNEXPLAINED_SHARE = 0.2
-"""All biases have moved where the best hypothesis of a fault leaves this share of the chi-square: a fault of one or two
-channels leaves hardly any, were it ever so large."""
+"""All biases have moved where the best hypothesis of a fault leaves this share of the
+chi-square: a fault of one or two channels leaves hardly any, were it ever so large."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -79,6 +94,8 @@ class Inference:
     angular_acceleration: (
         Channels  # angular acceleration along each channel, lately largest, rad/s^2
     )
+    change: Vector  # of the body rate over that time, rad/s
+    at: Projection  # of the states in that motion
     parity: Parity
     u: Channels  # A y, s/rad
     total: Real  # y' A y / 2
@@ -96,7 +113,9 @@ class Inference:
     whole: Wholes  # by the hypothesis the gyros are healthy, their unit is not
     # The answer:
     log_odds: Real  # of the likeliest hypothesis against none
-    common: Mask  # channels that all likely hypotheses have in common, if the likeliest fits: they are faulty
+    # channels that all likely hypotheses have in common, if the likeliest fits: they
+    # are faulty
+    common: Mask
     union: Mask  # channels of which at least one is faulty
     likeliest: Mask  # channels of the likeliest hypothesis
     fit_of_best: Real  # what it explains of ``total``
@@ -108,70 +127,86 @@ class Inference:
 
 @compiled
 def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
-    """Set the mean of the last so many samples to be explained, and its covariance."""
-    n, layout, before, noise = (
-        params.sensors.n,
-        params.layout,
-        inference.before,
-        kf.noise,
-    )
+    """Set the mean of the last ``size`` samples to be explained, and its covariance."""
+    n, layout, before = params.sensors.n, params.layout, inference.before
     total_before(kf, kf.samples - size + 1, before, n)
+    # The sums are kept at some moments only.
     size = kf.samples - before.sample
-    inference.mask = 0
-    for i in range(n):
-        count = kf.total.count[i] - before.count[i]
-        if kf.mask >> i & 1 and count > 0.9 * size:
-            inference.mask |= 1 << i
-            inference.y[i] = (kf.total.values[i] - before.values[i]) / count
-    inference.judged = inference.mask & kf.judged
-    speed = 0.0
-    # At rest what passes for a rate is the fault itself, and no motion.
-    moves = 1.0 if noise.regime == MOTION else 0.0
-    for a in range(3):
-        inference.rate[a] = moves * (kf.total.rate[a] - before.rate[a]) / size
-        speed += inference.rate[a] * inference.rate[a]
-    # A turn that ends as it began leaves no trace of a delay in the mean.
-    part = min(1.0, 3.0 * params.length / size)
-    for i in range(n):
-        change = 0.0
-        for a in range(3):
-            change += params.sensors.axes[i, a] * (kf.rate[a] - before.instant[a])
-        inference.angular_acceleration[i] = moves * change / (size * params.period)
-    signals = kf.block_at.signals
+    fill_mean(params, kf, inference, size)
+    signals = inference.at.signals
     fill_signals(layout, inference.rate, inference.angular_acceleration, signals)
     subtract_errors(layout, kf.states, signals, inference.y, inference.y)
-    project(layout, kf.states, kf.block_at)
-    lasts = size >= params.length
+    project(layout, kf.states, inference.at)
     for i in range(n):
         for j in range(n):
-            inference.covariance[i, j] = kf.block_at.covariance[i, j]
-        v, over = noise.now.sample[i], noise.longest[i]
-        if lasts:
-            v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
-        else:
-            v = max(
-                v * max(1.0, BURST * noise.quick[i]),
-                noise.now.block[i] * over * size / params.length,
-            )
-        bent = params.nonlinearity * params.nonlinearity * speed
-        inference.covariance[i, i] += v / size + kf.peak_extra[i] * part + bent
-        place = layout.delays[params.unit[i]]
-        if place >= 0:
-            swing = moves * kf.peak_turn[i] * part
-            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
-    add_line(kf, inference, n, size, lasts)
+            inference.covariance[i, j] = inference.at.covariance[i, j]
+    add_noise(params, kf, inference, size)
+    add_line(params, kf, inference, size)
 
 
 @compiled
-def add_line(
-    kf: Estimator, inference: Inference, n: int, size: int, lasts: bool
+def fill_mean(
+    params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
-    """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
+    """Work out the mean of the values and of the motion since the sums before."""
+    n, before = params.sensors.n, inference.before
+    inference.mask = 0
+    for i in range(n):
+        count = kf.total.count[i] - before.count[i]
+        if kf.mask >> i & 1 and count > LEAST_PRESENCE * size:
+            inference.mask |= 1 << i
+            inference.y[i] = (kf.total.values[i] - before.values[i]) / count
+    inference.judged = inference.mask & kf.judged
+    # At rest a seeming rate is the fault itself, and no motion.
+    moves = 1.0 if kf.noise.regime == MOTION else 0.0
+    for a in range(3):
+        inference.rate[a] = moves * (kf.total.rate[a] - before.rate[a]) / size
+        inference.change[a] = kf.rate[a] - before.instant[a]
+    for i in range(n):
+        change = moves * along(params.sensors.axes[i], inference.change)
+        inference.angular_acceleration[i] = change / (size * params.period)
+
+
+@compiled
+def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
+    """Variance of the mean of ``size`` samples of channel i by noise, (rad/s)^2."""
+    variance, slow = noise.now.sample[i], noise.longest[i]
+    if size >= params.length:
+        colour = max(1.0, noise.now.level[BLOCK, i] * slow)
+        variance *= noise.unknown[i] * colour
+    else:
+        burst = variance * max(1.0, BURST * noise.quick[i])
+        variance = max(burst, noise.now.block[i] * slow * size / params.length)
+    return variance / size
+
+
+@compiled
+def add_noise(
+    params: Constants, kf: Estimator, inference: Inference, size: int
+) -> None:
+    """Add to the covariance noise, and what motion makes of delays and of scale that is not linear."""
+    # A turn that ends as it began leaves no trace of a delay in the mean.
+    part = min(1.0, 3.0 * params.length / size)
+    moves = 1.0 if kf.noise.regime == MOTION else 0.0
+    nonlinear = params.nonlinearity * params.nonlinearity * square(inference.rate)
+    for i in range(params.sensors.n):
+        noise = noise_of_mean(params, kf.noise, i, size)
+        inference.covariance[i, i] += noise + kf.peak_extra[i] * part + nonlinear
+        place = params.layout.delays[params.unit[i]]
+        if place >= 0:
+            swing = moves * kf.peak_turn[i] * part
+            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
+
+
+@compiled
+def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
+    """Add vibration to the covariance: channels that show the same line are no independent witnesses."""
+    n, longest = params.sensors.n, kf.noise.longest
     for i in range(n):
         for j in range(n):
-            slow = (
-                math.sqrt(kf.noise.longest[i] * kf.noise.longest[j]) if lasts else 1.0
-            )
+            slow = 1.0
+            if size >= params.length:
+                slow = math.sqrt(longest[i] * longest[j])
             inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
 
 
@@ -189,9 +224,7 @@ def reduce(inference: Inference, n: int, k: int) -> None:
     """Work out D' u and D' A D for the first k directions."""
     direction, information = inference.direction, inference.parity.information
     for p in range(k):
-        inference.along[p] = 0.0
-        for i in range(n):
-            inference.along[p] += direction[p, i] * inference.u[i]
+        inference.along[p] = dot(direction[p], inference.u, n)
         for q in range(p + 1):
             total = 0.0
             for i in range(n):
@@ -213,9 +246,7 @@ def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
     invert(inference.matrix, k, inference.inverse)
     inference.fit, t = 0.0, given
     for p in range(k):
-        inference.amplitude[p] = 0.0
-        for q in range(k):
-            inference.amplitude[p] += inference.inverse[p, q] * inference.along[q]
+        inference.amplitude[p] = dot(inference.inverse[p], inference.along, k)
         inference.fit += 0.5 * inference.amplitude[p] * inference.along[p]
         if given == 0.0:
             t += (
@@ -324,14 +355,10 @@ def add_units(params: Constants, inference: Inference) -> None:
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
-                along = inference.angular_acceleration[i]
+                size = inference.angular_acceleration[i]
                 if way == 0:
-                    along = (
-                        axes[i, 0] * rate[0]
-                        + axes[i, 1] * rate[1]
-                        + axes[i, 2] * rate[2]
-                    )
-                inference.direction[0, i] = along if inside >> i & 1 else 0.0
+                    size = along(axes[i], rate)
+                inference.direction[0, i] = size if inside >> i & 1 else 0.0
             odds = log_ratio(inference, n, 1, std * std)
             if odds > NO_LOG:
                 add(inference, n, 1, prior + odds, inside, True)
@@ -386,8 +413,8 @@ def update_best(inference: Inference, n: int) -> None:
 def choose(inference: Inference, n: int, confidence: float) -> None:
     """Take the most likely hypotheses until their odds make up the confidence.
 
-    Where all of them contain a channel, it is faulty; but where some of them say that a unit measures motion wrongly,
-    its gyros may all be healthy.
+    Where all of them contain a channel, it is faulty; but where some of them say that a
+    unit measures motion wrongly, its gyros may all be healthy.
     """
     update_best(inference, n)
     top, total = inference.log_odds, 0.0
@@ -408,7 +435,8 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
         inference.odds[best] = 0.0
         common &= inference.members[best]
         some_whole = some_whole or inference.whole[best] != 0
-    # Of a unit that is off in all its channels each is suspect, and none is sure: some may be off by very little.
+    # Of a unit that is off in all its channels each is suspect, and none is sure: some
+    # may be off by very little.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
     named = inference.fitted and common > 0 and few and not some_whole
     inference.common = common if named else 0
@@ -428,10 +456,8 @@ def explain(params: Constants, inference: Inference) -> None:
     )
     inference.total = 0.0
     for i in range(n):
-        inference.u[i] = 0.0
-        for j in range(n):
-            if inference.mask >> j & 1:
-                inference.u[i] += inference.parity.information[i, j] * inference.y[j]
+        information = inference.parity.information[i]
+        inference.u[i] = dot_in(information, inference.y, n, inference.mask)
         if inference.mask >> i & 1:
             inference.total += 0.5 * inference.u[i] * inference.y[i]
     inference.count = 0
@@ -444,7 +470,8 @@ def explain(params: Constants, inference: Inference) -> None:
 def moved_by(inference: Inference, n: int) -> float:
     """By how much all biases have moved, standard deviation, if that is what the mean shows; 0: it is not.
 
-    So it is where no hypothesis of a few channels leaves noise, and the best of them much of what is to be explained.
+    So it is where no hypothesis of a few channels leaves noise, and the best of them
+    much of what is to be explained.
     """
     residual = 2.0 * (inference.total - inference.fit_of_best)
     if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:

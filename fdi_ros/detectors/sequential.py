@@ -3,9 +3,9 @@
 
 """The detector that flies: the path of a sample through the estimator, the sums, and the case that they open.
 
-The sums (`fdi_ros.detectors.sums`) are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of
-variance one, if what is known of the sensors holds. A case lasts until its evidence has gone, or its channels are left
-out.
+The sums (`fdi_ros.detectors.sums`) are of innovations of the estimator
+(`fdi_ros.estimator.estimator`): white and of variance one, if what is known of the
+sensors holds. A case lasts until its evidence has gone, or its channels are left out.
 """
 
 from __future__ import annotations
@@ -90,15 +90,19 @@ from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
 
-LEAST_TIME = 0.02  # s that a fault lasts before it is declared: two samples at 100 Hz, as one value decides nothing
+# s that a fault lasts before it is declared: two samples at 100 Hz, as one value
+# decides nothing
+LEAST_TIME = 0.02
 OUTLIER, ALIKE = 5.5, 0.95
-"""A value so many standard deviations off, as noise makes one in 2e7, is left out of the fused rate of its sample; so
-are those nearly as far off, of which each may be the culprit."""
+"""A value so many standard deviations off, as noise makes one in 2e7, is left out of
+the fused rate of its sample; so are those nearly as far off, of which each may be the
+culprit."""
 PAUSE = 5.0
-"""s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
+"""s; after a longer hole in the stream the vehicle may be in another kind of motion:
+its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
-"""Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any,
-calibrated or not."""
+"""Scale error, sampling instant of a channel in s, and what is not linear in the rate:
+less is not believed of any, calibrated or not."""
 FEWEST_BLOCKS = 3  # in a row from which the acceleration in the middle of one is known
 SHORT = (
     1.0 - 1e-9
@@ -234,7 +238,8 @@ def look_for_slow_faults(params: Constants, state: State) -> None:
 def forget_suspicion(params: Constants, state: State) -> None:
     """Begin the search anew.
 
-    Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is re-estimated.
+    Clocks that were set are no fault that lasts: of a unit that was declared as a whole
+    the delay is re-estimated.
     """
     kf, case = state.estimator, state.case
     inflate_delays(
@@ -289,7 +294,8 @@ def fill_outliers(params: Constants, state: State, verdict: SampleVerdict) -> No
         far = max(far, kf.distance[i])
     for i in range(params.sensors.n):
         if largest > OUTLIER:
-            # Of all statistics with equal weights that of the culprit is the largest (Cauchy and Schwarz).
+            # Of all statistics with equal weights that of the culprit is the largest
+            # (Cauchy and Schwarz).
             verdict.outliers[i] = kf.distance[i] > ALIKE * far
         elif state.case.open:
             verdict.outliers[i] = kf.excluded_from_rate >> i & 1
@@ -302,7 +308,8 @@ def fill_verdict(
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     unsure = case.open and case.isolated == 0
-    # What the channels disagree by now beyond all that is known, as in a shock that they measure at other instants.
+    # What the channels disagree by now beyond all that is known, as in a shock that
+    # they measure at other instants.
     odd = 1.0 if case.open else kf.odd
     fill_scores(params, state.estimator, state.scales, verdict.scores)
     for i in range(n):
@@ -315,7 +322,8 @@ def fill_verdict(
         sample.estimate.bias[i] = kf.states.x[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         for j in range(n):
-            # While it is open which channels are faulty, each may be off by what it is if it is one of them.
+            # While it is open which channels are faulty, each may be off by what it is
+            # if it is one of them.
             doubt = case.inference.spread[i, j] if unsure else 0.0
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
         if unsure and kf.mask >> i & 1:
@@ -402,22 +410,27 @@ def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> 
 class Sequential(Detector):
     r"""Shiryaev-Roberts sums of the innovations of an error-state estimator; channels named by the odds since onset.
 
-    The estimator knows bias, scale error, misalignment and delay of the channels, each with its uncertainty, and the
-    noise of the moment. Sums over channels, signs, sizes and time scales of a fault tell where its innovations are not
-    white: where their mean reaches `run_length`, a hypothesis that explains the values since the onset has to stand
-    against everything that is not known of the sensors. While the alarm stands, the smallest set of hypotheses that
-    holds the truth with `confidence` is named; `isolated` if all of it have a channel in common and the best of it
-    leaves no more than noise. `Verdict.statistic` is the logarithm of one plus the mean of all sums: below the
-    threshold without an alarm, never below it with one, and 0 while evidence is void. docs/methods.md has the rest.
+    The estimator knows bias, scale error, misalignment and delay of the channels, each
+    with its uncertainty, and the noise of the moment. Sums over channels, signs, sizes
+    and time scales of a fault tell where its innovations are not white: where their
+    mean reaches `run_length`, a hypothesis that explains the values since the onset has
+    to stand against everything that is not known of the sensors. While the alarm
+    stands, the smallest set of hypotheses that holds the truth with `confidence` is
+    named; `isolated` if all of it have a channel in common and the best of it leaves no
+    more than noise. `Verdict.statistic` is the logarithm of one plus the mean of all
+    sums: below the threshold without an alarm, never below it with one, and 0 while
+    evidence is void. docs/methods.md has the rest.
 
     Parameters
     ----------
     geometry
         Sensitivity axes.
     noise
-        Error model of a healthy channel: `scale_std` and `bias_std` are what the estimator begins with.
+        Error model of a healthy channel: `scale_std` and `bias_std` are what the
+        estimator begins with.
     run_length
-        Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8 (1e-3 an hour at 100 Hz).
+        Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8
+        (1e-3 an hour at 100 Hz).
     false_alarms_per_hour
         The other way to give it, with `sample_rate`.
     sample_rate

@@ -3,8 +3,9 @@
 
 """Evidence at four time scales: Shiryaev-Roberts sums over channels, signs and sizes of a fault.
 
-The values are innovations of samples, of blocks, and of longer times. A large sum is looked back at: since when its
-channel is off, and how far beyond the scatter of that same time.
+The values are innovations of samples, of blocks, and of longer times. A large sum is
+looked back at: since when its channel is off, and how far beyond the scatter of that
+same time.
 """
 
 from __future__ import annotations
@@ -41,10 +42,14 @@ from fdi_ros.model.samples import Array
 SIZES, KEPT = 6, 64  # of a fault; values of each time scale that are looked back at
 PER_BLOCK = (0, 1, 6, 48)  # blocks in a value of each time scale; 0: samples
 SMALLEST = 0.2
-"""Smallest size of a fault, in standard deviations at its time scale; each next one is twice as large, up to 6.4. From
-one to the next at most 11 % of the delay are lost, and smaller faults are found at a longer time scale."""
-FIRST_LONG = 2  # sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
-STEP_LIMIT = 7.0  # a value counts as this many standard deviations at most (Huber 1965): beyond the largest size
+"""Smallest size of a fault, in standard deviations at its time scale; each next one is
+twice as large, up to 6.4. From one to the next at most 11 % of the delay are lost, and
+smaller faults are found at a longer time scale."""
+# sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
+FIRST_LONG = 2
+# a value counts as this many standard deviations at most (Huber 1965): beyond the
+# largest size
+STEP_LIMIT = 7.0
 CEILING = (
     1e6  # sums stay below so many times the threshold: what has passed is forgotten
 )
@@ -130,8 +135,8 @@ def look_back(
 
     Returns
     -------
-    Values since the onset, and the logarithm of the likelihood ratio: Student's, with the degrees of freedom that the
-    learned noise counts for and those of the values themselves.
+    Values since the onset, and the logarithm of the likelihood ratio: Student's, with
+    the degrees of freedom of the learned noise and of the values themselves.
     """
     best, since, total = 0.0, 0, 0.0
     for k in range(scale.kept):

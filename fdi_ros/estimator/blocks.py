@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.algebra import dot_in, variance_along
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, fill_parity
+from fdi_ros.core.subsets import number_in
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
@@ -32,18 +34,20 @@ from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.estimator.shared_noise import UNEQUAL
 
 TURNING = 20.0
-"""Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
-not be taken for motion, or delays would be learned as zero."""
-LEAST_REDUNDANCY = 1e-3  # share of a channel's own error in its residual, below which no method judges it
-PEAK = 0.8  # what a peak of motion fades to with every block: gone in half a second
+"""Squared angular acceleration over its noise variance from which it counts as motion. Noise taken
+for motion would teach delays of zero."""
+# share of a channel's own error in its residual, below which no method judges it
+LEAST_REDUNDANCY = 1e-3
+PEAK = 0.8  # decay of a motion peak per block: gone after half a second
 
 
 @compiled
 def update_acceleration(params: Constants, kf: Estimator) -> float:
     """Angular acceleration in the middle of the block before, into ``kf.acceleration``; return its variance by noise.
 
-    It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
-    blocks are too slow for, that of those, unless samples between them are missing.
+    It is the difference of block means. Where the rates at the ends of the block
+    contradict that difference, as under vibration faster than a block, ``kf.shaken``
+    holds the square of the contradiction.
     """
     ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
     span, whole = kf.ended[1] - kf.ended[2], kf.times[0] - kf.times[2]
@@ -71,24 +75,25 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
     )
     if apart <= TURNING * single or span > 2.0 * params.length * params.period:
         return noise
-    # Of vibration that blocks are too slow for nobody knows what it is: what channels see of it is no delay.
+    # Vibration faster than a block is not resolved, so its traces must not be learned as a delay.
     kf.shaken = apart
     return noise
 
 
 @compiled
 def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
-    """Angular acceleration along each channel in the block before, and what of it is not linear.
+    """Update the angular acceleration along each channel in the block before, and the extra variance.
 
-    The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
-    not linear in the rate.
+    The extra variance goes beyond noise and states: the second order of delays, the
+    sampling instants of single channels, and scale errors that are not linear in the
+    rate.
     """
     n, states = params.sensors.n, kf.states
     ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
     noise, square = update_acceleration(params, kf), 0.0
     for a in range(3):
         square += kf.acceleration[a] * kf.acceleration[a]
-    # At rest a rate that none of the channels agree on is a fault, and no motion.
+    # At rest a rate on which no channels agree is a fault, not motion.
     turning = square > TURNING * noise + kf.shaken and kf.noise.regime == MOTION
     kf.turning, kf.turn_noise = turning, noise
     speed = kf.rates[1, 0] ** 2 + kf.rates[1, 1] ** 2 + kf.rates[1, 2] ** 2
@@ -122,7 +127,7 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def judge_block(params: Constants, kf: Estimator) -> float:
-    """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable."""
+    """Work out the innovations A (y - C x) of the block before; return the block's weight: 1, or less if improbable."""
     n, noise, layout = params.sensors.n, kf.noise, params.layout
     for a in range(3):
         kf.signal_rate[a] = kf.rates[1, a] if noise.regime == MOTION else 0.0
@@ -130,57 +135,48 @@ def judge_block(params: Constants, kf: Estimator) -> float:
     project(layout, kf.states, kf.block_at)
     mask = kf.masks[1]
     for i in range(n):
-        # Of a unit that is slower than the others the samples lie otherwise in the block.
+        # Samples of a slower unit lie elsewhere in the block.
         kf.means[1, i] -= kf.angular_acceleration[i] * kf.middles[1, i]
         for j in range(n):
             kf.matrix[i, j] = kf.block_at.covariance[i, j]
-        kf.matrix[i, i] += (
-            noise.now.block[i] * noise.longest[i] / params.length + kf.extra[i]
-        )
+        kf.block_noise[i] = noise.now.block[i] * noise.longest[i] / params.length
+        kf.matrix[i, i] += kf.block_noise[i] + kf.extra[i]
     fill_joint_parity(kf.block_parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
     subtract_errors(
         layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
     )
-    chi, free = 0.0, -3.0
+    chi, information = 0.0, kf.block_parity.information
     for i in range(n):
-        total = share = 0.0
-        information = kf.block_parity.information
+        kf.block_values[i], noise.share[i] = 0.0, 1.0
         if mask >> i & 1:
-            for j in range(n):
-                if mask >> j & 1:
-                    total += information[i, j] * kf.block_innovation[j]
-                    variance = noise.now.block[j] * noise.longest[j] / params.length
-                    share += information[i, j] * information[i, j] * variance
-            chi += total * kf.block_innovation[i]
-            free += 1.0
+            kf.block_values[i] = dot_in(information[i], kf.block_innovation, n, mask)
+            chi += kf.block_values[i] * kf.block_innovation[i]
+        if information[i, i] > 0.0:
+            by_noise = variance_along(information[i], kf.block_noise, n)
+            noise.share[i] = max(by_noise / information[i, i], LEAST_SHARE)
         for j in range(n):
             kf.block_information[i, j] = information[i, j]
-        kf.block_values[i] = total
-        noise.share[i] = (
-            max(share / information[i, i], LEAST_SHARE)
-            if information[i, i] > 0.0
-            else 1.0
-        )
+    free = number_in(mask, n) - 3.0
     return min(1.0, usual_chi(free) / max(chi, 1e-9))
 
 
 @compiled
 def unlearnable(error: float, inside: float, square: float) -> float:
-    """Variance of an error by a signal that no number of samples takes away, in units of one.
+    """Variance of a multiplicative error that no number of samples removes, in units of one.
 
-    Vibration that units see differently is an error of both sides: of what a channel has (variance ``error``),
-    ``inside`` may be in the signal (``square``). As long as it lasts, it looks like an error of the share that it has
-    in the signal.
+    Units see vibration differently. Of the error variance of a channel (``error``),
+    ``inside`` may be part of the signal itself (mean square ``square``). Vibration then
+    looks like a constant share of the signal.
     """
     return error / max(square, 1e-12) * min(1.0, inside / max(square, 1e-12))
 
 
 @compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
-    """Variance that each state of the motion keeps at least, into ``kf.taught``; biases have no motion in them."""
+    """Find the variance that each state of the motion keeps at least; biases keep none."""
     layout, noise, n = params.layout, kf.noise, params.sensors.n
     for r in range(layout.count):
-        kf.taught[r] = 0.0
+        kf.least_variance[r] = 0.0
     if kf.rest:
         return
     quick = 0.0
@@ -197,7 +193,7 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
                 inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i]
             )
             quick = max(quick, along * noise.now.block[i] * noise.longest[i])
-        # A peak of vibration is no motion.
+        # A vibration peak is not motion.
         kf.usual_rate[a] += (
             kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]
         ) / REST_BLOCKS
@@ -206,10 +202,11 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
                 noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
             )
             least = unlearnable(error, inside, kf.usual_rate[a])
-            keep_least_variance(layout, i, RATE_X + a, least, kf.taught)
+            keep_least_variance(layout, i, RATE_X + a, least, kf.least_variance)
     for i in range(n):
-        # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be learned
-        # in the first seconds of motion.
+        # Variance of a difference of two blocks, with the root of the unknown slow
+        # noise: the full factor would
+        # stop delays from being learned in the first seconds of motion.
         error = (
             noise.now.block[i]
             * noise.longest[i]
@@ -218,12 +215,12 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
         )
         turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
         least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), turn)
-        keep_least_variance(layout, i, TURN, least, kf.taught)
+        keep_least_variance(layout, i, TURN, least, kf.least_variance)
 
 
 @compiled
 def learn(params: Constants, kf: Estimator, weight: float) -> None:
-    """Correct the states by the block before; at rest the rate is zero, and the estimated one no signal."""
+    """Correct the states by the block before. At rest the rate is zero, so the estimated rate is no signal."""
     n, layout = params.sensors.n, params.layout
     kept = kf.masks[1] & ~kf.under_test
     if kf.rest:
@@ -251,13 +248,13 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
         kf.block_parity.information,
         kf.block_innovation,
         weight,
-        kf.taught,
+        kf.least_variance,
     )
 
 
 @compiled
 def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
-    """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
+    """Predict the covariance of the next samples from the state uncertainty in the present motion."""
     n, layout, square, ahead = (
         params.sensors.n,
         params.layout,
@@ -297,10 +294,11 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_excess(params: Constants, kf: Estimator) -> None:
-    """Find how much more residuals vary than the noise expected makes them, where they do so most.
+    """Find the largest variance of a residual over the one expected.
 
-    With A of the noise expected and S the covariance of the noise of the moment, of vibration that lasts and of what is
-    not known of the states: the largest of ``(A S A)_ii / A_ii``, and no less than 1.
+    A is the information with the noise expected, S the covariance of the noise of the
+    moment, of lasting vibration and of the state uncertainty. The excess is the largest
+    ``(A S A)_ii / A_ii``, at least 1.
     """
     n, information = params.sensors.n, kf.expected_parity.information
     fill_parity(kf.expected_parity, params.sensors, kf.mask, params.expected)

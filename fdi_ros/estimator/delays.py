@@ -1,15 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delays between units: which are sure, and by how much values lie before their stamp."""
+"""Delays between units: compensation of sure delays, and the time offset of the corrected values."""
 
 from __future__ import annotations
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.estimator.estimator import Constants, Estimator
 
-TAKE_OFF = 0.002  # s; a smaller delay is an error state, whose first order is enough
-SURE = 25.0  # square of a delay in its variances from which it is sure: it moves the values of all that come after
+TAKE_OFF = (
+    0.002  # s. A smaller delay stays an error state: its first order is accurate enough
+)
+SURE = 25.0  # squared delay over its variance from which values are moved by the delay
 LONGEST_DELAY = (
     0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
 )
@@ -17,9 +19,10 @@ LONGEST_DELAY = (
 
 @compiled
 def update_time_offsets(params: Constants, kf: Estimator) -> None:
-    """Find by how much values lie before the stamp, if the earliest unit is in time, and how far units are apart.
+    """Find how far corrected values lie before their stamp if the earliest unit is in time, and the spread.
 
-    `restamp` brings all units to the instant of the latest, the states what is left to that of the first unit.
+    `restamp` brings all units to the instant of the latest unit. The delay states then
+    refer to the first unit.
     """
     latest = earliest = least = most = 0.0
     for u in range(1, params.units):
@@ -32,7 +35,7 @@ def update_time_offsets(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def transfer_delays(params: Constants, kf: Estimator) -> bool:
-    """Move delays that are sure from their states to ``late``, which `restamp` makes up for; return whether any was."""
+    """Move sure delays from their states to ``late``, which `restamp` compensates; return whether any moved."""
     changed = False
     for u in range(1, params.units):
         place = params.layout.delays[u]

@@ -1,12 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the sensors do wrong: bias, scale, misalignment, delay, and how these change, as one error state.
+"""Errors of the sensors as one error state: bias, scale, misalignment, delay, and their rates of change.
 
-Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each kind of error is one `StateKind` of the
-table `ERROR_KINDS`: its states enter a channel multiplied by a signal each (`fill_signals`): ``y = C x + H w + e``
-with row i of C the signals of channel i at the places of its states. Some have no signal: they are the rate of change
-of others.
+Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each kind of
+error is one `StateKind` of the table `ERROR_KINDS`. Its states enter a channel, each
+multiplied by a signal (`fill_signals`): ``y = C x + H w + e`` with row i of C the
+signals of channel i at the places of its states. States without a signal are rates of
+change of other states.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from fdi_ros.compiling.compiled import (
 from fdi_ros.model.samples import Array
 
 ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
-"""By what a state is multiplied in a channel: one; the body rate about an axis; the angular acceleration along the
-channel, negative. All but the first are of motion, and zero at rest."""
-GIVEN = math.nan  # in the table: whoever uses the states says how large the errors are
+"""Multipliers of a state in a channel: one, the body rate about an axis, or the negative angular
+acceleration along the channel. All but the first are motion, and zero at rest."""
+GIVEN = math.nan  # in the table: the caller of `prepare_layout` gives the size
 
 
 class StateKind(NamedTuple):
@@ -39,10 +40,12 @@ class StateKind(NamedTuple):
 
     name: str
     unit: str
-    per_unit: bool  # one for each unit but the first, against which the others are; else one for each channel
+    per_unit: bool  # one for each unit but the first, the reference; False: one for each channel
     by: tuple[int, ...]
-    """By what each of its states is multiplied; none: one state, which is the rate of change of `feeds`."""
-    prior: float  # standard deviation before anything is shown, where `prepare_layout` is given no other
+    """Multiplier of each state; empty: a single state, the rate of change of `feeds`."""
+    # standard deviation before anything is shown, where `prepare_layout` is given no
+    # other
+    prior: float
     walk: float = 0.0  # random walk, per sqrt(s), where none other is given
     memory: float = (
         0.0  # s, after which a rate of change has faded: a Gauss-Markov process
@@ -61,7 +64,7 @@ ERROR_KINDS = (
     # 100 ppm: two quartzes of 50 ppm.
     StateKind("clock rate", "s/s", True, (), 1e-4, memory=7200.0, feeds="delay"),
 )
-"""Biases stand first; a new kind stands last."""
+"""Biases come first. Add new kinds at the end."""
 MULTIPLIERS = tuple(by for kind in ERROR_KINDS for by in kind.by)
 """Of each signal of a channel, those of all kinds in order."""
 SIGNALS = len(MULTIPLIERS)
@@ -80,19 +83,19 @@ Columns = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_STATES)]
 
 @record
 class Layout:
-    """Which states there are, and how they wander."""
+    """Which states exist, and how they change with time."""
 
     n: Whole  # channels
     count: Whole  # states
     by: Annotated[NDArray[np.int64], "i8", (SIGNALS,)]  # what each signal is
-    place: Entries  # state of each signal of a channel; -1: none
+    place: Entries  # state of each signal of a channel, or -1
     prior: States  # standard deviation, in the unit of each
     walk: States  # per sqrt(s)
-    memory: States  # s; 0: for ever
-    feeds: Places  # state whose rate of change it is; -1: none
+    memory: States  # time constant, s; 0: infinite
+    feeds: Places  # state of which this one is the rate of change, or -1
     delays: Annotated[
         NDArray[np.int64], "i8", (MAX_UNITS,)
-    ]  # state of the delay of each unit; -1: none
+    ]  # state of the delay of each unit, or -1
 
 
 @record
@@ -105,12 +108,13 @@ class ErrorStates:
 
 @record
 class Projection:
-    """What the states do to the channels."""
+    """Effect of the states on the channels."""
 
     signals: Signals
     columns: Columns  # (P C')', one row a channel
     covariance: Square  # C P C', (rad/s)^2
     weighted: Columns  # (P C' A)'
+    share: States  # of its gain that each state takes, 0 to 1
 
 
 def places_of(name: str, n: int, units: int) -> list[list[int]]:
@@ -135,8 +139,9 @@ def prepare_layout(
 ) -> None:
     """Fill a record of `Layout`: unit (n,) has the number of the unit of each channel.
 
-    ``priors``, ``walks``: standard deviations and random walks by the names of kinds, scalar or (n,), that stand in
-    place of the table's. `ValueError` if one is in neither.
+    ``priors``, ``walks``: standard deviations and random walks by the names of kinds,
+    scalar or (n,), that stand in place of the table's. `ValueError` if one is in
+    neither.
     """
     n = len(unit)
     layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = (
@@ -174,7 +179,7 @@ def prepare_layout(
 
 @compiled
 def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
-    """Begin with nothing known but the priors, and of the biases their standard deviations (n,), rad/s."""
+    """Begin with the priors, and with standard deviations (n,) of the biases, rad/s."""
     for r in range(layout.count):
         states.x[r] = 0.0
         for c in range(layout.count):
@@ -185,7 +190,7 @@ def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
 
 @compiled
 def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
-    """Let the states wander for a time: what has a rate of change runs with it, and all have their random walks."""
+    """Predict the states over a time, s: rates of change integrate, and every state walks at random."""
     x, p, count = states.x, states.p, layout.count
     for r in range(count):
         to = layout.feeds[r]
@@ -248,7 +253,7 @@ def project(layout: Layout, states: ErrorStates, at: Projection) -> None:
 def subtract_errors(
     layout: Layout, states: ErrorStates, signals: Array, values: Array, out: Array
 ) -> None:
-    """Values (n,) less what the states say of their errors, rad/s."""
+    """Subtract the estimated errors from values (n,), rad/s."""
     for i in range(layout.n):
         total = values[i]
         for k in range(SIGNALS):
@@ -266,31 +271,37 @@ def update(
     information: Array,
     innovation: Array,
     weight: float,
-    taught: Array,
+    least: Array,
 ) -> None:
-    """Take a measurement: x += D P C' A (y - C x), and with G = P C' A C P and D diagonal P -= D G + G D - D G D.
+    """Update the states by a measurement: x += D P C' A (y - C x), P -= D G + G D - D G D.
 
-    As A M A = A, that is the covariance for any D (Joseph). D leaves every state the variance that it has at least.
-    ``information`` A (n, n); ``innovation`` y - C x (n,), rad/s, of which that of channels left out is not read;
-    ``weight`` of the measurement, 0 to 1; ``taught`` (states,): variance that each state keeps at least; takes D, the
-    share of its gain that each takes.
+    Here G = P C' A C P, and D is diagonal. As A M A = A, this is the covariance for any
+    D (Joseph). D, in ``at.share``, leaves every state its least variance.
+
+    Parameters
+    ----------
+    information
+        A (n, n), s^2/rad^2. Rows of channels left out are zero.
+    innovation
+        y - C x (n,), rad/s. Entries of channels left out are not read.
+    weight
+        Of the measurement, 0 to 1.
+    least
+        Least variance of each state (states,); 0: no bound.
     """
-    count = layout.count
+    count, share = layout.count, at.share
     for j in range(layout.n):
         if information[j, j] != 0.0:
             fill_gain(layout, at, information, j, weight)
-    fill_shares(layout, states, at, information, taught)
+    fill_shares(layout, states, at, information, least)
     for j in range(layout.n):
         if information[j, j] != 0.0:
+            gain, column = at.weighted[j], at.columns[j]
             for r in range(count):
-                states.x[r] += taught[r] * at.weighted[j, r] * innovation[j]
-                share = at.weighted[j, r]
+                states.x[r] += share[r] * gain[r] * innovation[j]
                 for c in range(r + 1):
-                    states.p[r, c] -= (
-                        (1.0 - (1.0 - taught[r]) * (1.0 - taught[c]))
-                        * share
-                        * at.columns[j, c]
-                    )
+                    taken = 1.0 - (1.0 - share[r]) * (1.0 - share[c])
+                    states.p[r, c] -= taken * gain[r] * column[c]
     for r in range(count):
         for c in range(r):
             states.p[c, r] = states.p[r, c]
@@ -302,33 +313,47 @@ def fill_shares(
     states: ErrorStates,
     at: Projection,
     information: Array,
-    taught: Array,
+    least: Array,
 ) -> None:
-    """Put into ``taught`` (states,), which holds the least variances, the share of its gain that each state takes."""
+    """Find the share of the gain that each state takes, so that every state keeps its least variance (states,).
+
+    A share d of the gain takes ``(1 - (1 - d)^2) G_rr`` off the variance.
+    """
     for r in range(layout.count):
-        least, taught[r], gained = taught[r], 1.0, 0.0
-        if least > 0.0:
-            for j in range(layout.n):
-                if information[j, j] != 0.0:
-                    gained += at.weighted[j, r] * at.columns[j, r]
-            if gained > 0.0 and states.p[r, r] - gained < least:
-                taught[r] = 1.0 - math.sqrt(
-                    1.0 - min(max(states.p[r, r] - least, 0.0) / gained, 1.0)
-                )
+        at.share[r] = 1.0
+        if least[r] > 0.0:
+            gained = variance_gained(layout, at, information, r)
+            variance = states.p[r, r]
+            if gained > 0.0 and variance - gained < least[r]:
+                allowed = min(max(variance - least[r], 0.0) / gained, 1.0)
+                at.share[r] = 1.0 - math.sqrt(1.0 - allowed)
         elif layout.feeds[r] >= layout.n:
-            # The rate of change of a state is learned with it.
-            taught[r] = taught[layout.feeds[r]]
+            # A rate of change is learned together with its state.
+            at.share[r] = at.share[layout.feeds[r]]
+
+
+@compiled
+def variance_gained(
+    layout: Layout, at: Projection, information: Array, r: int
+) -> float:
+    """Variance G_rr that the full gain takes off state r."""
+    gained = 0.0
+    for j in range(layout.n):
+        if information[j, j] != 0.0:
+            gained += at.weighted[j, r] * at.columns[j, r]
+    return gained
 
 
 @compiled
 def keep_least_variance(
-    layout: Layout, i: int, by: int, least: float, taught: Array
+    layout: Layout, i: int, by: int, variance: float, least: Array
 ) -> None:
-    """Let the states that enter channel i by ``by`` keep a variance: a unit learns from the axis that shows most."""
+    """Bound the variance of the states of channel i with multiplier ``by``; a unit takes its best axis."""
     for k in range(SIGNALS):
         place = layout.place[i, k]
         if layout.by[k] == by and place >= 0:
-            taught[place] = least if taught[place] == 0.0 else min(taught[place], least)
+            known = least[place]
+            least[place] = variance if known == 0.0 else min(known, variance)
 
 
 @compiled

@@ -1,13 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimator of what the sensors do wrong, and its innovations.
+"""Estimator of the sensor errors, and its innovations.
 
-A sample is corrected by what is known (`correct_sample`); the mean of a block of 40 ms corrects what is known
-(`blocks.py`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
-biases shows too. The filter takes blocks at once; the states are kept at moments 0.12, 1, 8, 61
-and 490 s apart, and after a fault it goes on from before its onset (`predict_from`): what was absorbed of it is undone.
-Innovations, whitened with the uncertainty of all states, go to the detector.
+The present states correct a sample (`correct_sample`), and the mean of a block of 40 ms
+corrects the states (`blocks.py`). In motion the rate is eliminated. At rest the rate is
+known to be zero, so the common part of the biases shows too. The filter takes every
+block at once. Snapshots of the states are kept 0.12, 1, 8, 61 and 490 s apart. After a
+fault the filter goes on from a snapshot before the onset (`predict_from`), which undoes
+all that was absorbed. Innovations, whitened with the uncertainty of all states, go to
+the detector.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import along, dot, quadratic, residual, square, variance_along
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, fill_joint_parity, fill_parity
 from fdi_ros.core.records import Parity, Sensors
 from fdi_ros.estimator.error_states import (
@@ -53,15 +56,17 @@ from fdi_ros.estimator.noise import (
 )
 from fdi_ros.model.samples import Array
 
-BLOCK_TIME = 0.04  # s; four samples at 100 Hz, and short against what moves a body
+BLOCK_TIME = 0.04  # s: four samples at 100 Hz, short against the motion of a vehicle
 LONG_TIME = 2.0
-"""s; the longest time scale of evidence. For so long the states are held under suspicion at most (their errors would be
-common to all blocks), and of a longer time since an onset the last half is explained."""
+"""Longest time scale of evidence, s. Under suspicion the states are held for at most
+this time, as their errors would become common to all blocks. Of a longer time since an
+onset only the last half is explained."""
 BEGINS = 16.0
-"""Motion begins where the square of the rate is so many of its variances, which noise never is, and `THREE_SIGMA` times
-what no rate explains: a fault looks like motion too."""
+"""Motion begins where the squared rate exceeds this many of its variances, and
+`THREE_SIGMA` times the part that no rate explains: a fault looks like motion too."""
 SNAPSHOT_TIME, TIERS, SNAPSHOTS = 3.0 * BLOCK_TIME, 5, 8
-"""s between snapshots, three blocks; of each tier every eighth goes on to the next."""
+"""s between snapshots (three blocks), tiers, snapshots per tier. Every eighth of a tier
+enters the next."""
 REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
 STRIDE = round(LONG_TIME / BLOCK_TIME)
 SAMPLES, BLOCKS, COARSE = (
@@ -69,22 +74,29 @@ SAMPLES, BLOCKS, COARSE = (
     1024,
     512,
 )  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
-LEAST_SHARE = 0.02  # share of noise in the variance of a statistic, at least: what is less is rounding
-SENSITIVE = 1e-6  # share of a channel's own variance in its parity, below which a fault does not show
-CHECKABLE = 0.01  # information over that with all errors known: with less a fault would have to be ten times as large
+LEAST_SHARE = (
+    0.02  # least share of noise in the variance of a statistic: below is rounding
+)
+# share of a channel's own variance in its parity below which a fault does not show
+SENSITIVE = 1e-6
+# least information over the information with all errors known: faults may be ten times
+# larger
+CHECKABLE = 0.01
 Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
 Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
 Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
-SLOW_TURN = 1e-4  # (rad/s)^2; below 0.6 deg/s nothing grows with the motion
-SPIKE = 4  # samples that a spike lasts at most: delays spread it over neighbours
+SLOW_TURN = (
+    1e-4  # (rad/s)^2: below 0.6 deg/s the uncertainty does not grow with the motion
+)
+SPIKE = 4  # most samples of a spike: delays spread one over its neighbours
 
 
 @record
 class Constants:
-    """What the estimator and the detector that tests its innovations are given; filled by the detector."""
+    """Constants of the estimator and of the detector that tests its innovations; filled by the detector."""
 
     sensors: Sensors
     layout: Layout
@@ -97,11 +109,11 @@ class Constants:
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
     nonlinearity: (
-        Real  # error that is not linear in the rate, standard deviation, share of it
+        Real  # standard deviation of errors not linear in the rate, share of the rate
     )
     rest_std: Real  # of the rate at rest, rad/s
     determines: Sets  # sets of channels that give a rate
-    spans: Sets  # of these, sets with redundancy
+    spans: Sets  # of the sets that give a rate, those with redundancy
     least: Whole  # samples that a fault lasts
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real
@@ -112,7 +124,7 @@ class Constants:
 class Total:
     """Sums of all samples so far, to have means over any time."""
 
-    sample: Whole  # number of the last sample in it
+    sample: Whole  # number of the last sample summed
     values: Channels  # rad/s
     count: Channels  # samples that each channel has delivered
     rate: Vector  # rad/s
@@ -123,7 +135,7 @@ class Total:
 class Snapshot:
     """The states at a moment."""
 
-    seconds: Real  # since the start; negative: none
+    seconds: Real  # since the start; negative: no snapshot
     states: ErrorStates
     late: Units  # delays that `restamp` made up for then, s
 
@@ -142,33 +154,34 @@ class Estimator:
     states: ErrorStates
     noise: Noise
     late: Units  # delays that `restamp` makes up for, s
-    behind: Real  # by how much corrected values lie before the stamp, if the earliest unit is in time, s
+    # by how much corrected values lie before the stamp, if the earliest unit is in
+    # time, s
+    behind: Real
     spread: Real  # largest delay between units, s
     odd: Real  # chi-square of the last sample over the largest usual, at least 1
     rate: Vector  # of the last sample, rad/s
-    corrected: Channels  # values less what is known of their errors, rad/s
-    innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
+    corrected: Channels  # values less their estimated errors, rad/s
+    innovation: Channels  # corrected values less the rate along each channel, rad/s
     statistic: Channels  # (A y)_i of the last sample over its standard deviation in this motion
-    distance: Channels  # how far each is off in it, ``|A y|_i / sqrt(A_ii)``
-    share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
+    distance: Channels  # ``|A y|_i / sqrt(A_ii)`` of the last sample
+    share: Channels  # of noise in the variance of each statistic; the rest is state uncertainty
     inflation: Channels  # its inverse, in this motion
-    known: Channels  # information of each channel if all errors of the sensors were known, s^2/rad^2
-    growth: Channels  # variance of each channel with that of the states, (rad/s)^2
+    # information of each channel if all errors of the sensors were known, s^2/rad^2
+    known: Channels
+    growth: Channels  # variance of each channel by noise and states, (rad/s)^2
     judged: Mask  # channels that the others check
-    checked: (
-        Mask  # of them, those of which what is not known of the states hides no fault
-    )
+    checked: Mask  # judged channels whose state uncertainty hides no fault
     excess: Real  # largest variance of a residual over the one expected, at least 1
     speed_squared: Real  # of the rate of the last block, (rad/s)^2
     parity: Parity  # of a sample
     expected_parity: Parity  # of a sample in the noise expected
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
-    taught: States  # share of its gain that each state takes from a block
+    least_variance: States  # of each state; 0: no bound
     usual_rate: Vector  # mean square of the rate of the last second, (rad/s)^2
     shared: SharedNoise
     zero: Vector  # in place of a rate that is not known yet
-    signal_rate: Vector  # by which errors enter, rad/s; zero at rest
+    signal_rate: Vector  # rate that multiplies the states, rad/s; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
     far: Whole  # samples in a row that are far off
@@ -177,11 +190,12 @@ class Estimator:
     sum_time: Channels  # when each has, s since the block begins
     sum_rate: Vector  # rad/s
     sum_seconds: Real  # of all samples, s since the block begins
-    begun: Real  # when it begins, s since the start
+    begun: Real  # begin of the block, s since the start
     span: Real  # s, from one block to the next
     blocks: Whole  # completed in a row
     all_blocks: Whole
-    # Of the last blocks, the newest first. A block is judged when the next one is there: its acceleration needs both.
+    # Of the last blocks, the newest first. A block is judged when the next one is
+    # there: its acceleration needs both.
     means: Block  # of the values, rad/s
     middles: Block  # of the samples of each channel, from the middle of the block, s
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
@@ -198,10 +212,11 @@ class Estimator:
     block_information: (
         Square  # A of all its channels, whatever is learned from, s^2/rad^2
     )
+    block_noise: Channels  # variance of the mean of a block by noise, (rad/s)^2
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
-    angular_acceleration: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
-    turning: Flag  # it is more than noise
+    angular_acceleration: Channels  # along each channel, rad/s^2; zero where only noise
+    turning: Flag  # the angular acceleration exceeds noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     turn_noise: Real  # its variance, (rad/s^2)^2
     peak_turn: Channels  # lately largest, rad/s^2
@@ -209,14 +224,14 @@ class Estimator:
     peak_extra: Channels  # lately largest, (rad/s)^2
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
-    rest_bias_variance: Vector  # and what is not known of the biases, (rad/s)^2
+    rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2
     rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
     hole_at: (
         Real  # when the first of the last holes in the stream began, s since the start
     )
-    hole_sample: Whole  # number of the last sample before it; 0: there was none
+    hole_sample: Whole  # number of the last sample before the hole; 0: no hole
     used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held
     taken_off_at: Real  # when delays were last looked at, s
@@ -232,10 +247,10 @@ class Estimator:
 
 @compiled
 def update_weights(params: Constants, kf: Estimator) -> None:
-    """Work out what samples of the channels present are judged and fused with.
+    """Work out the information and gain with which samples of the channels present are judged and fused.
 
-    What is not known of the states lasts until the next block: it counts twice the samples of a block, or it would be
-    summed up as if it were white.
+    The state uncertainty is the same error in all samples until the next block. It
+    counts twice the samples of a block, or the sums would treat it as white.
     """
     n, noise = params.sensors.n, kf.noise
     lasting = 2.0 * params.length
@@ -249,17 +264,13 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     fill_joint_parity(kf.parity, params.sensors, kf.mask, kf.matrix, UNKNOWN_RATE)
     kf.judged = kf.checked = 0
     for i in range(n):
-        information, share = kf.parity.information[i, i], 0.0
+        information = kf.parity.information[i, i]
         if kf.mask >> i & 1 and information * kf.matrix[i, i] > SENSITIVE:
             kf.judged |= 1 << i
-            for j in range(n):
-                share += (
-                    kf.parity.information[i, j]
-                    * kf.parity.information[i, j]
-                    * noise.now.sample[j]
-                )
+            share = variance_along(kf.parity.information[i], noise.now.sample, n)
             kf.share[i] = max(share / information, LEAST_SHARE)
-            # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
+            # Scale the state uncertainty to 100 Hz, so that the check does not depend
+            # on the sample rate.
             hidden = kf.known[i] / information - 1.0
             if hidden * (2.0 * BLOCK_TIME * 100.0) / lasting < 1.0 / CHECKABLE - 1.0:
                 kf.checked |= 1 << i
@@ -272,7 +283,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def correct_sample(params: Constants, kf: Estimator, values: Array) -> None:
-    """Correct a sample by what is known now: its rate, and what is left over of every channel."""
+    """Correct a sample by the present states; update its rate and innovations."""
     n, layout = params.sensors.n, params.layout
     signals, innovation = kf.at.signals, kf.innovation
     fill_signals(layout, kf.zero, kf.angular_acceleration, signals)
@@ -285,58 +296,51 @@ def correct_sample(params: Constants, kf: Estimator, values: Array) -> None:
     for i in range(n):
         innovation[i] = 0.0
         if kf.mask >> i & 1:
-            innovation[i] = kf.corrected[i]
-            for a in range(3):
-                innovation[i] -= params.sensors.axes[i, a] * kf.rate[a]
+            innovation[i] = residual(kf.corrected[i], params.sensors.axes[i], kf.rate)
 
 
 @compiled
 def watch_for_motion(params: Constants, kf: Estimator) -> None:
-    """Let rest end where a rate shows, and no error that looks like it."""
+    """End rest where the channels agree on a rate."""
     n, noise = params.sensors.n, kf.noise
-    square = kf.rate[0] * kf.rate[0] + kf.rate[1] * kf.rate[1] + kf.rate[2] * kf.rate[2]
-    if noise.regime == MOTION or not square > 0.0:
+    speed_squared = square(kf.rate)
+    if noise.regime == MOTION or not speed_squared > 0.0:
         return
     variance = 0.0
     for a in range(3):
         for i in range(n):
             gain = kf.fused.gain[a, i]
             variance += gain * gain * (noise.now.sample[i] + kf.at.covariance[i, i])
-    if square <= BEGINS * variance:
+    if speed_squared <= BEGINS * variance:
         return
-    moving = odd = 0.0
+    explained = 0.0
     for i in range(n):
         if kf.mask >> i & 1:
-            along = 0.0
-            for a in range(3):
-                along += params.sensors.axes[i, a] * kf.rate[a]
-            moving += along * along / noise.now.sample[i]
-            for j in range(n):
-                odd += kf.innovation[i] * kf.parity.information[i, j] * kf.innovation[j]
-    if moving > THREE_SIGMA * odd:
+            turn = along(params.sensors.axes[i], kf.rate)
+            explained += turn * turn / noise.now.sample[i]
+    unexplained = quadratic(kf.parity.information, kf.innovation, n)
+    if explained > THREE_SIGMA * unexplained:
         change_regime(noise, n, MOTION, True)
         update_weights(params, kf)
 
 
 @compiled
 def usual_chi(free: float) -> float:
-    """Largest usual chi-square with so many degrees of freedom: four of its standard deviations above its mean."""
+    """Largest usual chi-square with ``free`` degrees of freedom: four standard deviations above the mean."""
     return max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
 
 
 @compiled
 def update_statistics(params: Constants, kf: Estimator) -> None:
-    """Statistics of a sample: innovations in their standard deviations; that of the states grows with motion."""
+    """Normalise the innovations of a sample. The state uncertainty grows with the motion."""
     n = params.sensors.n
-    square = kf.rate[0] * kf.rate[0] + kf.rate[1] * kf.rate[1] + kf.rate[2] * kf.rate[2]
-    more = max((square + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
+    faster = (square(kf.rate) + SLOW_TURN) / (kf.speed_squared + SLOW_TURN)
+    more = max(faster, 1.0)
     chi, free = 0.0, -3.0
     for i in range(n):
         kf.statistic[i], kf.inflation[i] = 0.0, 1.0
         if kf.judged >> i & 1:
-            total = 0.0
-            for j in range(n):
-                total += kf.parity.information[i, j] * kf.innovation[j]
+            total = dot(kf.parity.information[i], kf.innovation, n)
             variance = kf.share[i] + more * (1.0 - kf.share[i])
             kf.statistic[i] = total / math.sqrt(kf.parity.information[i, i] * variance)
             kf.inflation[i] = variance / kf.share[i]
@@ -362,7 +366,7 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 @compiled
 def is_spike(params: Constants, kf: Estimator) -> bool:
-    """Whether the last sample is far off, as few before it were; what is so for longer is none."""
+    """Whether the sample is an outlier in a run of at most `SPIKE` samples. A longer run is not a spike."""
     far = False
     for i in range(params.sensors.n):
         far = far or kf.statistic[i] * kf.statistic[i] > FAR
@@ -372,7 +376,7 @@ def is_spike(params: Constants, kf: Estimator) -> bool:
 
 @compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
-    """Add a sample to the totals and, but for spikes, to the block being filled; return whether that is complete."""
+    """Add a sample to the totals and, unless a spike, to the block; return whether the block is complete."""
     n, total, spike = params.sensors.n, kf.total, is_spike(params, kf)
     total.sample = kf.samples
     if kf.filled == 0:
@@ -457,7 +461,7 @@ def total_before(kf: Estimator, sample: int, out: Total, n: int) -> None:
 
 @compiled
 def drop_block(kf: Estimator, n: int) -> None:
-    """Begin the block anew: with a hole in it, it would have no time of its own."""
+    """Begin the block anew: a block with a hole has no time of its own."""
     kf.filled, kf.sum_seconds = 0, 0.0
     for i in range(n):
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0

@@ -3,11 +3,13 @@
 
 """The noise of the moment, of every channel by itself, from the innovations of samples and of longer times.
 
-The statistic of channel i is ``t_i = (A y)_i / sqrt(A_ii)``, of variance one if the noise is as supposed. Half the
-squared difference of successive ones (von Neumann 1941), which a lasting error does not move, steers the variance of
-the channel, ``v_i *= 1 + g (r_i - 1)``: its fixed point is that of restricted maximum likelihood, so a noisy channel
-does not leak into the others. Samples and blocks have a variance each; longer times a level above that of blocks.
-Rest and motion have memories of their own. Nothing of it is forgotten when a channel is excluded.
+The statistic of channel i is ``t_i = (A y)_i / sqrt(A_ii)``, of variance one if the
+noise is as supposed. Half the squared difference of successive ones (von Neumann 1941),
+which a lasting error does not move, steers the variance of the channel, ``v_i *= 1 + g
+(r_i - 1)``. The fixed point is restricted maximum likelihood, so a noisy channel does
+not leak into the others. Samples and blocks have a variance each, longer times a level
+above the block variance. Rest and motion are remembered separately, and excluded
+channels keep their noise.
 """
 
 from __future__ import annotations
@@ -35,31 +37,40 @@ from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 
 SAMPLE, BLOCK, QUARTER, LONG, SCALES = range(5)
-"""Time scales: samples, blocks, 0.25 s, 2 s; and their number."""
+"""Time scales (samples, blocks, 0.25 s, 2 s), and their number."""
 REST, MOTION = range(2)
-LAGS = 3  # of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later
+LAGS = 3  # shorter lags of 0.25 s means, beside one second: a 1 Hz beat repeats after a second
 THREE_SIGMA, FAR = 9.0, 100.0
-"""Squares of three standard deviations, which one of 370 normal values exceeds, and of ten, which none does."""
-BURST = 0.75  # share of the variance of half a second that is no scatter: it counts where it exceeds the learned one
-QUIETEST = 0.1  # of the variance expected: less is not believed, or the noise would be unknown when it comes back
+"""Squares of three standard deviations, which one of 370 normal values exceeds, and of
+ten, which none does."""
+# factor on the half-second variance, below its scatter; used where above the learned
+# variance
+BURST = 0.75
+QUIETEST = 0.1  # least variance over the one expected, so that returning noise is not a surprise
 QUIETEST_BLOCK = (
-    0.03  # the same of blocks: quantised values at rest have means that scatter less
+    0.03  # the same for blocks: means of quantised values at rest scatter less
 )
-LOUDEST = 1e4  # of blocks at most: in a hundred times the noise expected nothing could be told
-UNKNOWN = 16.0  # variance of long times over that of blocks at most, before any was measured: four times the noise
-FASTER = 16.0  # four times as fast as ever: vibration and what is not linear are others than in a hover
-WILD = 5.0  # standard deviations that no normal value reaches: gone with the next one it is no fault
+LOUDEST = 1e4  # largest block variance over the one expected: 100 times the noise hides any fault
+UNKNOWN = 16.0  # long-time variance over block variance assumed before any is measured
+FASTER = 16.0  # squared ratio to the fastest rate so far from which slow noise is unknown anew
+# standard deviations of a wild value; a wild value followed by a normal one is no fault
+WILD = 5.0
 WILD_EVENTS, WILD_SAMPLES = (
     0.02,
     4000.0,
-)  # before any was seen: one in 200 000, of which 4000 samples tell more
-SURELY = 0.8  # share of a level of long times that is no scatter of its estimate, which is from some 80 values at most
-TRUST = 50.0  # degrees of freedom at most: what has more is normal
+)  # prior: one wild value in 200 000, with the weight of 4000 samples
+# factor on a long-time level, below the scatter of its estimate from at most 80 values
+SURELY = 0.8
+TRUST = 50.0  # largest degrees of freedom: more counts as normal
 TAIL_MEMORY = 6000.0
 TAIL_FIRST = TAIL_MEMORY / 3.0
-"""Samples over which the weight of the tails is averaged: a minute tells some; and that the first guess counts for."""
-TAIL_SCATTER = 2.8  # standard deviation of those products in white noise, cut at `FAR`
-LEARNED_IN = 64.0  # samples for each degree of freedom to be earned: all of `TRUST` within half a minute at 100 Hz
+"""Samples over which the weight of the tails is averaged (a minute), and the weight of
+the first guess."""
+# standard deviation of products of adjacent squares in white noise, cut at `FAR`
+TAIL_SCATTER = 2.8
+LEARNED_IN = (
+    64.0  # samples per degree of freedom: `TRUST` is reached in half a minute at 100 Hz
+)
 
 ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
 ByLevel = Annotated[NDArray[np.float64], "f8", (SCALES + LAGS, MAX_CHANNELS)]
@@ -73,11 +84,12 @@ Four = Annotated[NDArray[np.float64], "f8", (SCALES,)]
 
 @record
 class Levels:
-    """What is learned of the noise at rest, or in motion."""
+    """Noise learned at rest, or in motion."""
 
     sample: Channels  # variance of a sample, (rad/s)^2
     block: Channels  # of a block, times its samples, (rad/s)^2
-    level: ByLevel  # variance of longer times over that of blocks; of blocks over that of samples; of nearer quarters
+    # variance of longer times over blocks, of blocks over samples, and of shorter lags
+    level: ByLevel
 
 
 @record
@@ -85,11 +97,12 @@ class Noise:
     """The noise of the moment."""
 
     now: Levels
-    longest: Channels  # variance of the longer times over that of blocks, now
-    kept: Annotated[list[Levels], 2]  # at rest, in motion: when it was last so
+    longest: Channels  # largest variance of longer times over blocks
+    kept: Annotated[list[Levels], 2]  # last levels at rest, in motion
     regime: Small  # `REST` or `MOTION`
     lived: Two  # time at rest, in motion, s
-    met: Real  # square of the fastest rate of the body since what was learned in motion counts as known, (rad/s)^2
+    # (rad/s)^2, square of the fastest rate since which the noise in motion is known
+    met: Real
     seen: Four  # values of each time scale so far
     quick: Channels  # variance over the last half second, over the learned one
     unknown: Channels  # by how much the variance of long times may still be larger
@@ -98,40 +111,41 @@ class Noise:
     wild: ByScale  # values that were wild, and back at once
     cap: ByScale  # likelihood ratio of one value at most
     sets: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two sets of channels
-    newest: Small  # place of the last of them
-    repeats: Flag  # it was met before
+    newest: Small  # place of the last set
+    repeats: Flag  # statistics of the same set exist
     before: Pair  # last statistics of samples of each
     block_set: Mask  # of the last block
     steps: Channels  # half squared differences of the samples of the block
     counted: Channels  # how many
-    cross: (
-        Channels  # what is in common says that the variance is larger by, share of it
-    )
-    square: Channels  # mean of them
+    cross: Channels  # relative correction of the variance by the common motion
+    square: Channels  # mean of half squared differences
     neighbours: Channels  # mean product of adjacent ones
     squares: Pair  # the last two
     degrees: Channels  # degrees of freedom of the noise, as of a Student's
     share: Channels  # of the variance of a block's statistic that is noise
 
 
-PAST = 4  # corrected values before, 20 ms apart, that a fourth difference is of with the present one
+# corrected values before, 20 ms apart, that a fourth difference is of with the present
+# one
+PAST = 4
 
 
 @record
 class SharedNoise:
     """Noise that channels have together (`fdi_ros.estimator.shared_noise`)."""
 
-    kept: Mask  # channels that it is of
-    regime: Small  # `REST` or `MOTION`: that it is of
+    kept: Mask  # channels that it describes
+    regime: Small  # `REST` or `MOTION` when `outer` began
     fresh: Whole  # samples in a row of the same channels
     ones: Channels
     alone: Parity  # of the noise of samples alone
     even: Parity  # of channels alike: E
     local: Channels  # mean of the innovations over half a second, rad/s
     outer: Square  # R, (rad/s)^2
-    count: Real  # samples that it is of
+    count: Real  # samples in `outer`
     line: Square  # of R what lines explained while nothing was suspicious, (rad/s)^2
-    excess: Real  # level of R over that of independent channels, at least 1
+    product: Square  # A R
+    excess: Real  # level of R over independent channels, at least 1
     coherent: (
         Real  # share of the noise that lines explain, and independent channels do not
     )
@@ -141,11 +155,11 @@ class SharedNoise:
     past: Annotated[NDArray[np.float64], "f8", (PAST, MAX_CHANNELS)]  # rad/s
     taken: Whole  # fourth differences of this block
     difference: Channels  # the last one, rad/s
-    common: Vector  # rate of it, rad/s
+    common: Vector  # rate of the last fourth difference, rad/s
     common_sum: Rates
     mixed_sum: ByAxis
     apart_sum: Channels
-    square: Rates  # Q: mean products of what is in common, (rad/s)^2
+    square: Rates  # Q: mean products of the common rate, (rad/s)^2
     inverse: Rates  # of Q, s^2/rad^2
     factor: Rates
     mixed: ByAxis  # c: mean products of that and A d
@@ -175,7 +189,7 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
 
 @compiled
 def update_longest(noise: Noise, n: int) -> None:
-    """Take over from the levels by how much the noise of longer times exceeds that of blocks, at least 1."""
+    """Update the largest ratio of long-time noise to block noise, at least 1."""
     for i in range(n):
         noise.longest[i] = 1.0
         for k in range(QUARTER, SCALES + LAGS):
@@ -184,7 +198,7 @@ def update_longest(noise: Noise, n: int) -> None:
 
 @compiled
 def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
-    """Take up what was learned at rest, or in motion; ``at_least``: no less than now, as motion begins."""
+    """Switch to the noise learned at rest or in motion; ``at_least``: keep the larger of both, as motion begins."""
     before = noise.kept[noise.regime]
     after = noise.kept[regime]
     for i in range(n):
@@ -206,7 +220,7 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
 
 @compiled
 def place_of(noise: Noise, mask: int) -> int:
-    """Find the place of the last statistics of the same channels, of two sets; ``noise.repeats``: there are some."""
+    """Find the place of the last statistics of the same channel set; ``noise.repeats``: the set is known."""
     noise.repeats = True
     for k in range(2):
         if noise.sets[k] == mask:
@@ -221,9 +235,10 @@ def place_of(noise: Noise, mask: int) -> int:
 def update_sample_noise(
     noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int
 ) -> None:
-    """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
+    """Take the statistics t (n,) of a sample; inflation: total variance over the noise alone."""
     gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
-    # Of other channels the rate is another: their difference would be that of the errors of the sensors.
+    # With another channel set the rate estimate changes, and the difference would show
+    # sensor errors, not noise.
     place = place_of(noise, mask)
     for i in range(n):
         if mask >> i & 1:
@@ -231,7 +246,7 @@ def update_sample_noise(
             noise.before[place, i] = t[i]
             if not noise.repeats:
                 continue
-            # What the state adds to the variance is slow: no difference of neighbours shows it.
+            # State uncertainty is slow: differences of neighbours do not show it.
             noise.steps[i] += min(0.5 * step * step * inflation[i], THREE_SIGMA)
             noise.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * noise.quick[i])
@@ -248,7 +263,8 @@ def update_sample_noise(
 def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
     """Remember statistics (n,), and count wild ones that have come and gone: a lasting error does not.
 
-    The inverse of how often a value is wild without a fault is the largest likelihood ratio of one value.
+    The inverse of how often a value is wild without a fault is the largest likelihood
+    ratio of one value.
     """
     for i in range(n):
         if mask >> i & 1:
@@ -273,8 +289,8 @@ def update_sample_variance(
 ) -> None:
     """Learn the variance of samples, beside the one expected (n,) (rad/s)^2, from those of a block.
 
-    ``mask``: channels that delivered throughout; ``length``, ``blocks``: samples of a block, blocks so far; ``learn``:
-    the learned variance follows.
+    ``mask``: channels that delivered throughout; ``length``, ``blocks``: samples of a
+    block, blocks so far; ``learn``: the learned variance follows.
     """
     gain = 1.0 / min(blocks + 25.0, 100.0)
     for i in range(n):
@@ -295,7 +311,8 @@ def update_sample_variance(
 def update_degrees(noise: Noise, n: int, mask: int) -> None:
     """Degrees of freedom, as of a Student's: ``3 + 0.5 / x`` with ``x = E[d d'] / E[d]^2 - 1`` of adjacent squares d.
 
-    Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by itself if that is more for certain.
+    Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by
+    itself if that is more for certain.
     """
     total, count = 0.0, 0
     for i in range(n):
@@ -352,7 +369,7 @@ def update_slow_level(
 def update_long_noise(
     noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool
 ) -> None:
-    """Take the statistics t (n,) of a longer time: its level over that of blocks."""
+    """Take the statistics t (n,) of a longer time into its level over blocks."""
     quarter, gain = (
         int(noise.seen[QUARTER]) % 4,
         1.0 / min(noise.seen[scale] + 3.0, 80.0),
@@ -398,7 +415,7 @@ def update_largest_rate(noise: Noise, square: float) -> None:
 
 @compiled
 def update_unknown(noise: Noise, n: int, seconds: float) -> None:
-    """Of the slow noise nothing is known at first, at rest and in motion each, and longer where it is coloured."""
+    """Update how much larger slow noise may still be: unknown at first, and for longer where noise is coloured."""
     noise.lived[noise.regime] += seconds
     lived = noise.lived[noise.regime]
     for i in range(n):

@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether the vehicle rests: the test is also that of calibration and inspection.
+"""Test of rest, also used by calibration and inspection.
 
-The average of the biases at the start has one of its own, which needs no estimator (`core/bias.py`), and so has the
-check of values that repeat (`is_at_rest` in `core/repeated.py`).
+The start-up average (`core/bias.py`) and the check of repeated values (`is_at_rest` in
+`core/repeated.py`) have tests of their own that need no estimator.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS, Constants, Estim
 from fdi_ros.estimator.noise import REST, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
-QUIET = (
-    3.0  # variance of blocks over that of rest before: a hover in vibration has more
+QUIET = 3.0  # largest block variance over earlier rest: a hover in vibration has more
+REST_STD = (
+    3e-4  # rad/s, of the rate at rest: rotation of the earth, vibration of a table
 )
-REST_STD = 3e-4  # rad/s; of the rate at rest: the rotation of the earth, and a table that vibrates
-UNLEARNED = 0.003  # rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn
-REST_CHI = 1.6  # scatter of the blocks of a second over that of noise: 72 degrees of freedom exceed it once in 1000
-REST_LAST = 12.0  # square of the last block's distance from their mean: soon enough for motion that begins
+UNLEARNED = 0.003  # rad/s, largest bias uncertainty in the test: a larger mean rate may be a turn
+# largest scatter of one second of blocks over noise: exceeded once in 1000 (72 degrees
+# of freedom)
+REST_CHI = 1.6
+REST_LAST = 12.0  # largest squared distance of the last block from the mean, to end rest in time
 
 
 @compiled
@@ -29,9 +31,9 @@ def rests(
 ) -> bool:
     """Whether the rates (`REST_BLOCKS`, c) of blocks, rad/s, scatter as noise does, about zero.
 
-    In any order, of the body or as single channels measure it; ``newest``: place of the last. ``variance``,
-    ``bias_variance`` (c,): of the noise of each and of what is not known of the biases, (rad/s)^2; ``floor``: of the
-    rate at rest.
+    Rates of the body or of single channels, in any order. ``newest``: place of the
+    last. ``variance`` (c,): of the noise, ``bias_variance`` (c,): of the biases,
+    ``floor``: of the rate at rest, all (rad/s)^2.
     """
     scatter = largest = last = 0.0
     for a in range(rates.shape[1]):
@@ -75,7 +77,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
                     part += kf.fused.gain[a, j] * kf.at.covariance[i, j]
                 known += gain * part
         kf.rest_noise[a] = variance
-        # Where little is known of the biases, a steady turn looks like them.
+        # While biases are uncertain a steady turn looks like biases.
         kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
     kf.rest = rests(
         kf.rest_rates,
@@ -85,7 +87,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         params.rest_std * params.rest_std,
     )
     if kf.noise.lived[REST] > LONG_TIME:
-        # A hover in vibration may turn as little: it is known by its noise.
+        # A hover may turn as slowly, but has more noise.
         for i in range(n):
             if (
                 kf.masks[1] >> i & 1

@@ -1,27 +1,33 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-r"""Noise that channels have together: vibration. From it follow the weights, the published covariance and the outliers.
+r"""Noise common to channels: vibration. The weights, the published covariance and the outliers follow from this noise.
 
-The variances v of `fdi_ros.estimator.noise` take channels for independent. Vibration is not: units see one rotation of
-the body with gains and phases of their own, or each channel a line of its own, and no v explains what the parity shows
-of it. So here the covariance R of the innovations about their mean of half a second is measured, over a second, and
-what of it channels of variances v would not show. With ``A = V^-1 - V^-1 H (H' V^-1 H)^-1 H' V^-1``, ``G`` the gain of
-the rate, ``E = I - H pinv(H)`` and k = n - 3:
+The variances v of `fdi_ros.estimator.noise` assume independent channels. Vibration is
+not independent: units see one rotation of the body with gains and phases of their own,
+or each channel has a line of its own, and no v explains the parity. This module
+measures the covariance R of the innovations about their half-second mean, over a
+second, and the part of R that channels of variances v do not explain. With
+``A = V^-1 - V^-1 H (H' V^-1 H)^-1 H' V^-1``, G the gain of the rate,
+``E = I - H pinv(H)`` and k = n - 3:
 
-- level ``q = tr(A R) / k``: noise of any colour beyond v, whose differences of neighbours do not show it;
-- dimensions ``tr(A R)^2 / tr(A R A R)``: k where channels are independent, two of a line, however many channels it has;
-- coherence ``sum c_i' Q^-1 c_i / sum d_i``, with ``Q``, ``c_i``, ``d_i`` the mean products of G d and (A d)_i of fourth
-  differences d: what channels differ by goes with what they have in common; of independent ones never;
-- vibration s of the body, of the same differences and of the rate within a block: units differ in what they make of it.
+- level ``q = tr(A R) / k``: noise of any colour beyond v, which differences of
+  neighbours do not show.
+- dimensions ``tr(A R)^2 / tr(A R A R)``: k for independent channels, two for a line, in
+  any number of channels.
+- coherence ``sum c_i' Q^-1 c_i / sum d_i``, with ``Q``, ``c_i``, ``d_i`` the mean
+  products of G d and (A d)_i of fourth differences d: in vibration the differences of
+  channels follow their common rate, in independent noise never.
+- vibration s of the body, from the same differences and from the rate within a block.
 
-A line has two dimensions, of which the parity shows k in n each: where dimensions or coherence say so, the variance of
-every channel is at least ``tr(E R) / (k - 1)``, the mean of its posterior. And at least `UNEQUAL`^2 of the vibration
-along it, for parity does not show by how much all units are wrong.
+The parity shows k in n of each of the two dimensions of a line. Where dimensions or
+coherence indicate a line, the variance of every channel is at least
+``tr(E R) / (k - 1)``, the mean of its posterior. The variance is also at least `UNEQUAL`^2 of the
+vibration along the channel, as parity does not show an error common to all units.
 
-Where two parallel channels differ, the parity knows the sum of their variances alone; the correlation of what they
-differ by with what they have in common, ``(G' Q^-1 c)_i / A_ii``, tells which is noisier (the likelihood of the full
-covariance ``H M H' + V`` with M profiled out).
+Of two parallel channels the parity shows only the sum of the variances. The correlation
+of their difference with the common rate, ``(G' Q^-1 c)_i / A_ii``, separates them
+(likelihood of the full covariance ``H M H' + V``, M profiled out).
 """
 
 from __future__ import annotations
@@ -29,7 +35,9 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.parity import apply_gain, fill_parity, invert
+from fdi_ros.core.algebra import dot, invert, quadratic, variance_along
+from fdi_ros.core.parity import apply_gain, fill_parity
+from fdi_ros.core.subsets import number_in
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
@@ -41,19 +49,22 @@ LINE = (
 INCOHERENT = 0.25  # squared correlation that chance reaches in a second
 COHERENT = 1.0 - INCOHERENT  # from which all is coherent: as far from one
 STEADY = 4.0
-"""Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
-parallel channels see a tenth more or less makes a variance wrong by a sixth there."""
-UNEQUAL = 0.15  # by how much units see vibration differently; logs show 0.04 to 0.6
+"""Energy of the differences of the rate, over that of noise, up to which the variances
+follow it: motion of which parallel channels see a tenth more or less makes a variance
+wrong by a sixth there."""
+UNEQUAL = 0.15  # relative difference of the units' response to vibration: logs show 0.04 to 0.6
 INDEPENDENT = (
     4.0  # values of a block that are independent of one another: all four at 100 Hz
 )
 MOST_CHECKED = 250.0  # blocks (10 s) that the level while checked is a mean of
-NEAR_SINGULAR = 1e-3  # share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is measured
+# share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is
+# measured
+NEAR_SINGULAR = 1e-3
 
 
 @compiled
 def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
-    """Begin with independent channels of the variances expected (n,), (rad/s)^2; ``shared`` is all zero."""
+    """Begin with independent channels of the expected variances (n,), (rad/s)^2. ``shared`` must be all zero."""
     shared.excess = 1.0
     for i in range(n):
         shared.level[i] = shared.outer[i, i] = expected[i]
@@ -83,7 +94,7 @@ def update_shared(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_covariance(params: Constants, kf: Estimator) -> None:
-    """Take the innovations about their mean of half a second into R; what is absent leaves its rows as they are."""
+    """Take the innovations about their half-second mean into R. Absent channels keep their rows."""
     shared, n, largest = kf.shared, params.sensors.n, 0.0
     for i in range(n):
         largest = max(largest, abs(kf.statistic[i]))
@@ -106,7 +117,7 @@ def update_covariance(params: Constants, kf: Estimator) -> None:
 def add_fourth_difference(params: Constants, kf: Estimator) -> None:
     """Sum the products of what channels have in common and what they differ by, of one fourth difference.
 
-    Of white noise its standard deviation is that of the values times the root of 70.
+    In white noise its standard deviation is sqrt(70) times the one of the values.
     """
     shared, n = kf.shared, params.sensors.n
     past = shared.past
@@ -118,18 +129,15 @@ def add_fourth_difference(params: Constants, kf: Estimator) -> None:
                 ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]
             ) / math.sqrt(70.0)
     apply_gain(shared.alone.gain, n, shared.difference, shared.common)
-    size = 0.0
+    size = quadratic(shared.inverse, shared.common, 3)
     for a in range(3):
         for b in range(3):
-            size += shared.common[a] * shared.inverse[a, b] * shared.common[b]
             shared.common_sum[a, b] += shared.common[a] * shared.common[b]
     share = min(1.0, THREE_SIGMA / max(size, 1e-12))
     shared.taken += 1
     for i in range(n):
         if shared.kept >> i & 1:
-            apart = 0.0
-            for j in range(n):
-                apart += shared.alone.information[i, j] * shared.difference[j]
+            apart = dot(shared.alone.information[i], shared.difference, n)
             shared.apart_sum[i] += share * apart * apart
             for a in range(3):
                 shared.mixed_sum[a, i] += share * shared.common[a] * apart
@@ -139,8 +147,8 @@ def add_fourth_difference(params: Constants, kf: Estimator) -> None:
 def update_shape(params: Constants, kf: Estimator) -> None:
     """Work out the parity of the channels in use by their noise alone: once a block, and as they change.
 
-    What was measured of others before stands: missing channels make no noise smaller. At rest, and in motion, R begins
-    anew with the variances of that time.
+    What was measured of others before stands: missing channels make no noise smaller.
+    At rest, and in motion, R begins anew with the variances of that time.
     """
     shared, n, noise = kf.shared, params.sensors.n, kf.noise
     kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
@@ -166,47 +174,50 @@ def update_shape(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_shared_level(params: Constants, kf: Estimator) -> None:
-    """Find the variance of each channel now, with all that independent channels do not explain; once a block."""
-    shared, n, noise, k = kf.shared, params.sensors.n, kf.noise, -3.0
-    for i in range(n):
-        k += shared.kept >> i & 1
-    coherent = update_coherence(params, kf)
+    """Find the variance of each channel now, with noise that independent channels do not explain; once a block."""
+    shared, n, noise = kf.shared, params.sensors.n, kf.noise
+    checks = number_in(shared.kept, n) - 3.0
+    shared.coherent = update_coherence(params, kf)
     update_vibration(params, kf)
     pooled = 0.0
-    if k > 0.0:
-        coherent = max(coherent, update_dimensions(params, kf, k))
-        for i in range(n):
-            for j in range(i + 1):
-                pooled += (
-                    (1.0 if i == j else 2.0)
-                    * shared.even.information[i, j]
-                    * shared.outer[i, j]
-                )
-        pooled /= max(k - 1.0, 0.5)
-    shared.coherent = coherent
-    blocks = min(shared.checked_blocks[noise.regime] + 1.0, MOST_CHECKED)
-    if k > 0.0:
-        shared.checked_blocks[noise.regime] = blocks
-    share = 1.0 / blocks
+    if checks > 0.0:
+        by_dimensions = update_dimensions(params, kf, checks)
+        shared.coherent = max(shared.coherent, by_dimensions)
+        pooled = pooled_variance(shared, n) / max(checks - 1.0, 0.5)
+        before = shared.checked_blocks[noise.regime]
+        shared.checked_blocks[noise.regime] = min(before + 1.0, MOST_CHECKED)
     for i in range(n):
-        level = noise.now.sample[i] * max(1.0, BURST * noise.quick[i], shared.excess)
-        seen = 0.0
-        for a in range(3):
-            seen += (
-                params.sensors.axes[i, a]
-                * params.sensors.axes[i, a]
-                * shared.vibration[a]
-            )
-        if k > 0.0:
-            level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
-            level += coherent * max(pooled - level, 0.0)
-            before = shared.checked[noise.regime, i]
-            shared.checked[noise.regime, i] += share * (level - before)
+        own = noise.now.sample[i]
+        level = own * max(1.0, BURST * noise.quick[i], shared.excess)
+        seen = variance_along(params.sensors.axes[i], shared.vibration, 3)
+        if checks > 0.0:
+            level = max(level, own + UNEQUAL * UNEQUAL * seen)
+            level += shared.coherent * max(pooled - level, 0.0)
+            follow_checked(shared, noise.regime, i, level)
         else:
             # Without redundancy vibration of the body and of one sensor look alike.
-            level = max(level, noise.now.sample[i] + seen)
+            level = max(level, own + seen)
             level = max(level, shared.checked[noise.regime, i])
         shared.level[i] = level
+
+
+@compiled
+def pooled_variance(shared: SharedNoise, n: int) -> float:
+    """Trace of R with the projector of channels alike, (rad/s)^2."""
+    total = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            weight = 1.0 if i == j else 2.0
+            total += weight * shared.even.information[i, j] * shared.outer[i, j]
+    return total
+
+
+@compiled
+def follow_checked(shared: SharedNoise, regime: int, i: int, level: float) -> None:
+    """Average the variance that channel i has while it is checked, at rest or in motion."""
+    share = 1.0 / shared.checked_blocks[regime]
+    before = shared.checked[regime, i]
+    shared.checked[regime, i] += share * (level - before)
 
 
 @compiled
@@ -221,18 +232,15 @@ def update_line(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
-    """Find the level of R over that of the variances; return the share of it that is a line, by its dimensions."""
+    """Find the level of R over the variances; return the share of R that is a line, by its dimensions."""
     shared, n, first, second = kf.shared, params.sensors.n, 0.0, 0.0
-    product = kf.block_parity.weight
+    product = shared.product
     for i in range(n):
         for j in range(i):
             shared.outer[j, i] = shared.outer[i, j]
     for i in range(n):
         for j in range(n):
-            total = 0.0
-            for m in range(n):
-                total += shared.alone.information[i, m] * shared.outer[m, j]
-            product[i, j] = total
+            product[i, j] = dot(shared.alone.information[i], shared.outer[j], n)
         first += product[i, i]
     for i in range(n):
         for j in range(n):
@@ -245,7 +253,7 @@ def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
 
 @compiled
 def update_coherence(params: Constants, kf: Estimator) -> float:
-    """Take the products of a block into their means, and what they say of each variance; return the coherent share."""
+    """Average the products of a block, correct each variance by them; return the coherent share."""
     shared, n, noise = kf.shared, params.sensors.n, kf.noise
     adaptation_gain, count = (
         params.adaptation_gain / MEMORY if shared.taken else 0.0,
@@ -286,7 +294,7 @@ def update_coherence(params: Constants, kf: Estimator) -> float:
 
 @compiled
 def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> float:
-    """Take what channels have in common into Q, and invert it; return its energy over that of noise."""
+    """Update Q by the common rate and invert Q; return the energy of Q over noise."""
     over = 0.0
     for a in range(3):
         for b in range(3):

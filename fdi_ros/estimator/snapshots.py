@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The states as they were moments before, and after holes in the stream.
+"""Snapshots of the states, and widening after holes in the stream.
 
-After a fault the estimator goes back to states kept 0.12 to 490 s before, eight of each distance.
+After a fault the estimator goes back to a snapshot 0.12 to 490 s old. Each tier keeps eight.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from fdi_ros.estimator.estimator import (
 )
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
-"""Random walk of a bias over a hole, rad/s/sqrt(s), which has gone its way, of a turn-on bias, in an hour."""
+"""Random walk of a bias over a hole, rad/s/sqrt(s), which has gone its way, of a
+turn-on bias, in an hour."""
 AFTER_HOLE = 5.0 * LONG_TIME
-"""s of samples after a hole in which biases are compared with those before: five comparisons, and by then the states
-know what they can learn of the biases."""
+"""s of samples after a hole in which biases are compared with those before: five
+comparisons, and by then the states know what they can learn of the biases."""
 
 
 @compiled
@@ -45,7 +46,7 @@ def keep_snapshot(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
-    """Let the biases be others after a hole, in all states kept too: what changed in it is compared with those."""
+    """Widen the biases after a hole, in the snapshots too, which the biases after the hole are compared with."""
     if not is_after_hole(params, kf):
         kf.hole_at, kf.hole_sample = kf.seconds - seconds, kf.samples
     move_biases(params, kf, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
@@ -62,7 +63,7 @@ def is_after_hole(params: Constants, kf: Estimator) -> bool:
 
 @compiled
 def move_biases(params: Constants, kf: Estimator, std: float, rate_std: float) -> None:
-    """Let all biases be others by so much, rad/s, and their rates of change, rad/s^2; now and in all states kept."""
+    """Widen all biases by a standard deviation, rad/s, and their rates, rad/s^2, now and in all snapshots."""
     add_to_biases(params, kf.states, std, rate_std)
     for k in range(TIERS * SNAPSHOTS):
         add_to_biases(params, kf.snapshots[k].states, std, rate_std)
@@ -82,14 +83,14 @@ def add_to_biases(
 
 @compiled
 def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
-    """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
+    """Widen the delays of units whose channels are all in ``units``; of the reference unit: all delays."""
     for u in range(1, params.units):
         if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
             kf.states.p[place, place] += (
                 params.layout.prior[place] * params.layout.prior[place]
             )
-            # The states kept are surer than what is known now.
+            # The snapshots would be too sure.
             for tier in range(TIERS):
                 kf.taken[tier] = 0
 
@@ -98,7 +99,7 @@ def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
 def predict_from(
     params: Constants, kf: Estimator, seconds: float, states: ErrorStates
 ) -> bool:
-    """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
+    """Predict the present states from the last snapshot before a time, s; return whether one exists."""
     best, latest = -1, 0.0
     for tier in range(TIERS):
         for k in range(min(kf.taken[tier], SNAPSHOTS)):

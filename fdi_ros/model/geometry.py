@@ -3,8 +3,8 @@
 
 """Sensitivity axes of redundant gyros: least squares, parity, which faults can be told apart, names for sets.
 
-Measurement model: ``z = H @ omega + error``; row i of H (n, 3) is the sensitivity axis of channel i in the
-body frame, a unit vector times the channel's scale factor.
+Measurement model: ``z = H @ omega + error``; row i of H (n, 3) is the sensitivity axis
+of channel i in the body frame, a unit vector times the channel's scale factor.
 """
 
 from __future__ import annotations
@@ -23,9 +23,12 @@ from fdi_ros.system.text import html_table
 
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
-SAME_DIRECTION = 0.999  # |rho| above which two channels have one parity direction for every practical purpose
-ROUNDING = 1e-9  # relative: double precision leaves 1e-16 of values, which products of matrices multiply
-MIN_SINGULAR_RATIO = 0.02  # axes whose smallest singular value is a smaller share of the largest do not span space
+# |rho| above which two channels have one parity direction for every practical purpose
+SAME_DIRECTION = 0.999
+# relative: double precision leaves 1e-16 of values, which products of matrices multiply
+ROUNDING = 1e-9
+# axes whose smallest singular value is a smaller share of the largest do not span space
+MIN_SINGULAR_RATIO = 0.02
 MIN_SENSITIVITY = (
     0.03  # sqrt(S_ii) below which a fault of channel i does not reach the parity vector
 )
@@ -45,17 +48,20 @@ class Geometry:
     Parameters
     ----------
     axes
-        Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1 is a scale factor).
+        Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1
+        is a scale factor).
     channel_names
         One name per channel; default g1, g2, ...
     units
-        Name of the unit that each channel belongs to, (n,): channels of one housing, which may fail together.
-        Default: by the part of their names before the last point.
+        Name of the unit that each channel belongs to, (n,): channels of one housing,
+        which may fail together. Default: by the part of their names before the last
+        point.
 
     Raises
     ------
     GeometryError
-        If the axes are of the wrong shape or number, non-finite, of a norm out of range, or of rank below 3.
+        If the axes are of the wrong shape or number, non-finite, of a norm out of
+        range, or of rank below 3.
     """
 
     def __init__(
@@ -296,11 +302,14 @@ def _rotation(mount: ArrayLike, index: int) -> Array:
     return rotation
 
 
-# Names for sets ------------------------------------------------------------------------------------------------------
+# Names for sets
+# ------------------------------------------------------------------------------------------------------
 
 
 PARALLEL = 0.985  # cosine of the angle from which on two channels measure the same axis: 10 deg
-_FEW = 3  # names that are told one by one; of more it is said how many they are, or which few are not among them
+# names that are told one by one; of more it is said how many they are, or which few are
+# not among them
+_FEW = 3
 
 
 def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:

@@ -25,8 +25,9 @@ from fdi_ros.model.samples import Array
 class NoiseModel:
     """Error of a healthy channel in one sample.
 
-    The variance of channel i is ``noise_std^2 + (scale_std * rate_i)^2 + (timing_std * accel_i)^2`` with rate_i
-    and accel_i the body rate and angular acceleration along the channel's axis.
+    The variance of channel i is ``noise_std^2 + (scale_std * rate_i)^2 + (timing_std *
+    accel_i)^2`` with rate_i and accel_i the body rate and angular acceleration along
+    the channel's axis.
 
     Parameters
     ----------
@@ -35,13 +36,15 @@ class NoiseModel:
     scale_std
         Standard deviation of the scale-factor error, dimensionless, 0 to 1 (sigma_k).
     timing_std
-        Standard deviation of the sampling instant, s, 0 to 1; it multiplies the angular acceleration.
+        Standard deviation of the sampling instant, s, 0 to 1; it multiplies the angular
+        acceleration.
     bound
-        Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma); needed by `guaranteed` alone.
+        Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma);
+        needed by `guaranteed` alone.
 
     bias_std
-        Standard deviation of the bias left after its correction, rad/s, >= 0; it does not average out, so only
-        methods that accumulate count it.
+        Standard deviation of the bias left after its correction, rad/s, >= 0; it does
+        not average out, so only methods that accumulate count it.
 
     Each is a scalar, or (n,) with one value per channel.
 
@@ -98,7 +101,8 @@ class NoiseModel:
     ) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.
 
-        ``rate``: of the body, (N, 3) rad/s; ``acceleration``: angular, (N, 3) rad/s^2, None is zero.
+        ``rate``: of the body, (N, 3) rad/s; ``acceleration``: angular, (N, 3) rad/s^2,
+        None is zero.
         """
         total = (rate @ geometry.axes.T * self.scale_std) ** 2 + self.noise_std**2
         if acceleration is not None:
@@ -132,7 +136,8 @@ def _checked(
     return array
 
 
-MUCH_NOISIER = 3.0  # times all channels of other units; vibration of the body, however mounted, makes up to sqrt(3)
+# times all channels of other units. Body vibration makes up to sqrt(3) in any mounting
+MUCH_NOISIER = 3.0
 
 
 def much_noisier(
@@ -140,8 +145,9 @@ def much_noisier(
 ) -> list[tuple[int, float]]:
     """Find channels that are much noisier than every channel of all other units, with the noisiest of these, rad/s.
 
-    ``noise`` (n,) of each channel, rad/s; what is not finite is not compared. ``units``: numbers of the channels of
-    each; channels that fail alone are units of one.
+    ``noise`` (n,) of each channel, rad/s; what is not finite is not compared.
+    ``units``: numbers of the channels of each; channels that fail alone are units of
+    one.
     """
     found = []
     for k, unit in enumerate(units):
@@ -164,8 +170,8 @@ def noisier_words(
 ) -> str:
     """Say which channels are much noisier than the others, with figures; empty: none is.
 
-    ``noise``, ``units`` as `much_noisier` takes them. ``unit``, ``factor``: unit of rates in the words, and how many of
-    it are 1 rad/s.
+    ``noise``, ``units`` as `much_noisier` takes them. ``unit``, ``factor``: unit of
+    rates in the words, and how many of it are 1 rad/s.
     """
     found = much_noisier(noise, units)
     if not found:
@@ -175,7 +181,8 @@ def noisier_words(
     return f"{who} {verb} much noisier than the other units ({max(beside for _, beside in found) * factor:.2g} at most)"
 
 
-# False-alarm rates ----------------------------------------------------------------------------------------------------
+# False-alarm rates
+# ----------------------------------------------------------------------------------------------------
 
 
 DEFAULT_PROBABILITY = 1e-6  # per sample
@@ -278,7 +285,8 @@ def erfc(x: Array) -> Array:
     return np.asarray(np.frompyfunc(math.erfc, 1, 1)(x), dtype=np.float64)
 
 
-# Thresholds ----------------------------------------------------------------------------------------------------------
+# Thresholds
+# ----------------------------------------------------------------------------------------------------------
 
 
 def normal_isf(probability: float) -> float:
@@ -307,10 +315,11 @@ def chi2_isf(probability: float, dof: int) -> float:
 def max_normal_threshold(directions: Array, probability: float) -> float:
     """Exact threshold of ``max_i |w_i|`` for standard normal w_i = directions_i . p, p white in m dimensions.
 
-    The threshold is exceeded with a probability, 0 to 1; directions (n, m) are unit vectors. Up to m = 3 the chi-square
-    tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged over the unit sphere by quadrature.
-    Above, over samples drawn beyond the threshold along each direction in turn (Naiman and Priebe 2001), which keeps
-    its relative accuracy far into the tail.
+    The threshold is exceeded with a probability, 0 to 1; directions (n, m) are unit
+    vectors. Up to m = 3 the chi-square tail of ``(t / M(u))^2``, ``M(u) = max_i
+    |directions_i . u|``, is averaged over the unit sphere by quadrature. Above, over
+    samples drawn beyond the threshold along each direction in turn (Naiman and Priebe
+    2001), which keeps its relative accuracy far into the tail.
     """
     kept: list[int] = []
     for i, direction in enumerate(directions):
@@ -335,7 +344,8 @@ def _sphere_tail(directions: Array) -> Callable[[float], float]:
 def _half_sphere(m: int) -> tuple[Array, Array]:
     """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
 
-    In a plane there are 360 of them; in space 128 at each of 48 heights, which are those of Gauss and Legendre.
+    In a plane there are 360 of them; in space 128 at each of 48 heights, which are
+    those of Gauss and Legendre.
     """
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
@@ -357,7 +367,8 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
     # Seeded once: the threshold is a function of the geometry, the same in every run.
     rng = np.random.default_rng(20190101)
     n, m = directions.shape
-    # The more directions share in the estimate, the fewer draws each needs: the cost grows with n squared, not cubed.
+    # The more directions share in the estimate, the fewer draws each needs: the cost
+    # grows with n squared, not cubed.
     draws = min(4096, 16 * 4096 // n)
     white = rng.standard_normal((draws, m)) @ directions.T
     log_levels = np.log((rng.permutation(draws) + 0.5) / draws)
@@ -376,7 +387,8 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
         for i in range(n):
             w = (along - white[:, i])[:, None] * correlation[i]
             w += white
-            # Comparing i's own value, rounded, with t would lose the one exceedance that is certain.
+            # Comparing i's own value, rounded, with t would lose the one exceedance
+            # that is certain.
             w[:, i] = 0.0
             others = (np.abs(w, out=w) > t).sum(axis=1)
             total += single * float(np.mean(1 / (1 + others)))
@@ -403,7 +415,9 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
 DETECTION = (
     0.99  # probability with which the smallest detectable error is seen in one sample
 )
-IN_PLANE = 0.1  # third singular value below which directions are in one plane: mounts are known no better
+# third singular value below which directions are in one plane: mounts are known no
+# better
+IN_PLANE = 0.1
 MOST_SETS = 4  # sets of channels that are listed
 
 
@@ -412,8 +426,9 @@ def smallest_detectable(
 ) -> Array:
     """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
 
-    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
-    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
+    The test is the largest normalised residual at a false-alarm probability. A
+    channel's own residual, whitened, is ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0,
+    1)``; that some other one passes the threshold first is left out.
     """
     V = geometry.parity
     inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
@@ -432,7 +447,8 @@ def smallest_detectable(
 def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
     """Channels of which two that fail in step look like a fault of a third, set by set.
 
-    Their directions in parity space lie in a plane: three parallel gyros, for one, which have two differences.
+    Their directions in parity space lie in a plane: three parallel gyros, for one,
+    which have two differences.
     """
     directions = geometry.parity / np.maximum(
         np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY
@@ -476,8 +492,9 @@ def summary_line(
 ) -> str:
     """Return what a mounting can do, in one line: for the log of a node.
 
-    ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the errors, and how much of it is 1
-    rad/s. ``agree``: the channels are not known to contradict each other; else nothing is said of what can be named.
+    ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the
+    errors, and how much of it is 1 rad/s. ``agree``: the channels are not known to
+    contradict each other; else nothing is said of what can be named.
     """
     smallest = smallest_detectable(
         geometry, noise.for_channels(geometry.n), probability

@@ -17,7 +17,9 @@ Mask = NDArray[np.bool_]
 Int = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-MAX_RATE = 1e3  # rad/s; a larger finite value counts as this: no gyro measures as much, no vehicle survives it
+# rad/s; a larger finite value counts as this: no gyro measures as much, no vehicle
+# survives it
+MAX_RATE = 1e3
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,10 @@ class Block:
     ]  #: time of each sample, (N,) int64 nanoseconds, strictly increasing
     z: NDArray[np.float64]  #: measured channels, (N, n) float64 rad/s
     received: NDArray[np.bool_] | None = None
-    """(N, n) bool: the channel delivered a value for this sample, whatever the value. None: all did. A value that
-    was delivered but is NaN or infinite is a defect of the sensor; one that was not delivered is silence. The two
-    are reported in different words."""
+    """(N, n) bool: the channel delivered a value for this sample, whatever the value.
+    None: all did. A value that was delivered but is NaN or infinite is a defect of the
+    sensor; one that was not delivered is silence. The two are reported in different
+    words."""
 
     def __post_init__(self) -> None:
         stamp, z = np.asarray(self.stamp), np.asarray(self.z)

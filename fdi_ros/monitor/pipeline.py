@@ -119,7 +119,8 @@ class Pipeline:
         Raises
         ------
         FdiError
-            If the new settings do not fit, or change what cannot change at run time; then nothing is changed.
+            If the new settings do not fit, or change what cannot change at run time;
+            then nothing is changed.
         """
         before = self.config.parameters()
         fixed = [

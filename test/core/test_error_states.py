@@ -138,8 +138,8 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
 
 
 @settings(max_examples=25)
-@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.2))
-def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
+@given(seed=st.integers(0, 2**32 - 1), taken=st.floats(0.0, 1.2))
+def test_no_state_is_known_better_than_it_can_be_taught(seed, taken):
     """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
     one = Measured(seed, 6)
     whole = one.columns.T @ one.information @ one.columns
@@ -148,18 +148,18 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed, share):
         one.rng.normal(0, 0.01, 6),
         slice(6, 6 + 18),
     )
-    least[motion] = (np.diag(one.p) - share * np.diag(whole))[motion]
+    least[motion] = (np.diag(one.p) - taken * np.diag(whole))[motion]
     x, p = one.after(innovation, least)
     assert (
         np.diag(p)[motion]
-        >= (np.diag(one.p - min(share, 1.0) * whole))[motion] * (1 - 1e-9)
+        >= (np.diag(one.p - min(taken, 1.0) * whole))[motion] * (1 - 1e-9)
     ).all()
-    taught = np.diag(least[: one.count])
+    share = np.diag(one.at["share"][: one.count])
     np.testing.assert_allclose(
-        p, one.p - taught @ whole - whole @ taught + taught @ whole @ taught, atol=1e-12
+        p, one.p - share @ whole - whole @ share + share @ whole @ share, atol=1e-12
     )
     np.testing.assert_allclose(
-        x, one.x + taught @ one.columns.T @ one.information @ innovation, atol=1e-12
+        x, one.x + share @ one.columns.T @ one.information @ innovation, atol=1e-12
     )
     assert np.linalg.eigvalsh(p).min() > -1e-12
 

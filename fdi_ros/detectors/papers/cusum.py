@@ -22,13 +22,13 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import along
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.papers.likelihood_ratio import (
     Hypotheses,
     Scratch,
-    along,
     explain,
     fill_scratch,
     prepare_hypotheses,

@@ -30,6 +30,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import along
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector
@@ -226,12 +227,6 @@ def correct_rate(
     d[1] = s[1] * x + s[3] * y + s[4] * z
     d[2] = s[2] * x + s[4] * y + s[5] * z
     return max(squares - (x * d[0] + y * d[1] + z * d[2]), 0.0)
-
-
-@compiled
-def along(axis: Array, vector: Array) -> float:
-    """Scalar product of an axis and a vector, both (3,)."""
-    return axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2]
 
 
 @compiled
