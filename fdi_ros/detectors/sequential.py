@@ -67,7 +67,6 @@ from fdi_ros.estimator.estimator import (
     watch_for_motion,
 )
 from fdi_ros.estimator.noise import (
-    BURST,
     MOTION,
     REST,
     THREE_SIGMA,
@@ -77,6 +76,7 @@ from fdi_ros.estimator.noise import (
     update_sample_variance,
     update_unknown,
 )
+from fdi_ros.estimator.outliers import find_outliers
 from fdi_ros.estimator.rest import REST_STD, update_rest
 from fdi_ros.estimator.shared_noise import (
     begin_shared,
@@ -93,10 +93,6 @@ from fdi_ros.model.samples import MAX_RATE
 # s that a fault lasts before it is declared: two samples at 100 Hz, as one value
 # decides nothing
 LEAST_TIME = 0.02
-OUTLIER, ALIKE = 5.5, 0.95
-"""A value so many standard deviations off, as noise makes one in 2e7, is left out of
-the fused rate of its sample; so are those nearly as far off, of which each may be the
-culprit."""
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion:
 its slow noise is unknown anew."""
@@ -269,36 +265,18 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     kf.used_at = kf.seconds
     kf.samples += 1
     update_time_offsets(params, kf)
-    correct_sample(params, kf, sample.z)
+    correct_sample(params, kf, sample.z, kf.fused.gain)
     watch_for_motion(params, kf)
     if kf.blocks < FEWEST_BLOCKS and kf.noise.regime == MOTION:
         # No block says yet how the body moves, but the sample does.
         project(params.layout, kf.states, kf.at)
         update_weights(params, kf)
     update_statistics(params, kf)
+    find_outliers(params, kf, sample.z)
     if kf.judged == 0:
         update_shared(params, kf)
     elif not is_blind(kf):
         update_from_sample(params, kf, state.scales, not state.case.open)
-
-
-@compiled
-def fill_outliers(params: Constants, state: State, verdict: SampleVerdict) -> None:
-    """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
-    kf, largest, far = state.estimator, 0.0, 0.0
-    for i in range(params.sensors.n):
-        burst = max(
-            1.0, BURST * kf.noise.quick[i], kf.shared.level[i] / kf.noise.now.sample[i]
-        )
-        largest = max(largest, abs(kf.statistic[i]) / math.sqrt(burst))
-        far = max(far, kf.distance[i])
-    for i in range(params.sensors.n):
-        if largest > OUTLIER:
-            # Of all statistics with equal weights that of the culprit is the largest
-            # (Cauchy and Schwarz).
-            verdict.outliers[i] = kf.distance[i] > ALIKE * far
-        elif state.case.open:
-            verdict.outliers[i] = kf.excluded_from_rate >> i & 1
 
 
 @compiled
@@ -382,7 +360,9 @@ def judge(
     if add_sample(params, kf, sample.z, seconds):
         process_block(params, state, sample)
         # Its covariance is that of now.
-        correct_sample(params, kf, sample.z)
+        has_spike = kf.spiked != 0 and kf.spiked != kf.mask
+        gain = kf.clean.gain if has_spike else kf.fused.gain
+        correct_sample(params, kf, sample.z, gain)
     sample.estimate.known = True
     if kf.judged:
         follow_evidence(params, state, verdict)
@@ -398,7 +378,11 @@ def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> 
     kf, case = state.estimator, state.case
     mean = mean_of(params, kf, state.scales)
     verdict.statistic = math.log(1.0 + mean)
-    fill_outliers(params, state, verdict)
+    outliers = kf.outliers
+    if outliers == 0 and case.open:
+        outliers = kf.excluded_from_rate
+    for i in range(params.sensors.n):
+        verdict.outliers[i] = outliers >> i & 1
     if case.open:
         follow_case(params, state)
     elif kf.filled == 0 and goes_too_far(params, state):

@@ -47,7 +47,6 @@ from fdi_ros.estimator.error_states import (
     subtract_errors,
 )
 from fdi_ros.estimator.noise import (
-    FAR,
     MOTION,
     THREE_SIGMA,
     Noise,
@@ -91,7 +90,6 @@ Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 SLOW_TURN = (
     1e-4  # (rad/s)^2: below 0.6 deg/s the uncertainty does not grow with the motion
 )
-SPIKE = 4  # most samples of a spike: delays spread one over its neighbours
 
 
 @record
@@ -159,6 +157,12 @@ class Estimator:
     behind: Real
     spread: Real  # largest delay between units, s
     odd: Real  # chi-square of the last sample over the largest usual, at least 1
+    outliers: Mask  # channels of the last sample that are too far off to be used in it
+    spiked: Mask  # of these, those of a spike; all, if the culprit is not known
+    spikes: Counts  # of each channel so far
+    clean: Parity  # without the outliers
+    clean_values: Channels  # A y of that, s/rad
+    clean_rate: Vector  # of that, rad/s
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less their estimated errors, rad/s
     innovation: Channels  # corrected values less the rate along each channel, rad/s
@@ -184,7 +188,8 @@ class Estimator:
     signal_rate: Vector  # rate that multiplies the states, rad/s; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
-    far: Whole  # samples in a row that are far off
+    far_samples: Whole  # samples in a row that are far off
+    spike_channels: Mask  # culprits in these
     sum_values: Channels  # rad/s
     sum_count: Channels  # samples that each channel has delivered
     sum_time: Channels  # when each has, s since the block begins
@@ -208,7 +213,7 @@ class Estimator:
     block_at: Projection
     matrix: Annotated[
         NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)
-    ]  # M of a block, (rad/s)^2
+    ]  # M of a block, or of a sample, (rad/s)^2
     block_information: (
         Square  # A of all its channels, whatever is learned from, s^2/rad^2
     )
@@ -282,17 +287,19 @@ def update_weights(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
-def correct_sample(params: Constants, kf: Estimator, values: Array) -> None:
-    """Correct a sample by the present states; update its rate and innovations."""
+def correct_sample(
+    params: Constants, kf: Estimator, values: Array, gain: Array
+) -> None:
+    """Correct a sample (n,) by the present states; update its rate, by a gain (3, n), and its innovations."""
     n, layout = params.sensors.n, params.layout
     signals, innovation = kf.at.signals, kf.innovation
     fill_signals(layout, kf.zero, kf.angular_acceleration, signals)
     subtract_errors(layout, kf.states, signals, values, innovation)
-    apply_gain(kf.fused.gain, n, innovation, kf.rate)
+    apply_gain(gain, n, innovation, kf.rate)
     if kf.noise.regime == MOTION:
         fill_signals(layout, kf.rate, kf.angular_acceleration, signals)
     subtract_errors(layout, kf.states, signals, values, kf.corrected)
-    apply_gain(kf.fused.gain, n, kf.corrected, kf.rate)
+    apply_gain(gain, n, kf.corrected, kf.rate)
     for i in range(n):
         innovation[i] = 0.0
         if kf.mask >> i & 1:
@@ -331,11 +338,16 @@ def usual_chi(free: float) -> float:
 
 
 @compiled
+def motion_growth(kf: Estimator, rate: Vector) -> float:
+    """Growth of the state uncertainty since the last block, at a rate (3,), rad/s."""
+    return max((square(rate) + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
+
+
+@compiled
 def update_statistics(params: Constants, kf: Estimator) -> None:
     """Normalise the innovations of a sample. The state uncertainty grows with the motion."""
     n = params.sensors.n
-    faster = (square(kf.rate) + SLOW_TURN) / (kf.speed_squared + SLOW_TURN)
-    more = max(faster, 1.0)
+    more = motion_growth(kf, kf.rate)
     chi, free = 0.0, -3.0
     for i in range(n):
         kf.statistic[i], kf.inflation[i] = 0.0, 1.0
@@ -365,19 +377,9 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 
 @compiled
-def is_spike(params: Constants, kf: Estimator) -> bool:
-    """Whether the sample is an outlier in a run of at most `SPIKE` samples. A longer run is not a spike."""
-    far = False
-    for i in range(params.sensors.n):
-        far = far or kf.statistic[i] * kf.statistic[i] > FAR
-    kf.far = kf.far + 1 if far else 0
-    return 0 < kf.far <= SPIKE
-
-
-@compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and, unless a spike, to the block; return whether the block is complete."""
-    n, total, spike = params.sensors.n, kf.total, is_spike(params, kf)
+    n, total = params.sensors.n, kf.total
     total.sample = kf.samples
     if kf.filled == 0:
         kf.begun = kf.seconds - seconds
@@ -385,13 +387,13 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
         if kf.mask >> i & 1:
             total.values[i] += values[i]
             total.count[i] += 1.0
-        if kf.mask >> i & 1 and not spike:
+        if (kf.mask & ~kf.spiked) >> i & 1:
             kf.sum_values[i] += values[i]
             kf.sum_count[i] += 1.0
             kf.sum_time[i] += kf.seconds - kf.begun
     kf.sum_seconds += kf.seconds - kf.begun
     for a in range(3):
-        if not spike:
+        if kf.spiked != kf.mask:
             total.instant[a] = kf.rate[a]
         total.rate[a] += total.instant[a]
         kf.sum_rate[a] += total.instant[a]

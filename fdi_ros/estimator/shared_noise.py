@@ -77,6 +77,10 @@ def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
 def update_shared(params: Constants, kf: Estimator) -> None:
     """Take the innovations of a sample and, every 20 ms, fourth differences of the corrected values."""
     shared = kf.shared
+    if kf.spiked == kf.mask:
+        # A spike whose channels are not known is no vibration.
+        shared.fresh = 0
+        return
     if kf.judged:
         update_covariance(params, kf)
     for a in range(3):

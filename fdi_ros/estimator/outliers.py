@@ -1,0 +1,245 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Values too far off to be used in their sample, and spikes: outliers that last a few samples.
+
+The first hypothesis that leaves no more than noise is taken: one channel, then one unit. Where parity cannot tell two
+hypotheses apart, as with two parallel units, the one that changes the rate least since the sample before is taken, if
+it does so by far; else all of them are left out. A spike is counted, and kept out of the estimator's rate, of its
+blocks and of what it learns of vibration. The evidence of faults takes the values as they are.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, fill_joint_parity
+from fdi_ros.estimator.estimator import (
+    Constants,
+    Estimator,
+    correct_sample,
+    motion_growth,
+    usual_chi,
+)
+from fdi_ros.estimator.noise import BURST, FAR, THREE_SIGMA
+from fdi_ros.model.samples import Array
+
+OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
+ALIKE = 0.95  # share of the largest distance from which a channel may be the culprit as well
+SPIKE_SAMPLES = 4  # longest spike: re-stamping spreads a single value over its neighbours
+MISFIT = 1e-4
+"""Share of the chi-square that a true hypothesis may leave: 1 % of the spike in other channels, whose scale errors were
+corrected at a rate that holds it."""
+CLOSER = 0.25  # ratio of squared changes of the rate from which the smaller one decides
+
+
+@compiled
+def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
+    """Find the outliers of a sample, and correct the sample without those that may be a spike."""
+    kf.outliers = kf.spiked = 0
+    burst, farthest = 1.0, 0.0
+    for i in range(params.sensors.n):
+        burst = max(burst, excess_of(kf, i))
+        farthest = max(farthest, kf.distance[i])
+    if largest_of(params, kf, 1.0) <= OUTLIER:
+        end_spike(params, kf)
+        return
+    candidates = 0
+    for i in range(params.sensors.n):
+        # The distance of the culprit is the largest (Cauchy and Schwarz).
+        if kf.distance[i] > ALIKE * farthest:
+            candidates |= 1 << i
+    if kf.far_samples >= SPIKE_SAMPLES:
+        # This lasts: it is left to the evidence which channels are wrong.
+        growth = motion_growth(kf, kf.rate)
+        if largest_of(params, kf, growth) > OUTLIER:
+            kf.outliers = candidates
+            kf.far_samples += 1
+        else:
+            end_spike(params, kf)
+        return
+    explain_outliers(params, kf, values, candidates, burst)
+
+
+@compiled
+def explain_outliers(
+    params: Constants, kf: Estimator, values: Array, candidates: int, burst: float
+) -> None:
+    """Find which channels explain a sample that is far off, and whether they are a spike."""
+    fill_sample_covariance(params, kf)
+    limit = MISFIT * chi_without(params, kf, 0)
+    chosen = choose(params, kf, candidates, burst, limit)
+    if chosen == 0:
+        chosen = remove_farthest(params, kf, burst)
+    if params.determines[kf.mask & ~chosen]:
+        chi_without(params, kf, chosen)
+    # A rate that holds a spike would excuse it as an error of scale.
+    largest = largest_of(params, kf, motion_growth(kf, kf.clean_rate))
+    if largest > OUTLIER:
+        kf.outliers = chosen
+    if largest * largest > FAR:
+        kf.far_samples += 1
+        leave_spike_out(params, kf, values, burst)
+    else:
+        end_spike(params, kf)
+
+
+@compiled
+def excess_of(kf: Estimator, i: int) -> float:
+    """Variance of the noise of a channel now over the learned one."""
+    level = kf.shared.level[i] / kf.noise.now.sample[i]
+    return max(1.0, BURST * kf.noise.quick[i], level)
+
+
+@compiled
+def largest_of(params: Constants, kf: Estimator, growth: float) -> float:
+    """Largest distance of a channel in standard deviations, as what is not known of the states has grown."""
+    largest = 0.0
+    for i in range(params.sensors.n):
+        variance = kf.share[i] + growth * (1.0 - kf.share[i])
+        size = kf.distance[i] / math.sqrt(excess_of(kf, i) * variance)
+        largest = max(largest, size)
+    return largest
+
+
+@compiled
+def fill_sample_covariance(params: Constants, kf: Estimator) -> None:
+    """Fill M of a sample, as the sample is judged with it."""
+    for i in range(params.sensors.n):
+        for j in range(params.sensors.n):
+            kf.matrix[i, j] = 2.0 * params.length * kf.at.covariance[i, j]
+        kf.matrix[i, i] += kf.noise.now.sample[i]
+
+
+@compiled
+def chi_without(params: Constants, kf: Estimator, without: int) -> float:
+    """Chi-square of the sample without some channels; the rate of the others is in ``kf.clean_rate``."""
+    n, parity = params.sensors.n, kf.clean
+    mask = kf.mask & ~without
+    fill_joint_parity(parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
+    apply_gain(parity.gain, n, kf.corrected, kf.clean_rate)
+    chi = 0.0
+    for i in range(n):
+        kf.clean_values[i] = 0.0
+        for j in range(n):
+            if mask >> i & mask >> j & 1:
+                kf.clean_values[i] += parity.information[i, j] * kf.corrected[j]
+        if mask >> i & 1:
+            chi += kf.clean_values[i] * kf.corrected[i]
+    return chi
+
+
+@compiled
+def change_without(
+    params: Constants, kf: Estimator, without: int, burst: float, limit: float
+) -> float:
+    """Square of the change of the rate since the last sample if some channels are wrong, (rad/s)^2.
+
+    Negative: the others disagree, or give no rate. ``burst``: variance over
+    the learned one; ``limit``: chi-square allowed beyond noise.
+    """
+    if not params.determines[kf.mask & ~without]:
+        return -1.0
+    chi, free = chi_without(params, kf, without), -3.0
+    for i in range(params.sensors.n):
+        free += (kf.mask & ~without) >> i & 1
+    if chi > burst * usual_chi(free) + limit:
+        return -1.0
+    change = 0.0
+    for a in range(3):
+        step = kf.clean_rate[a] - kf.total.instant[a]
+        # Noise of either rate is no change.
+        change += max(step * step, THREE_SIGMA * kf.clean.inverse[a, a])
+    return change
+
+
+@compiled
+def choose(
+    params: Constants, kf: Estimator, candidates: int, burst: float, limit: float
+) -> int:
+    """Return the channel, or the channels of the unit, that explains the sample; 0: none does.
+
+    A channel is preferred. A unit is taken where it changes the rate less by far: some spikes of a unit look like one
+    of a channel of another. Where two do as well, all channels of both are returned.
+    """
+    channel = 0
+    of_channel = next_channel = math.inf
+    for i in range(params.sensors.n):
+        if candidates >> i & 1:
+            change = change_without(params, kf, 1 << i, burst, limit)
+            if change >= 0.0:
+                next_channel = min(next_channel, max(change, of_channel))
+                if change < of_channel:
+                    of_channel, channel = change, 1 << i
+    unit = 0
+    of_unit = next_unit = math.inf
+    for u in range(params.units):
+        inside = params.members[u] & kf.mask
+        change = change_without(params, kf, inside, burst, limit) if inside else -1.0
+        if change >= 0.0:
+            next_unit = min(next_unit, max(change, of_unit))
+            if change < of_unit:
+                of_unit, unit = change, inside
+    if CLOSER * of_channel <= of_unit or (unit == 0 and channel):
+        return channel if decides(kf, of_channel, next_channel) else candidates
+    return unit if decides(kf, of_unit, next_unit) else kf.mask
+
+
+@compiled
+def decides(kf: Estimator, least: float, second: float) -> bool:
+    """Whether the least change of the rate is the smaller one by far; after a hole no rate is known."""
+    return second == math.inf or (kf.blocks > 0 and least < CLOSER * second)
+
+
+@compiled
+def remove_farthest(params: Constants, kf: Estimator, burst: float) -> int:
+    """Return channels of several units: the farthest again and again, until the rest is noise."""
+    without = 0
+    for _ in range(params.sensors.n):
+        chi, free = chi_without(params, kf, without), -3.0
+        farthest, most = -1, 0.0
+        for i in range(params.sensors.n):
+            information = kf.clean.information[i, i]
+            if (kf.mask & ~without) >> i & 1 and information > 0.0:
+                free += 1.0
+                size = kf.clean_values[i] * kf.clean_values[i] / information
+                if size > most:
+                    farthest, most = i, size
+        if chi <= burst * usual_chi(free) or farthest < 0:
+            break
+        if not params.spans[kf.mask & ~without & ~(1 << farthest)]:
+            break
+        without |= 1 << farthest
+    return without
+
+
+@compiled
+def leave_spike_out(
+    params: Constants, kf: Estimator, values: Array, burst: float
+) -> None:
+    """Correct a sample by the rate of the channels that are no outliers, and impute the others from it."""
+    kf.spiked = kf.outliers
+    if not params.determines[kf.mask & ~kf.spiked]:
+        kf.spiked = kf.mask
+        return
+    kf.spike_channels |= kf.spiked
+    chi, free = chi_without(params, kf, kf.spiked), -3.0
+    for i in range(params.sensors.n):
+        free += (kf.mask & ~kf.spiked) >> i & 1
+    kf.odd = max(1.0, chi / burst / usual_chi(free))
+    correct_sample(params, kf, values, kf.clean.gain)
+    for i in range(params.sensors.n):
+        if kf.spiked >> i & 1:
+            kf.corrected[i] -= kf.innovation[i]
+            kf.innovation[i] = 0.0
+
+
+@compiled
+def end_spike(params: Constants, kf: Estimator) -> None:
+    """Count a spike that has just ended, for its channels if they are known."""
+    if 0 < kf.far_samples <= SPIKE_SAMPLES:
+        for i in range(params.sensors.n):
+            kf.spikes[i] += kf.spike_channels >> i & 1
+    kf.spike_channels = 0
+    kf.far_samples = 0
