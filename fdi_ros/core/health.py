@@ -30,6 +30,7 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
             health.value[i] = math.nan
             health.run_stamp[i] = health.received_stamp[i] = stamp
             health.bad_stamp[i] = NOT_BAD
+            health.limit[i] = usual_limit(settings, i)
     health.begun += 1
     follow_presence(health, n, stamp, received)
     for i in range(n):
@@ -45,9 +46,28 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
         if stamp - health.received_stamp[i] > settings.stale_time:
             condition = SILENT
         health.condition[i] = condition
-        health.counts[condition, i] += 1
-        if condition != MISSING and condition != SILENT:
+    silence_units(settings, health)
+    for i in range(n):
+        health.counts[health.condition[i], i] += 1
+        if health.condition[i] != MISSING and health.condition[i] != SILENT:
             health.samples[i] += 1
+
+
+@compiled
+def silence_units(settings: PathSettings, health: Health) -> None:
+    """Take a unit that gives nothing but values that are not finite for one that gives nothing.
+
+    Drivers fill in NaN while their device is away. That is no fault of a channel that would last.
+    """
+    for u in range(settings.units):
+        gone = members = 0
+        for i in range(settings.n):
+            if settings.members[u] >> i & 1:
+                members += 1
+                gone += health.condition[i] == NON_FINITE_LASTING
+        for i in range(settings.n if gone == members > 1 else 0):
+            if settings.members[u] >> i & 1:
+                health.condition[i] = SILENT
 
 
 @compiled
@@ -66,8 +86,9 @@ def receive(
             health.run_stamp[i] = stamp
         if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
             health.step[i] = change
+        follow_rail(settings, health, i, z)
         health.value[i], health.bad_stamp[i] = z, NOT_BAD
-        return OUT_OF_RANGE if abs(z) >= settings.max_rate[i] else FINE
+        return OUT_OF_RANGE if abs(z) >= health.limit[i] else FINE
     if health.bad_stamp[i] == NOT_BAD or hole:
         health.bad_stamp[i] = stamp
     return (
@@ -75,6 +96,49 @@ def receive(
         if stamp - health.bad_stamp[i] >= settings.non_finite_time
         else NON_FINITE
     )
+
+
+RANGES = tuple(
+    math.radians(32767 / sensitivity) for sensitivity in (131, 65.5, 32.8, 16.4)
+)
+"""Largest rates that chips of 250, 500, 1000 and 2000 deg/s give, rad/s."""
+RAIL_SHARE, RAIL_OFFSET = 1e-3, 0.02
+"""A value is at the end of a range within this share of it and an offset, rad/s: sensitivities of makes differ, and a
+bias was taken off."""
+RAIL_REPEATS = 3  # values in a row, none larger before, that show an end of range: noise repeats no extreme
+UNKNOWN_RANGE = 36.0  # rad/s; a larger max_rate states a chip of more than 2000 deg/s
+
+
+@compiled
+def rail_of(size: float) -> float:
+    """Least value at the end of the range that a value of this size is at, rad/s; 0: it is at none."""
+    for largest in RANGES:
+        width = RAIL_SHARE * largest + RAIL_OFFSET
+        if abs(size - largest) <= width:
+            return largest - width
+    return 0.0
+
+
+@compiled
+def usual_limit(settings: PathSettings, i: int) -> float:
+    """Size from which values are out of range while no smaller range has shown, rad/s."""
+    stated = settings.max_rate[i]
+    return min(stated, rail_of(RANGES[3])) if stated < UNKNOWN_RANGE else stated
+
+
+@compiled
+def follow_rail(settings: PathSettings, health: Health, i: int, z: float) -> None:
+    """Learn the range of a chip from an extreme value that repeats; a larger one shows that it is no end of range."""
+    size = abs(z)
+    health.repeats[i] = health.repeats[i] + 1 if z == health.value[i] else 1
+    if size > health.extreme[i]:
+        if size > health.extreme[i] + RAIL_SHARE * size + 2.0 * RAIL_OFFSET:
+            health.limit[i] = usual_limit(settings, i)
+        health.extreme[i] = size
+    if size == health.extreme[i] and health.repeats[i] >= RAIL_REPEATS:
+        rail = rail_of(size)
+        if rail > 0.0:
+            health.limit[i] = min(health.limit[i], rail)
 
 
 SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0

@@ -180,7 +180,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
     for i in range(settings.n):
         if sample.received[i]:
             delivered |= 1 << i
-            if abs(sample.z[i]) < settings.max_rate[i]:
+            if abs(sample.z[i]) < core.health.limit[i]:
                 inside |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
@@ -194,7 +194,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
         aligned,
     )
     for i in range(settings.n):
-        if delivered >> i & 1 and abs(aligned[i]) < settings.max_rate[i]:
+        if delivered >> i & 1 and abs(aligned[i]) < core.health.limit[i]:
             plain |= 1 << i
     return plain, fine
 
@@ -284,7 +284,7 @@ def fill_input(core: Core, out: int) -> None:
             and not out >> i & 1
             and math.isfinite(now.aligned[i])
         ):
-            limit = core.settings.max_rate[i]
+            limit = core.health.limit[i]
             if abs(now.along[i]) < RAIL_MARGIN * limit:
                 now.input[i] = min(
                     max(now.input[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit

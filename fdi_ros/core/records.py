@@ -181,6 +181,7 @@ class Estimate:
     late: Units
     behind: Real  # by how much the values lie before the stamp, if the earliest unit is in time, s
     spread: Real  # largest delay between units, s
+    spikes: Counts  # of each channel so far: a few values far off, left out of the rate
 
 
 @record
@@ -264,6 +265,9 @@ class Health:
     value: Channels  # last finite value delivered, rad/s; NaN before the first
     run_stamp: Stamps  # when it was first seen, ns
     received_stamp: Stamps  # of the last sample that the channel delivered, ns
+    limit: Channels  # values from here on are out of range, rad/s
+    extreme: Channels  # largest size of a value so far, rad/s
+    repeats: Counts  # how often the last value has come in a row
     bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
     condition: Flags  # `Condition` in this sample
     counts: Annotated[

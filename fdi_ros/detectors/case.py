@@ -82,6 +82,8 @@ DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 """A slow drift is looked for over so many s (480), as long as states are kept, and half
 as long, so many times."""
+# s after a gap from which the mean begins anew: as long as a name must stand
+LEAST_RETURN = 0.2
 # by so much at once at most: motors that start move biases by some 5 mrad/s, and no
 # more
 LARGEST_STEP = 0.015
@@ -101,6 +103,7 @@ class Case:
     since: Whole  # sample since which they could
     isolated: Mask  # faulty for certain
     suspects: Mask  # at least one of them is faulty
+    witnesses: Mask  # channels that those were found among
     retry: Whole  # no case is opened before this sample
     before: ErrorStates  # the states as they were when it was opened
     moved: Real  # how far all biases have moved lately, rad/s
@@ -223,6 +226,7 @@ def open_case(params: Constants, state: State) -> None:
     kf, case = state.estimator, state.case
     case.onset = max(case.onset, 1)
     case.open, case.candidate, case.isolated = True, 0, 0
+    case.suspects = case.witnesses = 0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
@@ -299,13 +303,20 @@ def name_channels(params: Constants, state: State) -> None:
     if size * params.period > LONG_TIME:
         # A drift is largest at last.
         size = size // 2 + 1
+    if (kf.samples - kf.returned) * params.period > LEAST_RETURN:
+        # Means over a gap are of another motion.
+        size = min(size, kf.samples - kf.returned + 1)
     explain_mean(params, kf, inference, size)
+    if lacks_witnesses(case):
+        keep_suspects(case)
     std = 0.0 if case.isolated else moved_by(inference, params.sensors.n)
     if std > 0.0 and let_biases_move(params, state, std):
         return
     case.next = kf.samples + max(size // RENAME, 1)
     if inference.common and shows_others(params, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
+    if not lacks_witnesses(case):
+        case.witnesses = inference.mask
     case.suspects = inference.union
     isolate(params, kf, case)
     leave_aside(params, state)
@@ -347,6 +358,25 @@ def time_to_settle(params: Constants, inference: Inference) -> float:
     if checks(inference.mask, params.sensors.n) > FEW_CHECKS:
         return SETTLED
     return SETTLED_AMONG_FEW
+
+
+@compiled
+def lacks_witnesses(case: Case) -> bool:
+    """Whether channels are away that the suspects were found among, and that are none of them."""
+    found = case.suspects | case.isolated
+    return found != 0 and case.witnesses & ~case.inference.mask & ~found != 0
+
+
+@compiled
+def keep_suspects(case: Case) -> None:
+    """Keep what is known of the suspects, if the channels that are left do not clear them.
+
+    The others may not tell two units apart; who was wrong before is.
+    """
+    inference = case.inference
+    if inference.union & case.suspects:
+        inference.common, inference.union = case.isolated, case.suspects
+        inference.fitted = True
 
 
 @compiled

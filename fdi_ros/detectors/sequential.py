@@ -61,6 +61,7 @@ from fdi_ros.estimator.estimator import (
     add_sample,
     correct_sample,
     drop_block,
+    follow_gaps,
     forget_motion,
     update_statistics,
     update_weights,
@@ -264,6 +265,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
         drop_block(kf, params.sensors.n)
     kf.used_at = kf.seconds
     kf.samples += 1
+    follow_gaps(params, kf)
     update_time_offsets(params, kf)
     correct_sample(params, kf, sample.z, kf.fused.gain)
     watch_for_motion(params, kf)
@@ -298,6 +300,7 @@ def fill_verdict(
             variance,
         )
         sample.estimate.bias[i] = kf.states.x[i]
+        sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         for j in range(n):
             # While it is open which channels are faulty, each may be off by what it is

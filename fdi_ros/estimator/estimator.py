@@ -148,6 +148,8 @@ class Estimator:
     excluded_from_rate: Mask  # channels under doubt that the rate leaves out
     beyond: Mask  # channels of the last sample that were out of range
     under_test: Mask  # channels under doubt, which the states learn nothing from
+    present_at: Counts  # number of the last sample of each channel
+    returned: Whole  # number of the sample at which the last gap of a channel ended
     learned_at: Real  # the states are of this time, s since the start
     states: ErrorStates
     noise: Noise
@@ -374,6 +376,17 @@ def copy_total(n: int, source: Total, target: Total) -> None:
         target.values[i], target.count[i] = source.values[i], source.count[i]
     for a in range(3):
         target.rate[a], target.instant[a] = source.rate[a], source.instant[a]
+
+
+@compiled
+def follow_gaps(params: Constants, kf: Estimator) -> None:
+    """Note when channels return from a gap; a unit that is slower than the others has none."""
+    for i in range(params.sensors.n):
+        if kf.mask >> i & 1:
+            before = kf.present_at[i]
+            if 0 < before < kf.samples - 2 * params.length:
+                kf.returned = kf.samples
+            kf.present_at[i] = kf.samples
 
 
 @compiled

@@ -27,7 +27,9 @@ from fdi_ros.model.samples import Array
 
 OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
 ALIKE = 0.95  # share of the largest distance from which a channel may be the culprit as well
-SPIKE_SAMPLES = 4  # longest spike: re-stamping spreads a single value over its neighbours
+SPIKE_SAMPLES = (
+    4  # longest spike: re-stamping spreads a single value over its neighbours
+)
 MISFIT = 1e-4
 """Share of the chi-square that a true hypothesis may leave: 1 % of the spike in other channels, whose scale errors were
 corrected at a rate that holds it."""
@@ -237,9 +239,13 @@ def leave_spike_out(
 
 @compiled
 def end_spike(params: Constants, kf: Estimator) -> None:
-    """Count a spike that has just ended, for its channels if they are known."""
+    """Count a spike that has just ended, for its channels if they are known.
+
+    What ends because its channel is left out, or is under test, is a fault.
+    """
+    channels = kf.spike_channels & kf.mask & ~kf.under_test
     if 0 < kf.far_samples <= SPIKE_SAMPLES:
         for i in range(params.sensors.n):
-            kf.spikes[i] += kf.spike_channels >> i & 1
+            kf.spikes[i] += channels >> i & 1
     kf.spike_channels = 0
     kf.far_samples = 0

@@ -56,9 +56,9 @@ class ChannelStatus:
     error: float  #: Estimated error when declared or suspected, rad/s.
     residual: float  #: Of the last sample, rad/s, NaN where missing.
     last_received: int  #: Stamp of the last sample with a value, ns, 0 if none.
-    counts: Mapping[
-        str, int
-    ]  #: ``samples``, with ``missing``, ``non-finite``, ``out of range`` and ``stuck`` among them.
+    counts: Mapping[str, int]
+    """``samples``, with ``missing``, ``non-finite``, ``out of range`` and ``stuck`` among them, and ``spikes``: how
+    often a few values were far off and left out of the rate."""
     #: Share of the recent samples in which the channel gave a finite value.
     delivers: float = 1.0
     drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
@@ -265,6 +265,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
             ),
             "out of range": int(count[Condition.OUT_OF_RANGE]),
             "stuck": int(health["stuck"][i] + count[Condition.FROZEN]),
+            "spikes": int(core["sample"]["estimate"]["spikes"][i]),
         },
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
         drift=float(core["sample"]["estimate"]["bias"][i]),

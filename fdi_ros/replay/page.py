@@ -282,6 +282,7 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
         "not checked": lambda one: f"{one.unchecked:.1%}",
         f"residual, {unit.name} rms": lambda one: rate(one.residual_rms_rad_s, ".2g"),
         "noise, noise_std": lambda one: number(one.noise, ".2g"),
+        "spikes": lambda one: str(one.spikes),
         f"bias followed, {unit.name}": lambda one: rate(one.bias_followed, "+.2g"),
     }
     return Section(

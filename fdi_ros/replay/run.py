@@ -276,7 +276,15 @@ class Judge(Walk):
                 state, reason = changes[0].before, ""
             drift, noise = status.drift, status.noise or None
             yield ChannelResult(
-                status.name, state, since, reason, drift, noise, unchecked, rms
+                status.name,
+                state,
+                since,
+                reason,
+                drift,
+                noise,
+                unchecked,
+                rms,
+                status.counts["spikes"],
             )
 
     @property

@@ -32,6 +32,8 @@ class ChannelResult:
     unchecked: float  # Share of the samples in which nothing checked it.
     residual_rms_rad_s: float | None
     """Root mean square of what it differs by from the fused rate while OK; None: it never was."""
+    spikes: int = 0
+    """Times that a few values were far off, left out of the fused rate."""
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,19 @@ def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
         f"{fault.kind} on {fault.channel}: {_detection_words(fault)}."
         for fault in faults
     ]
-    return [*lines, *_episode_lines(summary, unit), *noisy_lines(summary, unit)]
+    return [
+        *lines,
+        *_episode_lines(summary, unit),
+        *spike_lines(summary),
+        *noisy_lines(summary, unit),
+    ]
+
+
+def spike_lines(summary: Summary) -> list[str]:
+    """Count the spikes of each channel."""
+    found = [one for one in summary.monitor.channels if one.spikes]
+    words = ", ".join(f"{one.name} {one.spikes}" for one in found)
+    return [f"Spikes, left out of the fused rate: {words}."] if found else []
 
 
 def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:

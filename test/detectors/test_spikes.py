@@ -1,0 +1,89 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A spike of one sample never enters the fused rate; it is counted for its channel, and for no other."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_ros import Block, Config, Pipeline, replay
+from fdi_ros.experiments.flight import regular_stamps
+
+# For this import alone: a module there has the name of a folder of tests.
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmark"))
+from trials import START, Asked
+from vibration import config_of, flight_of
+
+sys.path.pop(0)
+
+CASES = Path(__file__).parents[3] / "shared" / "data" / "cases"
+FIRST = 500  # sample of the first spike
+
+
+def judged(units, size, whole_unit, every):
+    """Judge one flight with and without spikes; return both outputs, the samples of spikes and their counts."""
+    pipeline = Pipeline.from_config(config_of(units, 100.0, Asked()))
+    rng = np.random.default_rng([units, every])
+    flight = flight_of(pipeline.config, pipeline.geometry.axes, rng)
+    values = flight.values()
+    stamps = regular_stamps(60.0, 100.0, START)[: len(values)]
+    clean = pipeline.process(Block(stamps, values.copy()))
+    at = np.arange(FIRST, len(values) - 20, every) + rng.integers(
+        0, every // 3, len(range(FIRST, len(values) - 20, every))
+    )
+    struck = [3, 4, 5] if whole_unit else [4]
+    for k in at:
+        values[k, struck] += size * rng.choice([-1.0, 1.0], len(struck))
+    pipeline.restart()
+    spiked = pipeline.process(Block(stamps, values))
+    counts = [one.counts["spikes"] for one in pipeline.status().channels]
+    return clean, spiked, at, np.array(counts), struck
+
+
+@pytest.mark.parametrize("units", [2, 3])
+@pytest.mark.parametrize("size", [1.0, 5.0, 34.0])
+@pytest.mark.parametrize("whole_unit", [False, True])
+def test_no_spike_enters_the_rate(units, size, whole_unit):
+    clean, spiked, at, counts, struck = judged(units, size, whole_unit, 97)
+    change = np.abs(spiked.rate - clean.rate)
+    std = np.sqrt(np.einsum("kii->ki", clean.covariance))
+    assert spiked.valid.sum() == clean.valid.sum()
+    assert (change[at] < 6 * std[at]).all()
+    assert np.nanmax(change) < 0.05
+    # The covariance stays what it was, but for the channels that a sample lacks.
+    others = np.sqrt(np.einsum("kii->ki", spiked.covariance))
+    assert np.nanmedian(others / std) < 1.1
+    assert (counts[struck] == len(at)).all()
+    assert not np.delete(counts, struck).any()
+    assert not [event for event in spiked.events if event.declares]
+
+
+def test_a_lasting_step_is_no_spike():
+    """It is left out at once as well, and named."""
+    pipeline = Pipeline.from_config(config_of(3, 100.0, Asked()))
+    flight = flight_of(
+        pipeline.config, pipeline.geometry.axes, np.random.default_rng(1)
+    )
+    values = flight.values()
+    values[3000:, 4] += 1.0
+    stamps = regular_stamps(60.0, 100.0, START)[: len(values)]
+    output = pipeline.process(Block(stamps, values))
+    named = [event for event in output.events if event.declares]
+    assert [event.channel for event in named] == [4]
+    assert 3000 <= named[0].row < 3030
+    assert sum(one.counts["spikes"] for one in pipeline.status().channels) == 0
+    error = output.rate - flight.truth_at((output.instant - START) * 1e-9)
+    assert np.abs(error[3000:3100]).max() < 0.03
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="needs the cases beside the project")
+def test_spikes_of_a_recording_are_counted():
+    config = Config.from_file(CASES / "clean_settings.yaml")
+    summary = replay(CASES / "spikes_5_every_1s.csv", config)
+    counts = {one.name: one.spikes for one in summary.monitor.channels if one.spikes}
+    assert counts == {"imu_1.y": 24}
+    rms = [one.residual_rms_rad_s for one in summary.monitor.channels]
+    assert max(rms) < 2 * min(rms)
