@@ -167,6 +167,9 @@ class Estimator:
     clean_rate: Vector  # of that, rad/s
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less their estimated errors, rad/s
+    imputed: (
+        Channels  # the same, with the rate of the others in place of a spike, rad/s
+    )
     innovation: Channels  # corrected values less the rate along each channel, rad/s
     statistic: Channels  # (A y)_i of the last sample over its standard deviation in this motion
     distance: Channels  # ``|A y|_i / sqrt(A_ii)`` of the last sample

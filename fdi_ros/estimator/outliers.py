@@ -42,6 +42,7 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
     kf.outliers = kf.spiked = 0
     burst, farthest = 1.0, 0.0
     for i in range(params.sensors.n):
+        kf.imputed[i] = kf.corrected[i]
         burst = max(burst, excess_of(kf, i))
         farthest = max(farthest, kf.distance[i])
     if largest_of(params, kf, 1.0) <= OUTLIER:
@@ -232,8 +233,9 @@ def leave_spike_out(
     kf.odd = max(1.0, chi / burst / usual_chi(free))
     correct_sample(params, kf, values, kf.clean.gain)
     for i in range(params.sensors.n):
+        kf.imputed[i] = kf.corrected[i]
         if kf.spiked >> i & 1:
-            kf.corrected[i] -= kf.innovation[i]
+            kf.imputed[i] -= kf.innovation[i]
             kf.innovation[i] = 0.0
 
 

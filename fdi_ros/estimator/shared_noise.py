@@ -92,7 +92,7 @@ def update_shared(params: Constants, kf: Estimator) -> None:
         for i in range(params.sensors.n):
             for k in range(PAST - 1, 0, -1):
                 shared.past[k, i] = shared.past[k - 1, i]
-            shared.past[0, i] = kf.corrected[i]
+            shared.past[0, i] = kf.imputed[i]
     shared.fresh += 1
 
 
@@ -128,7 +128,7 @@ def add_fourth_difference(params: Constants, kf: Estimator) -> None:
     for i in range(n):
         shared.difference[i] = 0.0
         if shared.kept >> i & 1:
-            ends = kf.corrected[i] + past[3, i]
+            ends = kf.imputed[i] + past[3, i]
             shared.difference[i] = (
                 ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]
             ) / math.sqrt(70.0)
