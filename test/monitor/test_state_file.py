@@ -104,7 +104,9 @@ def test_written_once_for_each_change(path):
         pipeline.process(block[k : k + 20])
         tried.append((file.save(pipeline), json.loads(path.read_text())["declared"]))
     declared = [kept["faulty"] for _, kept in tried]
-    assert [declared.index({}), declared.index({"g2": "disagrees"})] == [0, 5]
+    # Biases that nothing allows for may be declared beside it.
+    since = [kept.get("g2") == "disagrees" for kept in declared].index(True)
+    assert [declared.index({}), since] == [0, 5]
     assert sum(saved for saved, _ in tried) < 6, "also what is known much better"
     pipeline.reset()
     assert file.save(pipeline)
