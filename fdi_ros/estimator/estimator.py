@@ -87,6 +87,9 @@ Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
+LEAST_GAP = (
+    0.2  # s without a value of a channel that are a gap, and no loss of single messages
+)
 SLOW_TURN = (
     1e-4  # (rad/s)^2: below 0.6 deg/s the uncertainty does not grow with the motion
 )
@@ -387,7 +390,7 @@ def follow_gaps(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         if kf.mask >> i & 1:
             before = kf.present_at[i]
-            if 0 < before < kf.samples - 2 * params.length:
+            if before > 0 and (kf.samples - before) * params.period > LEAST_GAP:
                 kf.returned = kf.samples
             kf.present_at[i] = kf.samples
 
@@ -403,13 +406,13 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
         if kf.mask >> i & 1:
             total.values[i] += values[i]
             total.count[i] += 1.0
-        if (kf.mask & ~kf.spiked) >> i & 1:
+        if kf.mask >> i & 1 and kf.spiked == 0:
             kf.sum_values[i] += values[i]
             kf.sum_count[i] += 1.0
             kf.sum_time[i] += kf.seconds - kf.begun
     kf.sum_seconds += kf.seconds - kf.begun
     for a in range(3):
-        if kf.spiked != kf.mask:
+        if kf.spiked == 0:
             total.instant[a] = kf.rate[a]
         total.rate[a] += total.instant[a]
         kf.sum_rate[a] += total.instant[a]

@@ -226,7 +226,6 @@ def leave_spike_out(
     if not params.determines[kf.mask & ~kf.spiked]:
         kf.spiked = kf.mask
         return
-    kf.spike_channels |= kf.spiked
     chi, free = chi_without(params, kf, kf.spiked), -3.0
     for i in range(params.sensors.n):
         free += (kf.mask & ~kf.spiked) >> i & 1
@@ -236,6 +235,9 @@ def leave_spike_out(
         kf.imputed[i] = kf.corrected[i]
         if kf.spiked >> i & 1:
             kf.imputed[i] -= kf.innovation[i]
+            # Of a unit that is left out some channels may be well.
+            if kf.innovation[i] ** 2 > OUTLIER * OUTLIER * kf.growth[i]:
+                kf.spike_channels |= 1 << i
             kf.innovation[i] = 0.0
 
 
