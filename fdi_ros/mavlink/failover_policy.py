@@ -236,7 +236,7 @@ def objection(
         (view.imus[k].use, "not reported in use"),
         (not memories[k].left_alone, "set by others"),
         (sum(memories[j].ours for j in others) < settings.limit, "limit"),
-        (reserve, "no other IMU is sound and freshly reported in use"),
+        (reserve, "no sound IMU reported in use"),
     )
     return next((words for holds, words in checks if not holds), "")
 
