@@ -37,9 +37,9 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
-from fdi_ros.replay.run import Sink, replay
+from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary, as_json
-from fdi_ros.replay.words import sample_rate_notes, summary_text, verdict
+from fdi_ros.replay.words import sample_rate_notes, summary_text
 from fdi_ros.report.layout import unit_of
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text
@@ -51,11 +51,8 @@ if TYPE_CHECKING:
 
 def run_replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
-    config, assumed = (
-        (Config.from_file(arguments.config), "")
-        if arguments.config
-        else assumed_config(arguments.bag)
-    )
+    assumed = None if arguments.config else assumed_config(arguments.bag)
+    config = assumed.config if assumed else Config.from_file(arguments.config)
     config = (
         config.replaced({"detector.name": arguments.detector})
         if arguments.detector
@@ -90,14 +87,9 @@ def run_replay(arguments: Namespace) -> int:
         summary = replay(
             arguments.bag, config, faults, *part, sinks=sinks, progress=show
         )
-        found = verdict(summary, unit)
-        figures = {
-            **as_json(summary),
-            "verdict": {
-                "severity": found.severity.value,
-                "words": verdict(summary).words,
-            },
-        }
+        if assumed:
+            summary = with_unused(summary, assumed.unused)
+        figures = as_json(summary)
         unmet = failures(required, summary)
         if arguments.check is not None:
             figures["check"] = {
@@ -106,7 +98,10 @@ def run_replay(arguments: Namespace) -> int:
             }
         if report:
             page = report.html(
-                summary, _about_replay(arguments, config, faults, assumed)
+                summary,
+                _about_replay(
+                    arguments, config, faults, assumed.words if assumed else ""
+                ),
             )
             stack.enter_context(whole(arguments.report)).write_text(
                 page, encoding="utf-8"
@@ -120,8 +115,8 @@ def run_replay(arguments: Namespace) -> int:
         ]
         words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
-        words += f"note: no --config, so assumed: {assumed}\n"
-    code = outputs.finish(words, severity=found.severity)
+        words += f"note: no --config, so assumed: {assumed.words}\n"
+    code = outputs.finish(words, severity=summary.verdict.severity)
     if arguments.check is not None:
         return _say_check(arguments, outputs, summary, unmet)
     # Who injects faults tries the monitor: what it then finds is no news of the gyros.

@@ -41,7 +41,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
 from fdi_ros.replay.run import Sink, replay
 from fdi_ros.replay.summary import Summary
-from fdi_ros.replay.words import sample_rate_notes, verdict
+from fdi_ros.replay.words import sample_rate_notes
 from fdi_ros.report.layout import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.system.files import open_regular
@@ -276,8 +276,8 @@ def _row(known: Flight, summary: Summary) -> Flight:
     monitor, stream, declared = summary.monitor, summary.stream, summary.story.declared
     # What hides for a while, and comes back as it was, is declared once.
     steps = [step for one in declared for step in one.steps]
-    found = verdict(summary)
-    why = [found.words] if found.severity is not Severity.GOOD else []
+    found = summary.verdict
+    why = [found.sentence] if found.severity is not Severity.GOOD else []
     return replace(
         known,
         why=(*known.why, *why, *sample_rate_notes(stream.sample_rate)),

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
 from fdi_ros.errors import BagError
 from fdi_ros.inspection.fitness import candidates, left_out, needs, one_clock
+from fdi_ros.inspection.names import unit_names
 from fdi_ros.inspection.topics import (
     GAP,
     TopicReport,
@@ -42,8 +43,8 @@ from fdi_ros.inspection.turns import (
 )
 from fdi_ros.system.text import shown
 
-#: topics of flight logs, which name units as a config does
-_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
+#: topics of flight logs, which keep the numbers of the autopilot
+_LOG_TOPIC = re.compile(r"/imu_[0-9]{1,3}")
 #: time at the start over which the bias could be learned, s
 _REST = 3.0
 #: default of imus.timeout and of health.stale_timeout, s
@@ -64,6 +65,8 @@ class StartingConfig:
     remarks: dict[str, str]
     #: warnings before the settings are used, empty if none
     look: str = ""
+    #: topics with gyros left out, and why
+    unused: tuple[tuple[str, str], ...] = ()
 
     @property
     def text(self) -> str:
@@ -84,19 +87,32 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
     if words := one_clock(candidates(reports)):
         raise BagError(f"{refused}: needs one clock: {words}")
     chosen = candidates(reports)
-    look = [f"{shown(topic)} is left out: {why}" for topic, why in left_out(reports)]
+    unused = tuple((shown(topic), why) for topic, why in left_out(reports))
+    look = [f"{topic} is left out: {why}" for topic, why in unused]
     look += [
         f"{shown(one.topic.name)}: {burst_words(one)}"
         for one in chosen
         if one.burst > 1
     ]
-    return replace(starting_config(chosen, path), look="; ".join(look))
+    return replace(starting_config(chosen, path), look="; ".join(look), unused=unused)
 
 
-def assumed_config(path: Path) -> tuple[Config, str]:
-    """Return settings for a recording without a config, and one line with the assumptions.
+class AssumedConfig(NamedTuple):
+    """Settings for a recording that came without any."""
 
-    `BagError` if the recording shows no gyros, or units that are not mounted alike.
+    config: Config
+    """The settings."""
+    words: str
+    """What they assume, in one line."""
+    unused: tuple[tuple[str, str], ...]
+    """Topics with gyros that are left out, and why."""
+
+
+def assumed_config(path: Path) -> AssumedConfig:
+    """Return settings for a recording that came without any.
+
+    `BagError` if the recording shows no gyros, or they are not mounted alike: then the user must
+    give the axes.
     """
     refused = f"{shown(path.name)}: no config given, and none can be assumed"
     found = starting_config_of(path, refused)
@@ -111,11 +127,12 @@ def assumed_config(path: Path) -> tuple[Config, str]:
         )
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
     copies = f"{found.look}; " if found.look else ""
-    return config, (
+    words = (
         f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
         f" noise {low:.2g} to {high:.2g} rad/s,"
         f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
     )
+    return AssumedConfig(config, words, found.unused)
 
 
 def _turned_units(path: Path, config: Config) -> str:
@@ -187,14 +204,12 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
             " three of them, isolate it"
         )
-        numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
-        names = [
-            topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)
-        ]
-        known["imus.topics"], known["imus.names"] = (topics, ""), (names, "")
+        of_a_log = all(_LOG_TOPIC.fullmatch(topic) for topic in topics)
+        known["imus.topics"] = topics, ""
+        known["imus.names"] = unit_names(topics), "by the topics above"
         known["imus.mounts"] = np.tile(np.eye(3).ravel(), len(chosen)).tolist(), words
         known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
-        if numbered:
+        if of_a_log:
             words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
             known["decision.latch"] = False, words
         if timeout := _longer(chosen, _BRIDGED, 10.0):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from fdi_ros.compiling.compiled import MAX_CHANNELS
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
-from fdi_ros.system.text import html_table
+from fdi_ros.system.text import html_table, listed
 
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
@@ -348,22 +348,22 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
         return f"any of the {geometry.n} channels"
     units = whole_units(geometry, channels)
     if units:
-        return f"any axis of {_listed(units)}"
+        return f"any axis of {listed(units, 'or')}"
     parts = [name.rpartition(".") for name in names]
     if are_parallel(geometry, channels):
         if all(unit and axis == parts[0][2] for unit, _, axis in parts):
-            return f"the {parts[0][2]} axis of {_listed([unit for unit, *_ in parts])}"
-        return f"{_listed(names)}, which measure one axis,"
+            return f"the {parts[0][2]} axis of {listed([unit for unit, *_ in parts], 'or')}"
+        return f"{listed(names, 'or')}, which measure one axis,"
     others = [
         name for i, name in enumerate(geometry.channel_names) if i not in channels
     ]
     if len(names) > _FEW:
         return (
-            f"any channel but {_listed(others)}"
+            f"any channel but {listed(others, 'or')}"
             if len(others) <= _FEW
             else f"any of {len(names)} channels"
         )
-    return _listed(names)
+    return listed(names, "or")
 
 
 def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
@@ -371,7 +371,7 @@ def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     names = whole_units(geometry, channels) or [
         geometry.channel_names[i] for i in channels
     ]
-    return _listed(names, "and")
+    return listed(names)
 
 
 def axis_words(geometry: Geometry, channel: int) -> str:
@@ -381,7 +381,3 @@ def axis_words(geometry: Geometry, channel: int) -> str:
     if abs(axis[largest]) >= PARALLEL:
         return f"{'-' if axis[largest] < 0 else ''}{'xyz'[largest]}"
     return " ".join(f"{value:.2f}" for value in axis)
-
-
-def _listed(names: Sequence[str], last: str = "or") -> str:
-    return f" {last} ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

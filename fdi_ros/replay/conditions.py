@@ -18,7 +18,8 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.replay.episodes import MOST_TOLD, episode_words
 from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.replay.summary import Judgement
-from fdi_ros.replay.words import MOSTLY_JUDGED, unchecked_words
+from fdi_ros.replay.verdict import LEAST_JUDGED
+from fdi_ros.replay.words import unchecked_words
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
@@ -48,7 +49,7 @@ with a declaration, injected or not. ``judged``: share of the samples that was j
 _QUANTITIES = FAULT_QUANTITIES | RECORDING_QUANTITIES
 CHANNEL_STATES = ("faulty", "ambiguous", "stale", "ok")
 """States to ask for: declared alone, declared in a set, silent, none of these."""
-_DEFAULTS = (f"judged>={MOSTLY_JUDGED:g}", "unchecked=0")
+_DEFAULTS = (f"judged>={LEAST_JUDGED:g}", "unchecked=0")
 """Conditions that hold for a quantity that the user does not mention."""
 
 

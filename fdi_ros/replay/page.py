@@ -27,7 +27,8 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import Outcome, StateChange
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import AutopilotText, Summary
-from fdi_ros.replay.words import fault_sections, notes, sentences, verdict
+from fdi_ros.replay.verdict import verdict_of
+from fdi_ros.replay.words import fault_sections, health_section, notes, sentences
 from fdi_ros.report.layout import (
     FINE,
     RADIANS,
@@ -193,14 +194,15 @@ class Report(Sink):
                 ],
             ),
             *fault_sections(scores, unit),
+            health_section(summary, unit),
             _channel_section(summary, unit),
             *_autopilot_section(summary.autopilot),
             _event_section(scores.events, unit),
             Section("Notes", "", [*summary.monitor.degraded, *notes(summary)]),
             Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
         ]
-        found = verdict(summary, unit)
-        lines = [found.words, *sentences(summary, unit)]
+        found = verdict_of(summary, unit)
+        lines = [found.sentence, *sentences(summary, unit)]
         return page(
             f"fdi_ros: {summary.bag}",
             lines,

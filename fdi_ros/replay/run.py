@@ -26,6 +26,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
+from fdi_ros.core.sources import source_of
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.model.samples import Array, Block, Int
@@ -33,8 +34,10 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.status import ChannelStatus
+from fdi_ros.monitor.soundness import UnitHealth
+from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.replay.episodes import GAP, pieces
+from fdi_ros.replay.health import Deliveries, Values, with_delivery
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
@@ -49,6 +52,7 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
+from fdi_ros.replay.verdict import LASTING, verdict_of
 
 OnProgress = Callable[[float], None]  # called with the share done, 0 to 1
 Source = str | PathLike[str]
@@ -172,6 +176,7 @@ class Judge(Walk):
         self._reference = (
             Pipeline.from_config(pipeline.config) if injector.faults else None
         )
+        self._values = Values(pipeline.geometry)
         self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
         """Stamp of the last value of each channel as it was recorded, ns."""
         self._clean: Array | None = None
@@ -196,6 +201,7 @@ class Judge(Walk):
         for i in np.flatnonzero(np.isfinite(block.z).any(axis=0)).tolist():
             self._delivered[i] = block.stamp[np.isfinite(block.z[:, i])][-1]
         faulty = self.injector.apply(block)
+        self._values.add(faulty)
         if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
             limit = np.array(self.pipeline.config.health.max_rate)
@@ -221,8 +227,10 @@ class Judge(Walk):
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [one.name for one in status.channels if status.is_far(one)]
+        channels = tuple(self._channels(end, status.channels))
         monitor = MonitorResult(
-            channels=tuple(self._channels(end, status.channels)),
+            channels=channels,
+            units=tuple(self._units(status)),
             delays=tuple(
                 DelayResult(unit.name, late, std) for unit, late, std in delays
             ),
@@ -253,17 +261,11 @@ class Judge(Walk):
     def _channels(
         self, end: float, statuses: Sequence[ChannelStatus]
     ) -> Iterator[ChannelResult]:
-        """Yield each channel as it was at a time near the end, s, with what its status at the end says beside."""
-        found = zip(
-            statuses,
-            self.evaluation.unchecked.tolist(),
-            self.evaluation.residual_rms,
-            strict=True,
-        )
-        for status, unchecked, rms in found:
-            changes = [
-                one for one in self.evaluation.events if one.channel == status.name
-            ]
+        """Yield each channel as it was at a time near the end, s."""
+        values, evaluation = self._values, self.evaluation
+        samples = max(1, values.samples)
+        for i, status in enumerate(statuses):
+            changes = [one for one in evaluation.events if one.channel == status.name]
             before = [one for one in changes if one.at_s <= end]
             state, since, reason = status.state.name, None, status.reason.value
             if before:
@@ -274,17 +276,44 @@ class Judge(Walk):
                 )
             elif changes:
                 state, reason = changes[0].before, ""
-            drift, noise = status.drift, status.noise or None
+            delivered = float(values.finite[i]) / samples
+            unchecked = float(evaluation.unchecked[i])
             yield ChannelResult(
-                status.name,
-                state,
-                since,
-                reason,
-                drift,
-                noise,
-                unchecked,
-                rms,
-                status.counts["spikes"],
+                name=status.name,
+                unit=self.pipeline.geometry.unit_of[i],
+                checked=min(1.0, (1.0 - unchecked) / delivered) if delivered else 0.0,
+                delivered=delivered,
+                spikes=status.counts["spikes"],
+                saturated_s=float(values.saturated[i]) / (self.rate or math.inf),
+                residual_rms_rad_s=evaluation.residual_rms[i],
+                doubt=_doubt_words(state, since, reason, end),
+                state=state,
+                since_s=since,
+                reason=reason,
+                bias_followed=status.drift,
+                noise=status.noise or None,
+                unchecked=unchecked,
+            )
+
+    def _units(self, status: Status) -> Iterator[UnitHealth]:
+        """Yield the units, or the one topic with all channels."""
+        source = source_of(self.pipeline.config)
+        late = {
+            unit.name: (delay, std)
+            for unit, delay, std in zip(
+                status.units, status.delays, status.delay_std, strict=False
+            )
+        }
+        # Copies are named with their topics: "imu_2 (/imu_2/data)".
+        copies = {second: first for first, second in status.copies}
+        for name, topic in zip(source.names, source.topics, strict=True):
+            delay, std = late.get(name, (None, None))
+            yield UnitHealth(
+                name=name,
+                topic=topic,
+                delay_s=delay,
+                delay_std_s=std,
+                copy_of=copies.get(f"{name} ({topic})", ""),
             )
 
     @property
@@ -306,7 +335,16 @@ class Judge(Walk):
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
-# A recording ----------------------------------------------------------------------------------------------------------
+def _doubt_words(state: str, since: float | None, reason: str, end: float) -> str:
+    """Return what is wrong with a channel that is not declared, in words; empty: nothing."""
+    if state == "EXCLUDED":
+        return f"left out: {reason}"
+    if state != "SUSPECT" or since is None or end - since < LASTING:
+        return ""
+    return f"under suspicion from {since:.1f} s to the end ({reason})"
+
+
+# A recording
 
 
 def read(
@@ -379,16 +417,21 @@ def replay(
     settings or faults do not fit, or there are no settings and none can be assumed.
     """
     bag = Path(path)
-    settings = assumed_config(bag)[0] if config is None else Config.of(config)
+    unused: tuple[tuple[str, str], ...] = ()
+    if config is None:
+        assumed = assumed_config(bag)
+        settings, unused = assumed.config, assumed.unused
+    else:
+        settings = Config.of(config)
     begun, period = clock(), max((sink.period for sink in sinks), default=0)
     injector = Injector(
         tuple(map(_fault, faults)), build_geometry(settings).channel_names
     )
     judge = Judge(Pipeline.from_config(settings), injector, sinks)
+    deliveries = Deliveries(len(settings.topics), start)
+    taps = [*(sink.tap for sink in sinks), deliveries.tap]
     with Recording(bag) as recording:
-        samples = Samples(
-            recording, settings, start, end, [sink.tap for sink in sinks], period
-        )
+        samples = Samples(recording, settings, start, end, taps, period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
@@ -434,19 +477,34 @@ def replay(
             for one in recording.texts
         ]
     judgement = judge.judgement()
-    scores = judgement.scores
+    scores, monitor = judgement.scores, judgement.monitor
     said = tuple(
         replace(one, at_s=round(one.at_s, 6))
         for one in texts
         if scores.start_s <= one.at_s <= scores.end_s
     )
-    return Summary(
-        **vars(judgement),
+    units = [
+        with_delivery(unit, delivery)
+        for unit, delivery in zip(monitor.units, deliveries.result(), strict=True)
+    ]
+    summary = Summary(
+        detector=judgement.detector,
+        scores=scores,
+        monitor=replace(monitor, units=tuple(units)),
+        story=judgement.story,
         bag=str(bag),
         stream=stream,
         seconds=clock() - begun,
         autopilot=said,
     )
+    return with_unused(summary, unused)
+
+
+def with_unused(summary: Summary, unused: Sequence[tuple[str, str]]) -> Summary:
+    """Return a summary, and its verdict, with topics of gyros that were left out, and why."""
+    stream = replace(summary.stream, unused=tuple(unused))
+    summary = replace(summary, stream=stream)
+    return replace(summary, verdict=verdict_of(summary))
 
 
 def _fault(given: Fault | str | Mapping[str, Any]) -> Fault:

@@ -1,66 +1,84 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay finds, as values and JSON."""
+"""Results of a replay, as records and as JSON."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fdi_ros.monitor.output import time_index
+from fdi_ros.monitor.soundness import (
+    ChannelHealth,
+    Concern,
+    UnitHealth,
+    concerns_of,
+)
 from fdi_ros.replay.episodes import NOTHING_HAPPENED, Story
 from fdi_ros.replay.outcomes import UNCHECKED_STATES, Scores
+from fdi_ros.report.layout import Severity
 from fdi_ros.system import require
 
 if TYPE_CHECKING:
     import pandas
 
 
-@dataclass(frozen=True)
-class ChannelResult:
-    """A channel at the end: with the last sample of all channels that deliver to the end."""
+@dataclass(frozen=True, kw_only=True)
+class ChannelResult(ChannelHealth):
+    """A channel at the end, which is the last sample of all channels that deliver so long."""
 
-    name: str
     state: str
-    since_s: (
-        float | None
-    )  # When it came into its state, s from the first message; None: it began in it.
+    """Name of its state."""
+    since_s: float | None
+    """Time at which it came into the state, s from the first message; None: from the start."""
     reason: str
-    bias_followed: float  # Of its bias against the others, rad/s.
-    noise: float | None  # Lately, over noise_std; None: not measured.
-    unchecked: float  # Share of the samples in which nothing checked it.
-    residual_rms_rad_s: float | None
-    """Root mean square of what it differs by from the fused rate while OK; None: it never was."""
-    spikes: int = 0
-    """Times that a few values were far off, left out of the fused rate."""
+    """Reason for the state; empty: none."""
+    bias_followed: float
+    """Drift of its bias against the other channels since the start, rad/s."""
+    noise: float | None
+    """Its noise at the end, in ``noise.noise_std``; None: not measured."""
+    unchecked: float
+    """Share of all samples in which no other channel checked it."""
 
 
 @dataclass(frozen=True)
 class DelayResult:
-    """By how much a unit's stamps are late against the others."""
+    """Delay of the stamps of a unit against the others."""
 
     unit: str
+    """Name of the unit."""
     late_s: float
+    """Delay, s; negative: early."""
     std_s: float
+    """Standard deviation of the delay, s."""
 
 
 @dataclass(frozen=True)
 class BiasResult:
-    """The biases at the end."""
+    """Biases at the end."""
 
     state: str
-    value: tuple[float, ...]  # Per channel, rad/s.
+    """How they were found, in words."""
+    value: tuple[float, ...]
+    """Bias of each channel, rad/s."""
     far: tuple[str, ...] = ()
-    """Channels that began with more than four ``bias.turn_on_std``: learned, as a fault from before would be."""
+    """Channels that began with more than four ``bias.turn_on_std``, which is learned, as a
+    fault from before the start would be."""
 
 
 @dataclass(frozen=True)
 class ProtectionLevel:
-    """Bound on the error of the fused rate with one undetected fault, per axis, rad/s; None: none can be given."""
+    """Bound on the error of the fused rate with one undetected fault, per body axis, rad/s.
+
+    None: no bound can be given.
+    """
 
     at_end: tuple[float | None, ...]
+    """Level at the last sample."""
     after_one_more_loss: tuple[float | None, ...]
+    """Level after the loss of one more channel, on each axis the worst one."""
 
 
 @dataclass(frozen=True)
@@ -68,22 +86,31 @@ class MonitorResult:
     """The monitor at the end."""
 
     channels: tuple[ChannelResult, ...]
+    """The channels, in their order."""
     delays: tuple[DelayResult, ...]
-    degraded: tuple[
-        str, ...
-    ]  # What is worse than it should be without being declared, in sentences.
+    """Delays of units against the first one."""
+    degraded: tuple[str, ...]
+    """Sentences on what is worse than it should be without a declaration."""
     bias: BiasResult
+    """The biases."""
     note: str
+    """Why checking is limited, in words; empty: it is not."""
     protection_level: ProtectionLevel
+    """Bound on the error of the fused rate."""
     us_per_sample: float
+    """Time that the monitor took for a sample, us."""
+    units: tuple[UnitHealth, ...] = ()
+    """The units, in the order of their topics."""
 
 
 @dataclass(frozen=True)
 class SampleRate:
-    """Samples per second, Hz."""
+    """Samples per second."""
 
     configured_hz: float
-    recorded_hz: float | None  # None: too few samples to say.
+    """``sample_rate`` of the settings, Hz."""
+    recorded_hz: float | None
+    """Usual rate of the recording, Hz; None: too few samples."""
 
 
 @dataclass(frozen=True)
@@ -91,14 +118,45 @@ class StreamResult:
     """The recording itself."""
 
     sample_rate: SampleRate
-    origin_ns: (
-        int | None
-    )  # Stamp of the first message, from which all times count; None: there is none.
-    messages: int  # Used.
-    malformed: dict[str, int]  # By topic.
+    """Configured and recorded rate."""
+    origin_ns: int | None
+    """Stamp of the first message, from which all times count, ns; None: no message."""
+    messages: int
+    """Number of messages that were used."""
+    malformed: dict[str, int]
+    """Number of malformed messages by topic."""
     disordered: int
-    alignment: dict[str, dict[str, int]]  # Counters by topic.
+    """Number of messages left out because they were recorded after later ones."""
+    alignment: dict[str, dict[str, int]]
+    """Counters of the alignment by topic."""
     damage: tuple[str, ...]
+    """What could not be read, one line for each place."""
+    unused: tuple[tuple[str, str], ...] = ()
+    """Topics of gyros that were left out, and why."""
+
+
+class ReplayVerdict(NamedTuple):
+    """The verdict on a replay."""
+
+    word: str
+    """HEALTHY, LOOK, CANNOT TELL or FAULTY; with injected faults FOUND, NOT ALL FOUND or
+    FALSE ALARM."""
+    sentence: str
+    """The verdict in full; without injected faults it begins with the word."""
+    channels: tuple[str, ...]
+    """Channels that the word is about; also units or topics if it is LOOK."""
+
+    @property
+    def severity(self) -> Severity:
+        """How urgent it is; an exit code follows from that."""
+        if self.word in ("HEALTHY", "FOUND"):
+            return Severity.GOOD
+        urgent = self.word in ("FAULTY", "FALSE ALARM")
+        return Severity.BAD if urgent else Severity.UNKNOWN
+
+
+NO_VERDICT = ReplayVerdict("", "", ())
+"""Verdict of a summary that nobody judged."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +164,17 @@ class Judgement:
     """What a monitor made of a stream."""
 
     detector: str
+    """Name of the detector."""
     scores: Scores
+    """Injected faults and declarations."""
     monitor: MonitorResult
-    story: Story = NOTHING_HAPPENED  # What happened.
+    """The monitor at the end."""
+    story: Story = NOTHING_HAPPENED
+    """What happened, in stretches and episodes."""
 
     @property
     def unchecked_channels(self) -> list[ChannelResult]:
-        """Channels that end without being checked, but for those that a fault is injected into up to the end."""
+        """Channels unchecked at the end; those with an injected fault to the end are left out."""
         lasting = [
             fault
             for fault in self.scores.faults
@@ -125,14 +187,28 @@ class Judgement:
             if one.state in UNCHECKED_STATES and one.name not in struck
         ]
 
+    @property
+    def concerns(self) -> list[Concern]:
+        """Reasons not to call the recording healthy, beside declared faults.
+
+        Noise is compared only while nothing is declared: a fault disturbs the comparison.
+        """
+        channels: Sequence[ChannelHealth] = self.monitor.channels
+        if self.story.declared:
+            channels = [replace(one, residual_rms_rad_s=None) for one in channels]
+        return concerns_of(channels, self.monitor.units)
+
 
 @dataclass(frozen=True)
 class AutopilotText:
-    """What the autopilot of a flight log said of itself."""
+    """A message of the autopilot in a flight log."""
 
-    at_s: float  # s from the first message.
-    kind: str  # MSG, ERR (a lane switch of the EKF among them), STATUSTEXT, or the level of PX4.
+    at_s: float
+    """Time, s from the first message."""
+    kind: str
+    """MSG, ERR (a lane switch of the EKF among them), STATUSTEXT, or the level of PX4."""
     text: str
+    """The message."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,15 +216,28 @@ class Summary(Judgement):
     """What a monitor made of a recording."""
 
     bag: str
+    """Path of the recording."""
     stream: StreamResult
-    seconds: float  # That the replay took.
-    autopilot: tuple[AutopilotText, ...] = ()  # From the first sample to the last.
+    """The recording itself."""
+    seconds: float
+    """Time that the replay took, s."""
+    autopilot: tuple[AutopilotText, ...] = ()
+    """Messages of the autopilot from the first sample to the last."""
+    verdict: ReplayVerdict = NO_VERDICT
+    """The verdict."""
+
+    @property
+    def concerns(self) -> list[Concern]:
+        """Reasons not to call the recording healthy, topics that were not judged included."""
+        unused = concerns_of((), (), self.stream.unused)
+        return [*super().concerns, *unused]
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the changes of state as a table; needs pandas.
 
-        Columns: ``channel``, ``before``, ``state``, ``reason``, ``group`` and ``error`` (rad/s), as of `StateChange`.
-        The index is the time of each, as of `fdi_ros.monitor.output.time_index`.
+        Columns: ``channel``, ``before``, ``state``, ``reason``, ``group`` and ``error`` (rad/s),
+        as in `StateChange`. The index has their times, as in
+        `fdi_ros.monitor.output.time_index`.
         """
         require("Summary.to_pandas", ("pandas",))
         import pandas
@@ -165,13 +254,21 @@ class Summary(Judgement):
 
 
 def as_json(summary: Summary) -> dict[str, Any]:
-    """Return the figures under the names of the fields, those of the parts of a summary side by side."""
+    """Return all figures by the names of the fields, the parts of a summary side by side."""
+    verdict = summary.verdict
     return {
         "bag": summary.bag,
+        "verdict": {
+            "severity": verdict.severity.value,
+            "word": verdict.word,
+            "words": verdict.sentence,
+            "channels": verdict.channels,
+        },
         "detector": summary.detector,
         **asdict(summary.scores),
         **asdict(summary.monitor),
         **asdict(summary.stream),
+        "concerns": list(map(str, summary.concerns)),
         "stretches": [asdict(one) for one in summary.story.stretches],
         "episodes": [
             {**asdict(one), "duration_s": one.duration_s}

@@ -1,36 +1,38 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verdict on a replay, the sentences below it, and the tables for a terminal."""
+"""Sentences and tables of a replay for a terminal; the verdict itself is in `verdict`."""
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from fdi_ros.core.states import Reason
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
+from fdi_ros.monitor.soundness import Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
-    Episode,
     Story,
     detail_words,
     episode_words,
     stretch_words,
 )
-from fdi_ros.replay.outcomes import UNCHECKED_STATES, Outcome, Scores
-from fdi_ros.replay.summary import ChannelResult, Judgement, SampleRate, Summary
+from fdi_ros.replay.outcomes import Outcome, Scores
+from fdi_ros.replay.summary import ChannelResult, SampleRate, Summary
+from fdi_ros.replay.verdict import (
+    LASTING,
+    MOST_CONCERNS,
+    unjudged_words,
+    verdict_of,
+    wrongly_named,
+)
 from fdi_ros.report.layout import (
     RADIANS,
     Columns,
     Section,
-    Severity,
     Unit,
-    Verdict,
-    first_of,
     head_and_rows,
     milliseconds,
     number,
@@ -38,139 +40,12 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.system.text import shown
 
-MOSTLY_JUDGED = (
-    0.5  # share of the samples that must have been judged for a replay to say something
-)
-LONGEST_UNCHECKED = 0.5
-"""Share of a recording that a channel may be unchecked for without a break where the recording is called healthy."""
-LASTING = 1.0  # what a channel does at the end for less, s, is not told: recordings end with the power
-NOISIER = 3.0  # a channel is much noisier than the others where its residual is so many times their median
-
-
-def verdict(summary: Summary, unit: Unit = RADIANS) -> Verdict:
-    """Say in one line what came out: what became of injected faults; or healthy, faulty, or that it cannot be told."""
-    if summary.scores.faults:
-        return _verdict_on_faults(summary)
-    if told := _faulty(summary):
-        others = dict.fromkeys(one.who for one in told[1:] if one.who != told[0].who)
-        more = f"; then also {first_of(list(others), MOST_TOLD)}" if others else ""
-        return Verdict(Severity.BAD, f"FAULTY: {_without_state(told[0], unit)}{more}.")
-    if why := _untold(summary):
-        return Verdict(Severity.UNKNOWN, f"CANNOT TELL: {why}.")
-    return Verdict(Severity.GOOD, f"HEALTHY: {_healthy_words(summary)}.")
-
-
-def _faulty(summary: Summary) -> list[Episode]:
-    """Return the episodes that make a recording faulty: what was declared, names first; units silent for good."""
-    silent = [
-        one
-        for one in summary.story.episodes
-        if one.stands
-        and one.duration_s >= LASTING
-        and one.evidence.reason == Reason.NO_DATA.value
-    ]
-    declared = sorted(summary.story.declared, key=lambda one: one.state != "FAULTY")
-    return [*declared, *(one for one in silent if not one.declares)]
-
-
-def _without_state(one: Episode, unit: Unit) -> str:
-    """Tell of an episode behind the word FAULTY."""
-    untold = (
-        ", which of them cannot be told,"
-        if len(one.channels) > 1
-        else ", to be confirmed,"
-    )
-    state = {"FAULTY": "", "AMBIGUOUS": untold, "STALE": " silent"}[one.state]
-    return episode_words(one, unit).replace(f" {one.state} from", f"{state} from", 1)
-
-
-def _verdict_on_faults(summary: Summary) -> Verdict:
-    """Say how many of the injected faults were detected."""
-    faults, isolated = summary.scores.faults, summary.scores.isolated
-    detected = sum(fault.detected_at_s is not None for fault in faults)
-    plural = "fault" if len(faults) == 1 else "faults"
-    words = (
-        f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated."
-    )
-    if _wrongly_named(summary) or any(
-        not one.injected for one in summary.story.declared
-    ):
-        return Verdict(Severity.BAD, words)
-    return Verdict(
-        Severity.GOOD if isolated == len(faults) else Severity.UNKNOWN, words
-    )
-
-
-def _wrongly_named(summary: Summary) -> list[str]:
-    """Return the channels that are declared faulty by themselves and that no injected fault strikes."""
-    faulty = dict.fromkeys(
-        one.channel for one in summary.scores.declared if one.state == "FAULTY"
-    )
-    return [name for name in faulty if name not in summary.scores.struck]
-
-
-def _untold(summary: Summary) -> str:
-    """Say why a recording in which nothing was declared is not called healthy; empty: it is."""
-    samples, judged = summary.scores.samples, summary.scores.samples_judged
-    if judged == 0:
-        return f"not one of {samples} samples was judged; bias {summary.monitor.bias.state}"
-    if judged < MOSTLY_JUDGED * samples:
-        return f"only {100 * judged / samples:.1f} % of {samples} samples were judged"
-    if longest := _unchecked_longest(summary):
-        words = ", ".join(
-            f"{name} for {seconds:.1f} s" for name, seconds in longest.items()
-        )
-        return f"not checked without a break, of {summary.scores.duration_s:.1f} s: {words}"
-    if far := summary.monitor.bias.far:
-        return f"{', '.join(far)} began with a bias far beyond bias.turn_on_std, as after a fault before the start"
-    return ""
-
-
-def _unchecked_longest(summary: Summary) -> dict[str, float]:
-    """Return the channels that were unchecked for too long without a break, and for how long, s."""
-    scores, found = summary.scores, {}
-    for channel in summary.monitor.channels:
-        changes = [one for one in scores.events if one.channel == channel.name]
-        states = [
-            changes[0].before if changes else channel.state,
-            *(one.state for one in changes),
-        ]
-        edges = pairwise([scores.start_s, *(one.at_s for one in changes), scores.end_s])
-        spans = [
-            b - a
-            for state, (a, b) in zip(states, edges, strict=True)
-            if state in UNCHECKED_STATES
-        ]
-        if max(spans, default=0.0) > LONGEST_UNCHECKED * scores.duration_s:
-            found[channel.name] = max(spans)
-    return found
-
-
-def _healthy_words(summary: Summary) -> str:
-    channels, end = summary.monitor.channels, _unchecked_at_the_end(summary)
-    checked = 1.0 - max((one.unchecked for one in channels), default=0.0)
-    share = (
-        "all checked"
-        if checked > 0.995
-        else f"each checked in {checked:.0%} of the samples or more"
-    )
-    more = f"; at the end not checked: {end}" if end else ""
-    return f"no fault declared in {summary.scores.duration_s:.1f} s; {len(channels)} channels, {share}{more}"
-
-
-def _unchecked_at_the_end(summary: Summary) -> str:
-    end, unchecked = summary.scores.end_s, summary.unchecked_channels
-    return unchecked_words(
-        [
-            one
-            for one in unchecked
-            if one.since_s is not None and end - one.since_s >= LASTING
-        ]
-    )
+MOST_EPISODES = 20
+"""Episodes that a terminal shows with all their details."""
 
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
-    """Return what stands below the verdict."""
+    """Return the sentences below the verdict."""
     faults = sorted(
         summary.scores.faults, key=lambda fault: fault.detected_at_s is None
     )
@@ -178,64 +53,60 @@ def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
         f"{fault.kind} on {fault.channel}: {_detection_words(fault)}."
         for fault in faults
     ]
-    return [
-        *lines,
-        *_episode_lines(summary, unit),
-        *spike_lines(summary),
-        *noisy_lines(summary, unit),
-    ]
+    if faults:
+        lines += _unexplained_lines(summary, unit)
+    elif verdict_of(summary).word != Word.HEALTHY.value:
+        lines += _unchecked_lines(summary)
+    return [*lines, *_concern_lines(summary), *_name_lines(summary)]
 
 
-def spike_lines(summary: Summary) -> list[str]:
-    """Count the spikes of each channel."""
-    found = [one for one in summary.monitor.channels if one.spikes]
-    words = ", ".join(f"{one.name} {one.spikes}" for one in found)
-    return [f"Spikes, left out of the fused rate: {words}."] if found else []
+def _concern_lines(summary: Summary) -> list[str]:
+    """Return the concerns that the verdict does not list."""
+    word = verdict_of(summary).word
+    deciding = [one for one in summary.concerns if one.word.value == word]
+    others = [one for one in summary.concerns if one not in deciding[:MOST_CONCERNS]]
+    return [f"{one}." for one in others]
 
 
-def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
-    """Tell of channels that are much noisier than the others."""
-    # What is wrong already is said.
-    channels = () if judgement.story.declared else judgement.monitor.channels
-    rms = {
-        one.name: one.residual_rms_rad_s for one in channels if one.residual_rms_rad_s
-    }
-    lines = []
-    for name, size in rms.items():
-        others = statistics.median(
-            [value for other, value in rms.items() if other != name] or [size]
-        )
-        if size > NOISIER * others:
-            theirs, own = (f"{value * unit.factor:.2g}" for value in (others, size))
-            lines.append(
-                f"{name} is much noisier than the others: it differs from the fused rate by {own} {unit.name} rms, they"
-                f" by {theirs}. Look at its mount; smaller faults hide in this noise."
-            )
-    return lines
+def _name_lines(summary: Summary) -> list[str]:
+    """Say which topic each unit is, unless the name of the unit is that of the topic."""
+    units = summary.monitor.units
+    if all(one.topic.strip("/") == one.name.strip("/") for one in units):
+        return []
+    return [f"Topics: {', '.join(f'{one.name} is {one.topic}' for one in units)}."]
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
-    """Say which channels end how, from when on and why."""
+    """Say which channels end in which state, since when, and why."""
     alike: dict[tuple[str, str], list[ChannelResult]] = {}
     for one in channels:
         alike.setdefault((one.state, one.reason), []).append(one)
     words = []
     for (state, reason), group in alike.items():
         since = sorted({one.since_s or 0.0 for one in group})
-        when = (
-            f"from {since[0]:.3f} to {since[-1]:.3f} s on"
-            if len(since) > 1
-            else f"from {since[0]:.3f} s on"
-        )
-        when = when if since[-1] else "from the start"
-        words.append(
-            f"{', '.join(one.name for one in group)} {state} {when}{f' ({reason})' if reason else ''}"
-        )
+        if not since[-1]:
+            when = "from the start"
+        elif len(since) > 1:
+            when = f"from {since[0]:.3f} to {since[-1]:.3f} s on"
+        else:
+            when = f"from {since[0]:.3f} s on"
+        names = ", ".join(one.name for one in group)
+        words.append(f"{names} {state} {when}{f' ({reason})' if reason else ''}")
     return "; ".join(words)
 
 
+def _unchecked_lines(summary: Summary) -> list[str]:
+    """Say which channels were not checked at the end."""
+    lost = [
+        one
+        for one in summary.unchecked_channels
+        if one.since_s is not None and summary.scores.end_s - one.since_s >= LASTING
+    ]
+    return [f"Not checked at the end: {unchecked_words(lost)}."] if lost else []
+
+
 def notes(summary: Summary) -> list[str]:
-    """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
+    """Return what else matters: damage, messages left out, limits of the monitor."""
     stream, scores = summary.stream, summary.scores
     lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [
@@ -263,26 +134,22 @@ def notes(summary: Summary) -> list[str]:
 
 
 def sample_rate_notes(rate: SampleRate) -> list[str]:
-    """Say so where the configured sample rate is not that of the recording."""
-    if (
-        rate.recorded_hz is None
-        or abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE
-    ):
+    """Return a line if the configured sample rate is not that of the recording."""
+    if rate.recorded_hz is None:
+        return []
+    if abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:
         return []
     return [
-        f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has {rate.recorded_hz:.4g} Hz: the"
-        " false-alarm rate is wrong by as much"
+        f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has"
+        f" {rate.recorded_hz:.4g} Hz: the false-alarm rate is wrong by the same factor"
     ]
 
 
 def _detection_words(fault: Outcome) -> str:
-    """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
+    """Say when an injected fault was detected and isolated, and which channels were declared."""
     if fault.detected_at_s is None:
-        return (
-            "its channels had been declared before"
-            if fault.declared_before
-            else "not detected"
-        )
+        before = "its channels were already declared"
+        return before if fault.declared_before else "not detected"
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
         return f"{words}, isolated"
@@ -290,51 +157,38 @@ def _detection_words(fault: Outcome) -> str:
         words += f" as one of {', '.join(fault.declared_channels)}"
     elif len(fault.channels) > 1:
         words += f", declared: {', '.join(fault.declared_channels)}"
-    return (
-        f"{words}, isolated after {_time(fault.isolation_delay_s)}"
-        if fault.isolated
-        else f"{words}, not isolated"
-    )
+    if not fault.isolated:
+        return f"{words}, not isolated"
+    return f"{words}, isolated after {_time(fault.isolation_delay_s)}"
 
 
-def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
-    """Tell what was declared; where faults are injected, what of it they do not explain."""
+def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
+    """Say what was declared that the injected faults do not explain."""
     scores, story = summary.scores, summary.story
-    told = [one for one in story.declared if not one.injected]
-    if not scores.faults:
-        # What was declared, and that a healthy one was not checked at the end, the verdict says.
-        lost = (
-            ""
-            if verdict(summary).severity is Severity.GOOD
-            else _unchecked_at_the_end(summary)
-        )
-        return [f"At the end not checked: {lost}."] if lost else []
-    if told:
-        count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
-        first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
-        stretches = [
-            f"stretch {one.stretch}: " if len(story.stretches) > 1 else ""
-            for one in told[:MOST_TOLD]
-        ]
-        lines = [
-            f"{where}{episode_words(one, unit)}."
-            for where, one in zip(stretches, told, strict=False)
-        ]
-        if more := len(told[MOST_TOLD:]) + story.more:
+    unexplained = [one for one in story.declared if not one.injected]
+    if unexplained:
+        count = f"{len(unexplained)} episode{'s' if len(unexplained) > 1 else ''}"
+        first = f", the first {MOST_TOLD}" if len(unexplained) > MOST_TOLD else ""
+        lines = [f"{count} without an injected fault that explains it{first}:"]
+        for one in unexplained[:MOST_TOLD]:
+            where = f"stretch {one.stretch}: " if len(story.stretches) > 1 else ""
+            lines.append(f"{where}{episode_words(one, unit)}.")
+        if more := len(unexplained[MOST_TOLD:]) + story.more:
             lines.append(f"And {more} more episode{'s' if more > 1 else ''}.")
-        return [f"{count} that no injected fault explains{first}:", *lines]
-    if wrong := _wrongly_named(summary):
-        return [f"Declared faulty, and not struck by a fault: {', '.join(wrong)}."]
-    if why := _untold(summary):
-        return [f"Of the others it cannot be told: {why}."]
+        return lines
+    if wrong := wrongly_named(summary):
+        return [f"Declared faulty without an injected fault: {', '.join(wrong)}."]
+    if why := unjudged_words(summary):
+        return [f"The verdict on all other channels is CANNOT TELL: {why}."]
     doubted = dict.fromkeys(
-        name for fault in scores.faults for name in fault.other_channels
+        name
+        for fault in scores.faults
+        for name in fault.other_channels
+        if name not in scores.struck
     )
-    doubted = {name: None for name in doubted if name not in scores.struck}
     if doubted:
-        return [
-            f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."
-        ]
+        names = ", ".join(doubted)
+        return [f"No other channel was declared alone; doubted with them: {names}."]
     return ["No other channel was declared faulty."]
 
 
@@ -344,32 +198,87 @@ def _time(seconds: float | None) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.1f} s"
 
 
-# Tables for a terminal -----------------------------------------------------------------------------------------------
-
-
-_MOST_TOLD = 20  # episodes told of with all that is known
+# Tables for a terminal
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
-    """Words and tables for one replay."""
+    """Return sentences and tables for one replay."""
     scores = summary.scores
     rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
+    lines = [verdict_of(summary, unit).sentence, *sentences(summary, unit)]
+    health = health_section(summary, unit)
     parts = [
-        *(
-            f"{line}\n"
-            for line in (verdict(summary, unit).words, *sentences(summary, unit))
-        ),
+        *(f"{line}\n" for line in lines),
         f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
-        f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
+        f" detector {summary.detector}, replayed in {summary.seconds:.2f} s"
+        f" ({rate:.0f} messages/s)\n",
         _episodes(summary.story, bool(scores.faults), unit),
+        f"\n{section_text(health)}" if health.content else "",
         *(f"\n{section_text(section)}" for section in fault_sections(scores, unit)),
         *(f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))),
     ]
     return "".join(parts)
 
 
+def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
+    """Lay out the health of each unit, the worst of its channels in each column."""
+    channels, units = summary.monitor.channels, summary.monitor.units
+    rows = [
+        (one, [each for each in channels if each.unit == one.name] or list(channels))
+        for one in units
+    ]
+    columns: dict[str, Callable[[Any], str]] = {
+        "unit": lambda row: row[0].name,
+        "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
+        "rate": lambda row: number(row[0].rate_hz, ".3g", " Hz"),
+        "checked": lambda row: f"{100 * min(one.checked for one in row[1]):.0f} %",
+        "spikes": lambda row: str(sum(one.spikes for one in row[1])),
+        "at end of range": lambda row: (
+            f"{max(one.saturated_s for one in row[1]):.2g} s"
+        ),
+        f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
+        "delay": lambda row: milliseconds(row[0].delay_s),
+        "temperature": lambda row: _temperature_words(row[0].temperature_c),
+        "trouble": lambda row: _trouble_words(summary, row[0].name, row[1]),
+    }
+    if all(one.temperature_c is None for one in units):
+        del columns["temperature"]
+    if all(one.delay_s is None for one in units):
+        del columns["delay"]
+    return Section(
+        "Health of each unit", "", head_and_rows(columns, rows) if rows else ""
+    )
+
+
+def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:
+    """Return the largest difference from the fused rate, rms, in a unit of rate."""
+    known = [
+        one.residual_rms_rad_s * unit.factor
+        for one in channels
+        if one.residual_rms_rad_s is not None
+    ]
+    return max(known, default=None)
+
+
+def _temperature_words(span: tuple[float, float] | None) -> str:
+    return "-" if span is None else f"{span[0]:.0f} to {span[1]:.0f} C"
+
+
+def _trouble_words(
+    summary: Summary, unit: str, channels: Sequence[ChannelResult]
+) -> str:
+    """Say since when the unit is not healthy; a dash: it is."""
+    names = {unit, *(one.name for one in channels)}
+    faults = [
+        one for one in summary.story.episodes if not names.isdisjoint(one.channels)
+    ]
+    words = [f"{one.state.lower()} from {one.start_s:.1f} s" for one in faults[:1]]
+    words += [one.words for one in summary.concerns if not names.isdisjoint(one.who)]
+    return "; ".join(words) or "-"
+
+
 def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
-    """Lay out the injected faults, what became of them and what they did; without any there is no section."""
+    """Lay out the injected faults, their outcome and effect; no section without faults."""
     if not scores.faults:
         return []
     columns: Columns = {
@@ -395,7 +304,9 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
             unit.words(effect.without_monitor),
         ),
     ]
-    hint = "Rms, against the same samples without the faults, saturated ones left out."
+    hint = (
+        "Rms difference from a replay without the faults; saturated samples left out."
+    )
     return [
         Section("Injected faults", "", head_and_rows(columns, scores.faults)),
         Section(
@@ -414,7 +325,7 @@ def _detected(fault: Outcome) -> str:
 
 
 def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
-    """Size of a fault with its unit; where it is a rate, in the unit asked for."""
+    """Return the size of a fault with its unit; a rate in the unit asked for."""
     if fault.size is None:
         return "-"
     option = FAULT_KINDS[fault.kind].options()["size"].unit
@@ -424,15 +335,15 @@ def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
 
 
 def _episodes(story: Story, scored: bool, unit: Unit) -> str:
-    """Tell of every episode: who, when and how much, and what is known of it beside."""
-    told = story.episodes[:_MOST_TOLD]
-    lines = ["\nwhat happened\n"] if told else []
-    for place, one in enumerate(told, 1):
+    """List the episodes: channels, time and size, then the details."""
+    first = story.episodes[:MOST_EPISODES]
+    lines = ["\nwhat happened\n"] if first else []
+    for place, one in enumerate(first, 1):
         where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
         lines += [
             f"       {title}: {words}\n"
             for title, words in detail_words(one, unit, scored)
         ]
-    more = len(story.episodes) - len(told) + story.more
+    more = len(story.episodes) - len(first) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)

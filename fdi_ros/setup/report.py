@@ -23,7 +23,6 @@ from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
-from fdi_ros.replay.words import noisy_lines
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
@@ -300,9 +299,11 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     yield from topic_findings(found.chosen, unit)
     tried = found.proof.before if found.kept else found.proof.after
     if tried.baseline is not None:
-        # A replay with these settings reports the same noise.
-        for line in noisy_lines(tried.baseline.judgement, unit):
-            yield Finding(Role.WARNING, "noise", line, headline="USABLE, BUT LOOK")
+        # A replay with these settings would give the same reasons to look.
+        for one in tried.baseline.judgement.concerns:
+            yield Finding(
+                Role.WARNING, "health", str(one), one.who, headline="USABLE, BUT LOOK"
+            )
     limits = [
         line
         for line in pair_lines(mounting)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import html
 import math
 from collections.abc import Iterable, Sequence
@@ -41,6 +42,19 @@ def visible(text: str, kept: str = "\n\t") -> str:
         else c.encode("unicode_escape").decode("ascii")
         for c in text
     )
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Join words as a sentence lists them: ``a, b and c``."""
+    return f" {last} ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+
+
+def did_you_mean(word: str, choices: Sequence[str]) -> str:
+    """Return a hint for a word that is none of the choices: the closest one, or all of them."""
+    close = difflib.get_close_matches(word, choices, n=1)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return f"expected one of: {', '.join(choices)}"
 
 
 def plus_minus(value: float, std: float) -> str:

@@ -30,7 +30,8 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import Evaluation, score
 from fdi_ros.replay.recorder import Batches, Recorder
 from fdi_ros.replay.run import Sink, Walk
-from fdi_ros.replay.words import fault_sections, sentences, verdict
+from fdi_ros.replay.verdict import verdict_of
+from fdi_ros.replay.words import fault_sections, sentences
 from fdi_ros.report.layout import Severity
 
 S = ChannelState
@@ -521,11 +522,12 @@ def test_the_healthy_channel_that_a_fault_made_faulty_is_named():
             samples_judged=40,
         )
     )
-    assert verdict(told) == (
+    found = verdict_of(told)
+    assert (found.severity, found.sentence) == (
         Severity.BAD,
         "1 of 1 injected fault detected, 0 isolated.",
     )
-    assert sentences(told)[-1] == "Declared faulty, and not struck by a fault: g6."
+    assert sentences(told)[-1] == "Declared faulty without an injected fault: g6."
 
 
 def test_sentence_and_table_agree_on_two_faults_at_once():
@@ -536,21 +538,24 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     both = [event(12, i, S.AMBIGUOUS, (0, 3, 5)) for i in (0, 3, 5)]
     named = [event(14, i, S.FAULTY, before=S.AMBIGUOUS) for i in (0, 5)]
     told = summary_of(replace(scored(faults, *both, *named), samples_judged=40))
-    assert verdict(told) == (
+    found = verdict_of(told)
+    assert (found.severity, found.sentence) == (
         Severity.GOOD,
         "2 of 2 injected faults detected, 2 isolated.",
     )
     words = "detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms."
-    last = "No other channel was declared faulty by itself; under doubt with them: g4."
+    last = "No other channel was declared alone; doubted with them: g4."
     assert sentences(told) == [f"bias on g1: {words}", f"bias on g6: {words}", last]
     unjudged = summary_of(replace(told.scores, samples_judged=0))
-    assert sentences(unjudged)[-1].startswith("Of the others it cannot be told: ")
+    assert sentences(unjudged)[-1].startswith(
+        "The verdict on all other channels is CANNOT TELL: "
+    )
     table = fault_sections(told.scores)[0].content
     assert [row[-4:] for row in table[1]] == [
         ("2000.0 ms", "AMBIGUOUS", "4000.0 ms", "g1, g4, g6")
     ] * 2
     unnamed = summary_of(replace(scored(faults, *both), samples_judged=40))
-    assert verdict(unnamed).severity is Severity.UNKNOWN
+    assert verdict_of(unnamed).severity is Severity.UNKNOWN
     assert sentences(unnamed)[0].endswith("as one of g1, g4, g6, not isolated.")
 
 

@@ -23,7 +23,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outcomes import GRACE
 from fdi_ros.replay.run import replay
-from fdi_ros.replay.words import noisy_lines, sentences, verdict
+from fdi_ros.replay.words import sentences
 from fdi_ros.report.layout import Severity
 
 FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0
@@ -113,13 +113,13 @@ def test_the_six_gyros_as_one_array_and_as_two_imus_say_the_same(
     config = Config.from_file(root / "config" / file)
     summary = replay(flight, config)
     assert summary.scores.declared == ()
-    severity, words = verdict(summary)
+    severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.GOOD
     assert re.fullmatch(
-        r"HEALTHY: no fault declared in 60.0 s; 6 channels, each checked in 9\d% .* or more\.",
+        r"HEALTHY: no fault was found in 60.0 s; 6 channels, each checked in 9\d % .* or more\.",
         words,
     )
-    assert sentences(summary) == []
+    assert all(line.startswith("Topics: ") for line in sentences(summary))
     (fault,) = replay(
         flight, config, (parse_fault(f"channel={channel} {BIAS}"),)
     ).scores.faults
@@ -133,14 +133,12 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     assert keep.output.valid[-1]
     assert summary.stream.alignment[TOPICS[1]]["missing"] == 200
     assert summary.scores.samples_judged > 0.5 * summary.scores.samples
-    severity, words = verdict(summary)
+    severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.BAD
+    assert re.fullmatch(r"FAULTY: imu_2 gives no data from 4\.\d s\.", words)
+    second, *_ = sentences(summary)
     assert re.fullmatch(
-        r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", words
-    )
-    (second,) = sentences(summary)
-    assert re.fullmatch(
-        r"At the end not checked: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
+        r"Not checked at the end: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
         r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
         second,
     )
@@ -171,7 +169,7 @@ def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
     assert summary.scores.events[-1].state == "UNCHECKED"
     assert {one.state for one in summary.monitor.channels} == {"OK"}
     assert failures(parse_check("declared=0", 0), summary) == []
-    assert verdict(summary).severity is Severity.GOOD
+    assert summary.verdict.severity is Severity.GOOD
     assert summary.story.episodes == ()
 
 
@@ -179,10 +177,13 @@ def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
 def test_channels_much_noisier_than_the_others_are_told_of(tmp_path, noise, channels):
     z = recordings.flight(2000)[1]
     z[:, 4] += np.random.default_rng(3).normal(0, noise, len(z))
-    lines = noisy_lines(replay(written(tmp_path, z), CALM))
-    assert [
-        line.partition(" is much noisier than the others")[0] for line in lines
-    ] == channels
+    summary = replay(written(tmp_path, z), CALM)
+    assert [name for one in summary.concerns for name in one.who] == channels
+    assert summary.verdict.word == ("LOOK" if channels else "HEALTHY")
+    assert summary.verdict.channels == tuple(channels)
+    assert all(
+        re.search(r"is \d+ times as noisy", str(one)) for one in summary.concerns
+    )
 
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
@@ -190,10 +191,10 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     config = Config.from_parameters({**PARAMETERS, **learning})
     summary = replay(written(tmp_path, recordings.flight(200)[1]), config)
     assert summary.scores.samples_judged == 0
-    severity, words = verdict(summary)
+    severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.UNKNOWN
     assert words.startswith(
-        "CANNOT TELL: not one of 200 samples was judged; bias learning."
+        "CANNOT TELL: none of 200 samples was judged; bias learning."
     )
     assert (
         failures(parse_check("false=0", 0), summary)[0]

@@ -1,0 +1,60 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Names of units, taken from the topics that carry them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+_NUMBER = re.compile(r"[0-9]+")
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]+")
+LONGEST_NUMBER = 9
+"""Digits of a number that may name a unit; longer ones are serial numbers."""
+
+
+def unit_names(topics: Sequence[str]) -> list[str]:
+    """Name each unit after its topic.
+
+    Topics that have a number each, and no number twice, give ``imu_<number>``: ``/imu_0/data``
+    and ``/imu_1/data`` give ``imu_0`` and ``imu_1``. Other topics are named by the parts in which
+    they differ: ``/front/imu`` and ``/rear/imu`` give ``front`` and ``rear``. If these are not
+    unique, units are numbered from 0 in the order of the topics.
+    """
+    return (
+        _by_number(topics)
+        or _by_difference(topics)
+        or [f"imu_{k}" for k in range(len(topics))]
+    )
+
+
+def _by_number(topics: Sequence[str]) -> list[str]:
+    """Return names by the first number that differs between all topics; empty if none does."""
+    found = [_NUMBER.findall(topic) for topic in topics]
+    for digits in zip(*found, strict=False):
+        numbers = {int(one) for one in digits if len(one) <= LONGEST_NUMBER}
+        if len(numbers) == len(topics):
+            return [f"imu_{int(one)}" for one in digits]
+    return []
+
+
+def _by_difference(topics: Sequence[str]) -> list[str]:
+    """Return names by the parts of the topics in which they differ; empty if they are not unique."""
+    paths = [topic.strip("/").split("/") for topic in topics]
+    same_head = _common(paths)
+    same_tail = _common([path[same_head:][::-1] for path in paths])
+    own = [path[same_head : len(path) - same_tail] or path for path in paths]
+    names = [_NOT_IN_NAMES.sub("_", "_".join(parts)).strip("_") for parts in own]
+    named = all(name and not name[0].isdigit() for name in names)
+    return names if named and len(set(names)) == len(names) else []
+
+
+def _common(paths: Sequence[Sequence[str]]) -> int:
+    """Return how many parts at the beginning are the same in all paths."""
+    count = 0
+    for parts in zip(*paths, strict=False):
+        if len(set(parts)) > 1:
+            break
+        count += 1
+    return count

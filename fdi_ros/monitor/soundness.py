@@ -1,0 +1,243 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Health of channels and units without a declared fault: what forbids to call them healthy.
+
+Replay, set-up, fleet, diagnostics and `fdi watch` all ask `concerns_of`. A recording describes
+a whole flight, the live monitor its last seconds, by the same records.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi_ros.model.noise import much_noisier
+from fdi_ros.system.text import listed
+
+LEAST_CHECKED = 0.5
+"""Share of its samples in which the others must have checked a healthy channel."""
+LEAST_DELIVERED = 0.9
+"""Share of its messages that a healthy unit delivers."""
+LEAST_SPIKES = 3
+"""Single wrong samples from which on a channel has spikes; fewer may be chance."""
+
+
+class Word(str, Enum):
+    """First word of a verdict."""
+
+    HEALTHY = "HEALTHY"
+    """All channels delivered, were checked, and agreed."""
+    LOOK = "LOOK"
+    """No fault was declared, but something is not as it should be."""
+    CANNOT_TELL = "CANNOT TELL"
+    """No fault was declared, but too little was checked."""
+    FAULTY = "FAULTY"
+    """A fault was declared, or a unit fell silent for good."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelHealth:
+    """How one channel measured."""
+
+    name: str
+    """Name of the channel."""
+    unit: str = ""
+    """Name of its unit; empty for a channel without a unit."""
+    checked: float = 1.0
+    """Share of the samples in which the other channels checked it."""
+    delivered: float = 1.0
+    """Share of the samples in which it gave a finite value."""
+    spikes: int = 0
+    """Number of single wrong samples."""
+    saturated_s: float = 0.0
+    """Time at the end of its range, s."""
+    residual_rms_rad_s: float | None = None
+    """Root mean square of its difference from the fused rate while it was OK, rad/s.
+    None: never OK, or not measured."""
+    doubt: str = ""
+    """What is wrong with it at the end: ``under suspicion from 16.5 s on``; empty: nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitHealth:
+    """How one unit, which may be a single topic of channels, delivered."""
+
+    name: str
+    """Name of the unit."""
+    topic: str
+    """Topic that carries it."""
+    delivered: float = 1.0
+    """Share of its messages that arrived, by its usual rate and that of the other units."""
+    rate_hz: float | None = None
+    """Usual messages per second, Hz; None: not measured."""
+    slow_from_s: float | None = None
+    """Start of the longest time with fewer than half of its messages, s; None: no such time."""
+    slow_to_s: float | None = None
+    """End of that time, s; None: no such time, or it lasts to the end."""
+    slow_rate_hz: float | None = None
+    """Messages per second during that time, Hz."""
+    delay_s: float | None = None
+    """Delay of its stamps against the first unit, s; negative: early; None: not measured."""
+    delay_std_s: float | None = None
+    """Standard deviation of the delay, s."""
+    copy_of: str = ""
+    """Unit of which it repeats the values; empty: none."""
+    temperature_c: tuple[float, float] | None = None
+    """Lowest and highest temperature, degrees Celsius; None: not recorded."""
+
+
+class Concern(NamedTuple):
+    """One reason not to call channels healthy."""
+
+    word: Word
+    """The verdict it leads to: LOOK or CANNOT TELL."""
+    who: tuple[str, ...]
+    """Channels, units or topics."""
+    words: str
+    """What is wrong, as it continues the names: ``has 24 spikes``."""
+
+    def __str__(self) -> str:
+        return f"{listed(self.who)} {self.words}"
+
+
+def concerns_of(
+    channels: Sequence[ChannelHealth],
+    units: Sequence[UnitHealth] = (),
+    unused: Sequence[tuple[str, str]] = (),
+) -> list[Concern]:
+    """Return all reasons not to call channels and units healthy, the worst first.
+
+    Parameters
+    ----------
+    channels, units
+        What was measured, over a flight or over the last seconds.
+    unused
+        Topics of gyros that are left out, and why.
+    """
+    slow = [unit for unit in units if _is_slow(unit)]
+    by_unit = {unit.name for unit in slow}
+    alone = [one for one in channels if one.unit not in by_unit]
+    return [
+        *_alike(
+            [one for one in channels if one.checked < LEAST_CHECKED],
+            Word.CANNOT_TELL,
+            lambda some: (
+                f"{_was(some)} checked in only"
+                f" {100 * min(one.checked for one in some):.0f} % of the samples"
+            ),
+        ),
+        *(Concern(Word.LOOK, (topic,), f"is left out: {why}") for topic, why in unused),
+        *(Concern(Word.LOOK, (unit.name,), _slow_words(unit)) for unit in slow),
+        *(
+            Concern(
+                Word.LOOK,
+                (unit.name,),
+                f"repeats the values of {unit.copy_of}: one sensor, no redundancy",
+            )
+            for unit in units
+            if unit.copy_of
+        ),
+        *_alike(
+            [one for one in alone if one.delivered < LEAST_DELIVERED],
+            Word.LOOK,
+            lambda some: (
+                "gave a value in only"
+                f" {100 * min(one.delivered for one in some):.0f} % of the samples"
+            ),
+        ),
+        *_doubts([one for one in alone if one.doubt]),
+        *_alike(
+            [one for one in channels if one.saturated_s > 0.0],
+            Word.LOOK,
+            lambda some: (
+                f"{_was(some)} at the end of the range for"
+                f" {max(one.saturated_s for one in some):.2g} s"
+            ),
+        ),
+        *(
+            Concern(Word.LOOK, (one.name,), f"has {one.spikes} spikes of one sample")
+            for one in channels
+            if one.spikes >= LEAST_SPIKES
+        ),
+        *_noisy(channels),
+    ]
+
+
+def word_of(concerns: Iterable[Concern]) -> Word:
+    """Return the first word of the verdict where no fault was declared."""
+    words = {one.word for one in concerns}
+    if Word.CANNOT_TELL in words:
+        return Word.CANNOT_TELL
+    return Word.LOOK if words else Word.HEALTHY
+
+
+def _is_slow(unit: UnitHealth) -> bool:
+    return unit.delivered < LEAST_DELIVERED or unit.slow_from_s is not None
+
+
+def _slow_words(unit: UnitHealth) -> str:
+    words = f"delivered {100 * unit.delivered:.0f} % of its messages"
+    if unit.slow_from_s is None:
+        return words
+    until = "to the end" if unit.slow_to_s is None else f"to {unit.slow_to_s:.0f} s"
+    return (
+        f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz from"
+        f" {unit.slow_from_s:.0f} s {until})"
+    )
+
+
+def _was(some: Sequence[ChannelHealth]) -> str:
+    return "was" if len(some) == 1 else "were"
+
+
+def _alike(
+    some: Sequence[ChannelHealth],
+    word: Word,
+    words: Callable[[Sequence[ChannelHealth]], str],
+) -> list[Concern]:
+    """Return one concern about all of some channels, or none."""
+    if not some:
+        return []
+    return [Concern(word, tuple(one.name for one in some), words(some))]
+
+
+def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return a concern for each way in which channels are doubtful at the end."""
+    by_words: dict[str, list[str]] = {}
+    for one in some:
+        by_words.setdefault(one.doubt, []).append(one.name)
+    return [
+        Concern(
+            Word.LOOK,
+            tuple(names),
+            f"{'is' if len(names) == 1 else 'are'} {words}",
+        )
+        for words, names in by_words.items()
+    ]
+
+
+def _noisy(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return a concern for each channel that is much noisier than all other units."""
+    noise = np.array(
+        [
+            math.nan if one.residual_rms_rad_s is None else one.residual_rms_rad_s
+            for one in channels
+        ]
+    )
+    units: dict[str, list[int]] = {}
+    for i, one in enumerate(channels):
+        units.setdefault(one.unit or one.name, []).append(i)
+    return [
+        Concern(
+            Word.LOOK,
+            (channels[i].name,),
+            f"is {noise[i] / beside:.0f} times as noisy as the other units",
+        )
+        for i, beside in much_noisier(noise, list(units.values()))
+    ]

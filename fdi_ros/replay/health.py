@@ -1,0 +1,190 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the channels and units of a recording delivered: messages, finite values, saturation.
+
+All of it is measured on what was recorded, whatever the monitor made of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.raw import Batch
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array, Block, Int
+from fdi_ros.monitor.soundness import UnitHealth
+
+MOST_WINDOWS = 4096
+"""Windows in which messages are counted; for longer recordings their length doubles."""
+WINDOW = 1.0
+"""Length of a window at first, s."""
+MESSAGES_IN_WINDOW = 20.0
+"""Messages of a unit that a window must hold on average: fewer show no rate."""
+USUAL_QUANTILE = 0.9
+"""Quantile of the counts of a unit that is its usual count: a unit may be slow for long."""
+SLOW = 0.6
+"""Share of the usual count below which a unit is slow."""
+LEAST_SLOW = 3
+"""Windows in a row that a unit is slow at least."""
+
+LEAST_RAIL = 4.0
+"""Smallest end of a range, rad/s; gyros of 250 deg/s end at 4.36 rad/s."""
+RAIL_RUN = 5
+"""Consecutive samples at the largest value that show the end of a range."""
+
+
+class Delivery(NamedTuple):
+    """How one topic delivered its messages."""
+
+    share: float
+    """Share of the messages that arrived, by its usual rate and that of the other topics."""
+    rate: float | None
+    """Usual messages per second, Hz; None: too few messages."""
+    slow_from: float | None = None
+    """Start of the longest time at less than `SLOW` of its rate, s; None: no such time."""
+    slow_to: float | None = None
+    """End of that time, s; None: it lasts to the end, or there is no such time."""
+    slow_rate: float | None = None
+    """Messages per second in that time, Hz."""
+
+
+class Deliveries:
+    """Counts the messages of topics in windows of time; memory does not grow with the recording."""
+
+    def __init__(self, topics: int, start: float = 0.0) -> None:
+        """``start``: time of the first message that is counted, s."""
+        self._counts = np.zeros((topics, MOST_WINDOWS), dtype=np.int64)
+        self._start = start
+        self._width = WINDOW
+        self._first: int | None = None  # time of recording of the first message, ns
+        self._last = 0  # the latest time of recording, ns
+
+    def tap(self, batch: Batch, rows: Int) -> None:
+        """Count some rows of a batch of raw messages."""
+        if not len(rows):
+            return
+        times = batch.log_time[rows]
+        if self._first is None:
+            self._first = int(times[0])
+        self._last = max(self._last, int(times.max()))
+        since = np.maximum(times - self._first, 0) * 1e-9
+        while since.max() >= MOST_WINDOWS * self._width:
+            halved = self._counts.reshape(len(self._counts), -1, 2).sum(axis=2)
+            self._counts = np.hstack([halved, np.zeros_like(halved)])
+            self._width *= 2
+        windows = (since / self._width).astype(np.intp)
+        np.add.at(self._counts, (batch.topic[rows], windows), 1)
+
+    def result(self) -> list[Delivery]:
+        """Return how each topic delivered."""
+        if self._first is None:
+            return [Delivery(0.0, None) for _ in self._counts]
+        # The last window is cut off by the end of the recording.
+        length = int((self._last - self._first) * 1e-9 / self._width)
+        counts = self._counts[:, :length].astype(np.float64)
+        # Messages of each topic in a window in which it gives any.
+        usual_count = counts.sum(axis=1) / np.maximum((counts > 0).sum(axis=1), 1)
+        together = 1
+        while (
+            length // together > 2 * LEAST_SLOW
+            and usual_count.min() * together < MESSAGES_IN_WINDOW
+        ):
+            together *= 2
+        width = self._width * together
+        counts = counts[:, : length // together * together]
+        counts = counts.reshape(len(counts), -1, together).sum(axis=2)
+        if counts.shape[1] < 2 * LEAST_SLOW:
+            return [Delivery(1.0, None) for _ in counts]
+        usual: Array = np.maximum(np.quantile(counts, USUAL_QUANTILE, axis=1), 1.0)
+        shares = counts / usual[:, None]
+        # All topics lack what the recorder lost.
+        recorded = shares.max(axis=0)
+        shares = shares[:, recorded > 0] / np.maximum(recorded[recorded > 0], 1e-9)
+        times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
+        return [
+            _delivery(np.asarray(np.minimum(own, 1.0)), times, width, count / width)
+            for own, count in zip(shares, usual.tolist(), strict=True)
+        ]
+
+
+def _delivery(shares: Array, times: Array, width: float, rate: float) -> Delivery:
+    """Return how a topic delivered from its first message on.
+
+    ``shares`` (k,) of its usual rate in windows that begin at ``times`` (k,) s and last
+    ``width`` s. ``rate``: its usual rate, Hz.
+    """
+    # Its first window is cut off.
+    begun = int(np.flatnonzero(shares > 0)[0]) + 1
+    shares, times = shares[begun:], times[begun:]
+    if not len(shares):
+        return Delivery(1.0, None)
+    share = float(shares.mean())
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < SLOW, [0]])))
+    runs = edges.reshape(-1, 2)
+    longest = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
+    first, last = longest
+    if last - first < LEAST_SLOW:
+        return Delivery(share, rate)
+    slow_to = None if last == len(shares) else float(times[last - 1] + width)
+    slow_rate = rate * float(shares[first:last].mean())
+    return Delivery(share, rate, float(times[first]), slow_to, slow_rate)
+
+
+def with_delivery(unit: UnitHealth, delivery: Delivery) -> UnitHealth:
+    """Return the health of a unit with what its topic delivered."""
+    return replace(
+        unit,
+        delivered=delivery.share,
+        rate_hz=delivery.rate,
+        slow_from_s=delivery.slow_from,
+        slow_to_s=delivery.slow_to,
+        slow_rate_hz=delivery.slow_rate,
+    )
+
+
+class Values:
+    """Counts finite values and saturated samples of channels, block after block."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        n = geometry.n
+        self._largest = np.full(n, LEAST_RAIL)
+        self._run = np.zeros(n, dtype=np.int64)  # samples in a row at the largest value
+        self.samples = 0
+        """Samples so far."""
+        self.finite: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
+        """(n,) samples with a finite value."""
+        self.saturated: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
+        """(n,) samples in runs at the largest value of the channel."""
+
+    def add(self, block: Block) -> None:
+        """Take in the next samples."""
+        if not len(block):
+            return
+        known = np.isfinite(block.z)
+        self.samples += len(block)
+        self.finite += known.sum(axis=0)
+        size = np.where(known, np.abs(block.z), 0.0)
+        for i in np.flatnonzero(size.max(axis=0) >= self._largest).tolist():
+            self._add_saturated(i, size[:, i])
+        self._run[size[-1] < self._largest] = 0
+
+    def _add_saturated(self, i: int, size: Array) -> None:
+        """Count the samples of a channel at the end of its range."""
+        largest = float(size.max())
+        if largest > self._largest[i]:
+            self._largest[i], self._run[i], self.saturated[i] = largest, 0, 0
+        at_end = size == largest
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_end, [0]])))
+        for first, last in edges.reshape(-1, 2).tolist():
+            run = last - first + (int(self._run[i]) if first == 0 else 0)
+            if run >= RAIL_RUN:
+                counted = (
+                    run - (last - first) if run - (last - first) >= RAIL_RUN else 0
+                )
+                self.saturated[i] += run - counted
+            self._run[i] = run if last == len(size) else 0

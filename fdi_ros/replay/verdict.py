@@ -1,0 +1,261 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verdict on a replay: one word, and a sentence for the person who flies.
+
+`verdict_of` decides; `fdi replay`, its page, `fdi fleet` and Python only repeat it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from fdi_ros.core.states import Reason
+from fdi_ros.monitor.soundness import Word, word_of
+from fdi_ros.replay.episodes import MOST_TOLD, Episode, Size
+from fdi_ros.replay.summary import Judgement, ReplayVerdict
+from fdi_ros.report.layout import RADIANS, Unit, first_of
+from fdi_ros.system.text import listed
+
+LEAST_JUDGED = 0.5
+"""Share of the samples that must be judged for a verdict."""
+LASTING = 1.0
+"""Time to the end for which a channel must be silent or unchecked to be reported, s."""
+BRIEF = 1.0
+"""A fault that stands for less is reported with its duration, s."""
+MOST_CONCERNS = 3
+"""Reasons that a verdict lists."""
+
+
+def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
+    """Return the verdict on what a monitor made of a stream, with rates in a unit."""
+    if judgement.scores.faults:
+        return _verdict_on_faults(judgement)
+    faulty = faulty_episodes(judgement)
+    if faulty:
+        names = dict.fromkeys(name for one in faulty for name in one.channels)
+        return ReplayVerdict(
+            Word.FAULTY.value,
+            f"FAULTY: {_faulty_sentences(faulty, unit)}",
+            tuple(names),
+        )
+    if why := unjudged_words(judgement):
+        return ReplayVerdict(Word.CANNOT_TELL.value, f"CANNOT TELL: {why}.", ())
+    concerns = judgement.concerns
+    word = word_of(concerns)
+    deciding = [one for one in concerns if one.word is word]
+    names = dict.fromkeys(name for one in deciding for name in one.who)
+    seconds = judgement.scores.duration_s
+    if word is Word.HEALTHY:
+        sentence = _healthy_words(judgement)
+    else:
+        listed_ones = first_of(list(map(str, deciding)), MOST_CONCERNS, "; ")
+        sentence = f"no fault was found in {seconds:.1f} s, but {listed_ones}"
+    return ReplayVerdict(word.value, f"{word.value}: {sentence}.", tuple(names))
+
+
+def faulty_episodes(judgement: Judgement) -> list[Episode]:
+    """Return the episodes that make a recording faulty, those that name channels first.
+
+    These are the declarations, and the units that are silent to the end.
+    """
+    declared = sorted(
+        judgement.story.declared, key=lambda one: (one.state != "FAULTY", one.start_s)
+    )
+    silent = [
+        one
+        for one in judgement.story.episodes
+        if one.stands
+        and one.duration_s >= LASTING
+        and one.evidence.reason == Reason.NO_DATA.value
+        and not one.declares
+    ]
+    return [*declared, *silent]
+
+
+def unjudged_words(judgement: Judgement) -> str:
+    """Return why the recording as a whole was not judged, in words; empty: it was."""
+    scores, bias = judgement.scores, judgement.monitor.bias
+    if scores.samples_judged == 0:
+        return f"none of {scores.samples} samples was judged; bias {bias.state}"
+    share = scores.samples_judged / scores.samples
+    if share < LEAST_JUDGED:
+        return f"only {100 * share:.1f} % of {scores.samples} samples were judged"
+    if bias.far:
+        return (
+            f"{listed(bias.far)} began with a bias far beyond bias.turn_on_std, as after"
+            " a fault before the start"
+        )
+    return ""
+
+
+def wrongly_named(judgement: Judgement) -> list[str]:
+    """Return the channels declared by themselves that no injected fault strikes."""
+    faulty = dict.fromkeys(
+        one.channel for one in judgement.scores.declared if one.state == "FAULTY"
+    )
+    return [name for name in faulty if name not in judgement.scores.struck]
+
+
+def _verdict_on_faults(judgement: Judgement) -> ReplayVerdict:
+    """Say how many of the injected faults were detected."""
+    faults = judgement.scores.faults
+    isolated = judgement.scores.isolated
+    detected = sum(fault.detected_at_s is not None for fault in faults)
+    plural = "fault" if len(faults) == 1 else "faults"
+    unexplained = any(not one.injected for one in judgement.story.declared)
+    if wrongly_named(judgement) or unexplained:
+        word = "FALSE ALARM"
+    else:
+        word = "FOUND" if isolated == len(faults) else "NOT ALL FOUND"
+    names = dict.fromkeys(name for fault in faults for name in fault.declared_channels)
+    return ReplayVerdict(
+        word,
+        f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated.",
+        tuple(names),
+    )
+
+
+def _healthy_words(judgement: Judgement) -> str:
+    channels = judgement.monitor.channels
+    checked = min((one.checked for one in channels), default=1.0)
+    share = (
+        "all checked"
+        if checked > 0.995
+        else f"each checked in {100 * checked:.0f} % of the samples or more"
+    )
+    end = [
+        one.name
+        for one in judgement.unchecked_channels
+        if one.since_s is not None and judgement.scores.end_s - one.since_s >= LASTING
+    ]
+    more = f"; not checked at the end: {listed(end)}" if end else ""
+    return (
+        f"no fault was found in {judgement.scores.duration_s:.1f} s;"
+        f" {len(channels)} channels, {share}{more}"
+    )
+
+
+# A fault in one sentence for the person who flies
+
+
+def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
+    """Return sentences on the first episode, and the names in the others."""
+    first = faulty[0]
+    sentences = [
+        f"{_who(first)} {_when(first)}.",
+        *_size_sentences(first, unit),
+        *_reason_sentences(first),
+    ]
+    if first.since_s - first.start_s >= 0.05:
+        sentences.append(f"First sign at {first.start_s:.1f} s.")
+    others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
+    if others:
+        sentences.append(f"Later also {first_of(list(others), MOST_TOLD)}.")
+    return " ".join(sentences)
+
+
+def _who(one: Episode) -> str:
+    """Return the channels as they are said aloud: ``imu_0, x and y,``."""
+    parts = [name.rpartition(".") for name in one.channels]
+    units = {unit for unit, _, _ in parts}
+    if one.state != "FAULTY" or len(parts) == 1 or len(units) > 1 or "" in units:
+        return one.who.removesuffix(",")
+    unit = parts[0][0]
+    if one.who == unit:
+        return f"{unit}, all axes,"
+    return f"{unit}, {listed([axis for _, _, axis in parts])},"
+
+
+def _when(one: Episode) -> str:
+    since = f"from {one.since_s:.1f} s"
+    lasted = one.end_s - one.since_s
+    if not one.stands:
+        brief = f", for {1000 * lasted:.0f} ms" if lasted < BRIEF else ""
+        since += brief or f" to {one.end_s:.1f} s"
+    if one.state == "STALE":
+        return f"gives no data {since}"
+    if one.state == "FAULTY":
+        return since
+    if len(one.channels) == 1:
+        return f"{since}, not yet for certain"
+    return f"{since}; the data cannot tell which"
+
+
+def _size_sentences(one: Episode, unit: Unit) -> list[str]:
+    """Return how large the error is, in a sentence."""
+    if one.apart is not None:
+        return [f"They are {_size(one.apart.size, unit)} {unit.name} apart."]
+    if one.state != "FAULTY":
+        return []
+    sizes = {
+        each.channel.rpartition(".")[2] if len(one.channels) > 1 else "": each.size
+        for each in one.candidates
+        if each.size is not None
+    }
+    if not sizes:
+        return []
+    courses = {size.course for size in sizes.values()}
+    if courses == {"growing"} or courses == {"shrinking"}:
+        verb = "grows" if courses == {"growing"} else "shrinks"
+        begins = {_size(size, unit) for size in sizes.values()}
+        if len(begins) == 1:
+            ends = listed(
+                [
+                    f"{_rate(size.last_rad_s, size.std_rad_s, unit)}{f' ({axis})' if axis else ''}"
+                    for axis, size in sizes.items()
+                ]
+            )
+            return [f"Its error {verb} from {begins.pop()} to {ends} {unit.name}."]
+    words = [
+        f"{axis} {words}" if axis else words
+        for axis, size in sizes.items()
+        if (words := _size_words(size, unit))
+    ]
+    if not words:
+        return ["Its error is too small to measure."]
+    return [f"Its error: {'; '.join(words)}." if len(words) > 1 else f"It {words[0]}."]
+
+
+def _size_words(size: Size, unit: Unit) -> str:
+    """Return what an error does, as it continues ``It``; empty: too small to measure."""
+    value = _size(size, unit)
+    if size.course == "proportional":
+        share = 100.0 * abs(size.share_of_rate or 0.0)
+        low = (size.share_of_rate or 0.0) < 0
+        return f"reads {share:.2g} % too {'little' if low else 'much'}"
+    if size.course == "noisy":
+        return f"has noise of {value} {unit.name}"
+    if size.course == "varying":
+        return f"is off by a varying {value} {unit.name} rms"
+    if abs(size.rad_s) <= size.std_rad_s and size.course == "steady":
+        return ""
+    if size.course == "gone":
+        return f"was off by {value} {unit.name} until {size.gone_s:.1f} s"
+    if size.course in ("growing", "shrinking"):
+        last = _rate(size.last_rad_s, size.std_rad_s, unit)
+        return f"is off by {value}, {size.course} to {last} {unit.name}"
+    return f"is off by {value} {unit.name}"
+
+
+def _reason_sentences(one: Episode) -> list[str]:
+    """Return the reason of a fault that is more than a disagreement."""
+    reason = one.evidence.reason
+    common = (Reason.DISAGREES.value, Reason.DRIFTED.value, Reason.NO_DATA.value)
+    if one.state != "FAULTY" or not reason or reason.startswith(common):
+        return []
+    return [f"Reason: {reason}."]
+
+
+def _size(size: Size, unit: Unit) -> str:
+    return _rate(size.rad_s, size.std_rad_s, unit)
+
+
+def _rate(value: float, std: float, unit: Unit) -> str:
+    """Write the size of a rate to the figure that its standard error allows, three at most."""
+    size, error = abs(value) * unit.factor, std * unit.factor
+    figures = 2 - math.floor(math.log10(size)) if size > 0.0 else 0
+    if error > 0.0 and math.isfinite(error):
+        figures = min(figures, -math.floor(math.log10(error)))
+    return f"{size:.{min(max(figures, 0), 6)}f}"

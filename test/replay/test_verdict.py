@@ -1,0 +1,185 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A recording is called healthy only if everything delivered, was checked and agreed."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.inspection.names import unit_names
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.soundness import ChannelHealth, UnitHealth, concerns_of
+from fdi_ros.replay.health import MOST_WINDOWS, Deliveries, Values
+
+CASES = ROOT.parent / "shared" / "data" / "cases"
+LOGS = ROOT.parent / "shared" / "data" / "logs"
+TRIADS = Geometry.from_triads([np.eye(3)] * 3)
+
+needs_cases = pytest.mark.skipif(
+    not CASES.is_dir(), reason="../shared/data/cases is not there"
+)
+
+
+@needs_cases
+@pytest.mark.parametrize(
+    ("file", "code", "sentence"),
+    [
+        (
+            CASES / "names_topic1_faulty.mcap",
+            3,
+            r"FAULTY: imu_1\.y from 15\.\d s\. It is off by 0\.30\d* rad/s\.",
+        ),
+        (CASES / "five_units_fifth_faulty.csv", 4, r"LOOK: .*/imu_4 is left out: "),
+        (
+            CASES / "unit_slows_to_a_third.csv",
+            4,
+            r"LOOK: .*imu_1 delivered 6\d % of its messages \(16\.7 instead of 50 Hz from"
+            r" 1[67] s to the end\)",
+        ),
+        (
+            CASES / "all_saturate_2000dps.csv",
+            4,
+            r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z were at the end of the range for 1\.8 s",
+        ),
+        (CASES / "clean.csv", 0, r"HEALTHY: "),
+        (
+            LOGS / "quad_25mm_cut_hover.bin",
+            4,
+            r"CANNOT TELL: .*imu_2\.z was checked in only 4\d % of the samples",
+        ),
+    ],
+    ids=lambda value: value.stem if hasattr(value, "stem") else "",
+)
+def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
+    told = tmp_path / "told.json"
+    said = fdi("replay", file, "--json", told)
+    first = said.out.splitlines()[0]
+    assert re.match(sentence, first), first
+    assert said.code == code
+    verdict = json.loads(told.read_text())["verdict"]
+    assert (verdict["words"], verdict["word"]) == (first, first.partition(":")[0])
+
+
+@needs_cases
+def test_spikes_are_counted_on_their_channel_alone(fdi, tmp_path):
+    file, told = CASES / "spikes_5_every_1s.csv", tmp_path / "told.json"
+    settings = CASES / "clean_settings.yaml"
+    assert fdi("replay", file, "--config", settings, "--json", told).code == 4
+    summary = json.loads(told.read_text())
+    spikes = {one["name"]: one["spikes"] for one in summary["channels"]}
+    assert summary["verdict"]["channels"] == ["imu_1.y"]
+    assert 24 <= spikes.pop("imu_1.y") <= 25
+    assert set(spikes.values()) == {0}
+
+
+# Deliveries and values
+
+
+def tapped(times, topics, width=1.0):
+    """The deliveries of topics whose messages come at times (s)."""
+    deliveries = Deliveries(topics)
+    order = np.argsort(np.concatenate(times), kind="stable")
+    stamp = (np.concatenate(times)[order] * 1e9).astype(np.int64)
+    topic = np.repeat(np.arange(topics), [len(one) for one in times])[order]
+    for rows in np.array_split(np.arange(len(stamp)), 7):
+        batch = SimpleNamespace(log_time=stamp[rows], topic=topic[rows])
+        deliveries.tap(batch, np.arange(len(rows)))
+    return deliveries.result()
+
+
+@given(st.floats(10.0, 400.0), st.floats(0.0, 0.45), st.integers(20, 50))
+def test_a_unit_that_slows_down_is_seen_and_the_others_are_not(rate, left, after):
+    steady = np.arange(0.0, 90.0, 1 / rate)
+    slow = steady[(steady < after) | (np.arange(len(steady)) * left % 1.0 < left)]
+    whole, part = tapped([steady, slow], 2)
+    assert whole.share > 0.95
+    assert whole.slow_from is None
+    assert part.share == pytest.approx(len(slow) / len(steady), abs=0.08)
+    assert part.slow_from == pytest.approx(after, abs=40 / rate + 2.0)
+    assert part.slow_rate == pytest.approx(left * rate, abs=0.1 * rate)
+
+
+@given(st.floats(20.0, 200.0), st.floats(0.3, 1.0))
+def test_what_the_recorder_loses_of_all_units_is_no_fault_of_one(rate, ratio):
+    """Units of different rates, a hole in both, and a start and an end apart."""
+    times = [np.arange(0.0, 60.0, 1 / rate), np.arange(3.0, 59.5, 1 / (ratio * rate))]
+    times = [one[(one < 20.0) | (one > 31.0)] for one in times]
+    for delivery in tapped(times, 2):
+        assert delivery.share > 0.9
+        assert delivery.slow_from is None
+
+
+def test_memory_of_deliveries_does_not_grow_with_the_recording():
+    long = np.arange(0.0, 3.0 * MOST_WINDOWS, 0.5)
+    (delivery,) = tapped([long], 1)
+    assert delivery.share > 0.99
+    assert delivery.rate == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("cut", [1, 7, 5000])
+def test_the_end_of_a_range_is_counted_however_blocks_are_cut(cut):
+    random = np.random.default_rng(4)
+    time = np.arange(5000) * 0.01
+    body = 0.7 * np.sin(time[:, None] * [1.0, 1.3, 0.4])
+    z = np.tile(body, 3) + random.normal(0.0, 0.003, (5000, 9))
+    z[1000:1200, 0] = 8.0
+    values = Values(TRIADS)
+    stamp = (time * 1e9).astype(np.int64)
+    for first in range(0, 5000, cut):
+        values.add(Block(stamp[first : first + cut], z[first : first + cut]))
+    assert values.saturated.tolist() == [200] + 8 * [0]
+
+
+def test_concerns_name_what_is_wrong_and_nothing_else():
+    fine = [ChannelHealth(name=f"a.{axis}", unit="a") for axis in "xyz"]
+    assert concerns_of(fine, [UnitHealth(name="a", topic="/a")]) == []
+    bad = ChannelHealth(name="b.x", checked=0.4, spikes=5)
+    copy = UnitHealth(name="c", topic="/c", copy_of="a")
+    assert [str(one) for one in concerns_of([*fine, bad], [copy])] == [
+        "b.x was checked in only 40 % of the samples",
+        "c repeats the values of a: one sensor, no redundancy",
+        "b.x has 5 spikes of one sample",
+    ]
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("topics", "names"),
+    [
+        (
+            ["/imu_0/data_raw", "/imu_1/data_raw", "/imu_2/data_raw"],
+            "imu_0 imu_1 imu_2",
+        ),
+        (["/imu2", "/imu3", "/imu7"], "imu_2 imu_3 imu_7"),
+        (["/drone1/imu_4/data", "/drone1/imu_5/data"], "imu_4 imu_5"),
+        (["/front/imu", "/rear/imu"], "front rear"),
+        (["/imu", "/imu/backup"], "imu backup"),
+        (["/camera/imu", "/mavros/imu/data_raw"], "camera_imu mavros_imu_data_raw"),
+    ],
+)
+def test_units_are_named_as_their_topics(topics, names):
+    assert unit_names(topics) == names.split()
+
+
+@given(
+    st.lists(
+        st.from_regex(r"(/[a-z][a-z0-9_]{0,6}){1,3}", fullmatch=True),
+        min_size=2,
+        max_size=4,
+        unique=True,
+    )
+)
+def test_names_are_unique_whatever_the_topics(topics):
+    names = unit_names(topics)
+    assert len(set(names)) == len(topics)
+    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) for name in names)
