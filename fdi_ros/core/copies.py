@@ -21,14 +21,6 @@ from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSetti
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
-#
-# Two gyros differ by their noise. Where a linear map of three channels explains to
-# rounding what three others change
-# by, from sample to sample, these are a copy, perhaps turned, scaled or some samples
-# later: a topic that was mapped
-# twice. A copy agrees with its original whatever is wrong with it, so it is left out.
-
-
 # from one comparison to the next, ns: a copy is found on the ground, and in no hurry
 PERIOD = 1_000_000_000
 ROWS = 24  # changes compared: fewer quantised values of two gyros at rest may agree by chance
