@@ -64,7 +64,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
         health.gone, health.leaves, settings.n, INTERMITTENT_SHARE
     )
     clear &= now.usable
-    return update_stuck(core, subsets[clear], clear, evidence.stamp)
+    return update_stuck(core, subsets, clear, evidence.stamp)
 
 
 @compiled

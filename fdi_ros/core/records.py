@@ -600,6 +600,8 @@ class Current:
     others_rate: (
         Vector  # of the channels by which motion is measured in `update_stuck`, rad/s
     )
+    # sum of the squares by which the others of each channel disagree, (rad/s)^2
+    disagreement: Channels
     doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
     shared_error: (
         Axes  # C G', covariance of each channel's error with the rate's, (rad/s)^2
@@ -653,6 +655,7 @@ class Core:
     # prediction of each channel by the others when its present value was first seen,
     # rad/s; or NaN
     reference: Channels
+    witnesses: Counts  # channels that the reference of each is predicted from
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
     samples: Whole  # so far

@@ -6,14 +6,20 @@
 A value that repeats is no defect by itself: a quantised sensor at rest repeats for
 minutes. It counts after a much longer time, or against motion that the others see along
 this channel's axis: then the channel is stuck, or the values of a whole unit are old.
-The others are evidence of motion only if they agree: in a sample with an alarm that
-does not isolate the channel that repeats, it is not called stuck, and so neither of two
-parallel ones because of the other.
+
+A fault at rest looks like motion to every quiet channel beside it. The others are
+therefore evidence of motion only if they agree. The same channels must have seen the
+whole motion, their disagreement must be small beside the motion, and in coarse steps
+each of them must be checked by the rest. An alarm that does not isolate the channel
+that repeats forbids the conclusion too.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
+
+from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.algebra import along, square
@@ -24,6 +30,10 @@ from fdi_ros.model.geometry import MIN_SENSITIVITY
 # standard deviations, beyond one step, that the others move by while a stuck value
 # repeats
 LEAST_MOTION = 6.0
+AGREED = 0.5
+"""Largest disagreement of the others, root sum of squares, as a share of the motion they
+see. A fault of one of three parallel channels moves their mean by a third of itself and
+leaves 0.8 of itself as disagreement; real motion leaves noise."""
 # of a quantised sensor, which repeats its value by chance until the body has moved this
 # far
 STEPS = 3.0
@@ -63,28 +73,74 @@ def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
 
 
 @compiled
-def update_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
+def fill_disagreement(
+    settings: PathSettings, now: Current, subset: Subset, mask: int
+) -> None:
+    """Sum the squares by which the channels of a mask other than each disagree, into ``now.disagreement``."""
+    axes, rate, total = settings.sensors.axes, now.others_rate, 0.0
+    fill_rate(subset, settings.n, mask, now.corrected, rate)
+    for i in range(settings.n):
+        now.disagreement[i] = 0.0
+        if mask >> i & 1:
+            residual = now.corrected[i] - along(axes[i], rate)
+            total += residual * residual
+            share = subset.sensitivity[i]
+            if share > MIN_SENSITIVITY**2:
+                now.disagreement[i] = residual * residual / share
+    for i in range(settings.n):
+        now.disagreement[i] = max(total - now.disagreement[i], 0.0)
+
+
+@compiled
+def is_confirmed(settings: PathSettings, subset: Subset, mask: int, i: int) -> bool:
+    """Whether the rest checks each channel of a mask that measures along channel i; ``subset`` is of the mask."""
+    axes = settings.sensors.axes
+    for j in range(settings.n):
+        unchecked = mask & ~subset.detectable & (1 << j)
+        if unchecked and abs(along(axes[i], axes[j])) > MIN_SENSITIVITY:
+            return False
+    return True
+
+
+@compiled
+def has_moved(
+    core: Core, subset: Subset, others: int, i: int, least: float, step: float
+) -> bool:
+    """Whether the others (their ``subset``) have measured motion along channel i while its value repeats."""
+    now, noise = core.now, core.settings.sensors.noise_std[i]
+    change = abs(now.prediction[i] - core.reference[i])
+    if not (change > least + step and now.disagreement[i] < (AGREED * change) ** 2):
+        return False
+    # The noise of a fine sensor never repeats: its repeated values need no second witness.
+    coarse = step > COARSE_STEP * noise
+    return not coarse or is_confirmed(core.settings, subset, others, i)
+
+
+@compiled
+def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
-    n, now, stuck = core.settings.n, core.now, 0
+    n, now, stuck, subset = core.settings.n, core.now, 0, subsets[mask]
     # Use uncorrected values: a change of the estimated errors is not motion.
     fill_rate(subset, n, mask, now.input, now.others_rate)
     leave_one_out(core.settings, now, subset)
+    if now.evidence.repeats & now.usable:
+        fill_disagreement(core.settings, now, subset, mask)
     step = largest_step(core.settings, core.health, now)
     for i in range(n):
-        if core.health.run_stamp[i] == stamp:
+        others = mask & ~(1 << i)
+        if core.health.run_stamp[i] == stamp or others != core.witnesses[i]:
             core.reference[i] = now.prediction[i]
+            core.witnesses[i] = others
         elif now.evidence.repeats & now.usable & (1 << i):
+            isolated = now.verdict.suspects[i] and now.verdict.isolated
+            if now.verdict.alarm and not isolated:
+                continue
             share = subset.sensitivity[i]
             noise = core.settings.sensors.noise_std[i]
             spread = math.sqrt(
                 (noise * noise + step * step / 12.0) / (share if share > 0 else 0.5)
             )
-            moved = (
-                abs(now.prediction[i] - core.reference[i])
-                > LEAST_MOTION * spread + step
-            )
-            isolated = now.verdict.suspects[i] and now.verdict.isolated
-            if moved and (isolated or not now.verdict.alarm):
+            if has_moved(core, subsets[others], others, i, LEAST_MOTION * spread, step):
                 stuck |= 1 << i
                 core.health.stuck[i] += 1
     return stuck

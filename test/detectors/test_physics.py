@@ -1,0 +1,80 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Physics of healthy gyros is no fault, and faults beside it are found all the same."""
+
+import numpy as np
+import pytest
+
+from fdi_ros import Block, Config, Pipeline
+from fdi_ros.monitor.output import ChannelState
+
+RATE = 100.0
+NOISE = 0.003
+NAMES = ("imu_1", "imu_2", "imu_3")
+
+
+def three_units(**settings):
+    changes = {name.replace("__", "."): value for name, value in settings.items()}
+    return Pipeline.from_config(
+        Config.from_parameters(
+            {
+                "input": "imus",
+                "sample_rate": RATE,
+                "imus.topics": tuple(f"{name}/data_raw" for name in NAMES),
+                "imus.names": NAMES,
+                "noise.noise_std": (NOISE,),
+                "noise.scale_std": (0.01,),
+                "noise.timing_std": (0.0003,),
+                "bias.startup_bias_duration": 3.0,
+                **changes,
+            }
+        )
+    )
+
+
+def flight(seed, seconds, size=1.0):
+    """Times (N,), body rate (N, 3) at rest for 6 s and then turning, and the noise of nine channels (N, 9)."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 1 / RATE)
+    begun = np.clip(t - 6.0, 0, 1)[:, None]
+    waves = np.sin(np.outer(t, rng.uniform(0.7, 2.0, 3)) + rng.uniform(0, 6, 3))
+    return t, size * begun * waves, NOISE * rng.standard_normal((len(t), 9))
+
+
+def judge(pipeline, t, z):
+    pipeline.restart()
+    return pipeline.process(Block(np.round(1e9 * t).astype(np.int64) + 10**18, z))
+
+
+def first_named(output, t, channel):
+    """Seconds at which a channel is FAULTY; inf: never."""
+    rows = output.state[:, channel] == ChannelState.FAULTY
+    return t[rows.argmax()] if rows.any() else np.inf
+
+
+@pytest.mark.parametrize("detector", ["sequential", "guaranteed"])
+@pytest.mark.parametrize("kind", ["ramp", "bias"])
+def test_a_quiet_gyro_is_not_stuck_because_another_one_fails(detector, kind):
+    """At rest in steps of 1 mrad/s values repeat; in a turn a value that repeats is stuck."""
+    quiet = three_units(
+        detector__name=detector,
+        health__stuck_time=0.5,
+        health__stuck_time_at_rest=0.0,
+        bias__startup_bias_duration=0.0,
+    )
+    for seed in range(4):
+        t, rate, noise = flight(seed, 20.0)
+        noise *= 0.1
+        since = np.maximum(t - 10.0, 0.0)
+        fault = 0.02 * since if kind == "ramp" else 0.08 * (since > 0)
+        still = noise.copy()
+        still[:, seed % 9] += fault
+        faulty = judge(quiet, t, np.round(still, 3)).state == ChannelState.FAULTY
+        named = set(np.flatnonzero(faulty.any(axis=0)))
+        assert named <= {seed % 9}
+        assert named or detector == "guaranteed", "two faults of two may look like one"
+        z = np.round(np.tile(rate, 3) + noise, 3)
+        z[t > 12.0, 5] = z[t > 12.0, 5][0]
+        limit = 14.0 if detector == "sequential" else 20.0
+        assert 12.0 < first_named(judge(quiet, t, z), t, 5) < limit
