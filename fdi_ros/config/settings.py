@@ -581,7 +581,7 @@ MAVLINK = {
         choices=("off", "ardupilot"),
     ),
     "failover_limit": _of_node(
-        1, "at most so many IMUs are out of use by failover at a time", 1, 3
+        0, "most IMUs out of use by failover at a time; 0: all but one", 0, 2
     ),
     "failover_min_size": _of_node(
         0.03,

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 from fdi_ros.core.states import ChannelState
@@ -24,18 +25,17 @@ CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 DECAY = 0.5  #: Time constant with which the largest size of late decays, s.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
 VOTE = 2.0  #: In a set of several IMUs, the odd one must be so many ``min_size`` off.
-#: Difference from which an odd IMU is named after `QUICK`, rad/s. An autopilot whose primary
-#: gyro stands still is at 50 deg of tilt after 0.3 s.
-LARGE = 0.3
-QUICK = 40 * MS  #: Time for which a large difference must stand, ns.
-SIZED = (
-    4  #: Samples over which the size in a text is averaged: all from after the onset.
-)
-FAST = 2  #: Samples over which a large difference is averaged.
+LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
+#: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
+#: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
+CLEAR = 0.5
+QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
+FEWEST = 3  #: and so many samples.
+SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
-#: States of channels that are enough of a doubt where a difference is large.
-LARGE_DOUBTS = {
+#: States of channels that are a doubt.
+DOUBTS = {
     ChannelState.SUSPECT,
     ChannelState.AMBIGUOUS,
     ChannelState.FAULTY,
@@ -91,6 +91,16 @@ class RawComparison:
             while rows and rows[0][0] <= stamp - AVERAGED:
                 rows.popleft()
 
+    def least(self, unit: int, other: int, count: int, now: int) -> float:
+        """Return the smallest of the last count differences of two IMUs at time now, ns.
+
+        The size of a difference is its largest component, rad/s. NaN: fewer are known.
+        """
+        rows = list(self._pairs[min(unit, other), max(unit, other)])[-count:]
+        if len(rows) < count or now - rows[-1][0] > CURRENT:
+            return math.nan
+        return min(max(map(abs, difference)) for _, difference in rows)
+
     def between(
         self, unit: int, other: int, now: int, last: int = 0
     ) -> Difference | None:
@@ -133,6 +143,7 @@ class Evidence:
         self.raw = RawComparison(count, interval)
         self.imus: tuple[Imu, ...] = (Imu(),) * count
         self._min_size = min_size
+        self._fewest = max(FEWEST, QUICK // interval + 1)
         self._states: list[set[float]] = [set()] * count
         self._odd = -1  # the IMU that sets point to; -1: none
         self._odd_since = 0
@@ -147,9 +158,12 @@ class Evidence:
 
     def look(self, delivers: Sequence[bool], now: int) -> tuple[Imu, ...]:
         """Return the IMUs at time now, ns, given which of them deliver samples."""
-        sizes = self._sizes(delivers, now, 0)
-        fast = self._sizes(delivers, now, FAST)
-        odd, lasting = self._odd_one(sizes, fast)
+        apart: dict[tuple[int, int], float] = {}
+        for pair in combinations(range(len(delivers)), 2):
+            if delivers[pair[0]] and delivers[pair[1]]:
+                difference = self.raw.between(*pair, now)
+                apart[pair] = difference.size if difference else math.nan
+        odd, lasting = self._odd_one(apart, now)
         if odd != self._odd:
             self._odd = odd
             self._odd_since = now
@@ -157,9 +171,10 @@ class Evidence:
         self._looked = now
         imus = []
         for k, before in enumerate(self.imus):
+            own = [size for pair, size in apart.items() if k in pair]
             # One difference that is unknown may be the one in which the IMU agrees.
-            known = delivers[k] and sizes[k] and not any(map(math.isnan, sizes[k]))
-            size = min(sizes[k]) if known else math.nan
+            known = own and not any(map(math.isnan, own))
+            size = min(own) if known else math.nan
             agrees = size < self._min_size
             faulty = ChannelState.FAULTY in self._states[k]
             voted = k == odd and now - self._odd_since >= lasting
@@ -175,48 +190,34 @@ class Evidence:
         self.imus = tuple(imus)
         return self.imus
 
-    def _sizes(
-        self, delivers: Sequence[bool], now: int, last: int
-    ) -> list[list[float]]:
-        """Return the differences of each IMU to the others, rad/s; NaN: unknown."""
-        count = len(self.imus)
-        sizes: list[list[float]] = []
-        for k in range(count):
-            others = [j for j in range(count) if j != k and delivers[j]]
-            found = [self.raw.between(k, j, now, last) for j in others]
-            sizes.append([one.size if one else math.nan for one in found])
-        return sizes
-
     def _odd_one(
-        self, sizes: Sequence[Sequence[float]], fast: Sequence[Sequence[float]]
+        self, apart: Mapping[tuple[int, int], float], now: int
     ) -> tuple[int, int]:
         """Return the IMU that is bad without a name, and for how long that must stand, ns.
 
-        Of three IMUs that is the one that is off while the two others agree, if the
-        monitor doubts it too; else the only IMU with a set. -1: none.
+        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
+        or by less if the monitor doubts it too. Else it is the only IMU with a set. -1: none.
+
+        Parameters
+        ----------
+        apart
+            Difference of each pair of IMUs that deliver samples, rad/s; NaN: unknown.
         """
-        for k in range(3) if len(sizes) == 3 else ():
-            if self._is_odd(k, fast, LARGE, LARGE_DOUBTS):
-                return k, QUICK
-            if self._is_odd(k, sizes, VOTE * self._min_size, {ChannelState.AMBIGUOUS}):
+        for pair, alike in apart.items() if len(apart) == 3 else ():
+            (k,) = {0, 1, 2}.difference(pair)
+            size = min(size for other, size in apart.items() if other != pair)
+            if not alike < max(self._min_size, ALIKE * size):
+                continue
+            states = self._states[k]
+            limit = LARGE if states & DOUBTS else CLEAR
+            if all(self.raw.least(k, j, self._fewest, now) >= limit for j in pair):
+                return k, 0
+            if ChannelState.AMBIGUOUS in states and size >= VOTE * self._min_size:
                 return k, LASTING
         sets = [
             k for k, one in enumerate(self._states) if ChannelState.AMBIGUOUS in one
         ]
         return (sets[0] if len(sets) == 1 else -1), LASTING
-
-    def _is_odd(
-        self,
-        k: int,
-        sizes: Sequence[Sequence[float]],
-        least: float,
-        doubts: set[ChannelState],
-    ) -> bool:
-        """Return whether IMU k is off by `least`, rad/s, in doubt, and the others agree."""
-        size = _nearest(sizes[k])
-        alike = max(self._min_size, ALIKE * size)
-        agree = all(_nearest(sizes[j]) < alike for j in range(3) if j != k)
-        return agree and size >= least and bool(self._states[k] & doubts)
 
     def error(self, unit: int, now: int) -> tuple[str, float] | None:
         """Return the axis on which an IMU is off most, and by how much, rad/s.
@@ -240,9 +241,3 @@ class Evidence:
         if not abs(mean[axis]) > CERTAIN * std[axis]:
             return None
         return "xyz"[axis], mean[axis]
-
-
-def _nearest(sizes: Sequence[float]) -> float:
-    """Return the difference to the nearest of two other IMUs, rad/s; NaN: unknown."""
-    is_known = len(sizes) == 2 and not any(map(math.isnan, sizes))
-    return min(sizes) if is_known else math.nan

@@ -23,24 +23,25 @@ Rules, in this order at each tick
        or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
        is taken out in a flight. In flight that needs a live monitor. On the ground an
        IMU that the monitor still names stays out. An IMU that was out when the
-       autopilot started has no notch filters: only the operator or rule 5 puts it back.
-    2. In flight, the worst bad IMU becomes held if `objection` finds nothing against
-       it. At most ``limit`` IMUs are ours.
-    3. With the limit reached, a bad IMU `WORSE` times as bad as a held one takes its
-       place, if nothing but the limit is against it: the held one goes back first, the
-       bad one out once that is confirmed. A held IMU without samples is the least bad.
-    4. Orders are sent until the autopilot reports what is wanted. An order to take an
+       autopilot started has no notch filters: only the operator or rule 4 puts it back.
+    2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
+       most ``limit`` IMUs are ours, without a limit all but one.
+    3. Orders are sent until the autopilot reports what is wanted. An order to take an
        IMU out is sent only while rule 2 holds, so also each repetition needs a sound
        other IMU whose "in use" was reported within `FRESH`.
-    5. If the autopilot reports no IMU in use, all of ours go back.
+    4. If the autopilot reports no IMU in use, all of ours go back.
+
+No bad IMU goes back to make room for a worse one: while an IMU is out, its EKF lane
+runs on the first IMU in use, and would follow the one that came back.
 
 An IMU that somebody else has set is left alone until the vehicle is disarmed.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -54,7 +55,6 @@ STALE_ANSWER = NS // 2
 LASTING = NS  #: A change that we have not ordered counts if it stands so long, ns.
 PAUSE = 2 * NS  #: Time that an IMU must not be apart before it goes back, ns.
 LONGEST_PAUSE = 16 * NS  #: Bound of the doubled pause, ns.
-WORSE = 2.0  #: Ratio of sizes from which a bad IMU takes the place of a held one.
 RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an order, ns.
 QUICK_TRIES = 10
 SLOW_RETRY = NS  #: Time between further copies, ns.
@@ -81,18 +81,20 @@ class Condition(Enum):
     STUCK_OUT = "ordered back, but not reported in use"
     LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
     APART = "apart for long, while two others agree"
-    DISAGREE = "no two IMUs agree for long"
-    LANES = "two or more EKF lanes are not lost"
+    DISAGREE = "no two IMUs agree for long, and the monitor finds none OK"
+    REDUNDANT = "two or more IMUs in use, and EKF lanes that are not lost"
+    LAST_IMU = "one IMU in use, or none, because of our orders"
     LAST_LANE = "one EKF lane, or none, is not lost"
 
 
-REPEATED = {Condition.DANGER, Condition.LAST_LANE}  #: Announced every `REPEAT`.
+#: Announced every `REPEAT`.
+REPEATED = {Condition.DANGER, Condition.LAST_IMU, Condition.LAST_LANE}
 
 
 class PolicySettings(NamedTuple):
     """Settings of failover."""
 
-    limit: int = 1  #: Largest number of IMUs out of use by our orders.
+    limit: int = 0  #: Most IMUs out of use by our orders; 0: all but one.
     min_size: float = 0.03  #: Smallest error that is acted on, rad/s.
 
 
@@ -121,7 +123,8 @@ class View(NamedTuple):
     restore: bool = False  #: The operator asks now to put all of ours back.
 
 
-class Memory(NamedTuple):
+@dataclass
+class Memory:
     """What the policy remembers of one IMU; times in ns."""
 
     ours: bool = False
@@ -221,6 +224,7 @@ def objection(
 ) -> str:
     """Return what forbids an order to take IMU k out of use now; empty: nothing."""
     others = [j for j in range(len(memories)) if j != k]
+    limit = settings.limit or len(others)
     reserve = any(
         view.imus[j].use
         and now - view.imus[j].heard <= FRESH
@@ -235,7 +239,7 @@ def objection(
         (is_bad(view.imus[k], settings), "not bad"),
         (view.imus[k].use, "not reported in use"),
         (not memories[k].left_alone, "set by others"),
-        (sum(memories[j].ours for j in others) < settings.limit, "limit"),
+        (sum(memories[j].ours for j in others) < limit, "limit"),
         (reserve, "no sound IMU reported in use"),
     )
     return next((words for holds, words in checks if not holds), "")
@@ -245,11 +249,14 @@ def decide(
     state: PolicyState, view: View, now: int, settings: PolicySettings
 ) -> Decision:
     """Return orders, conditions to announce and the next state at time now, ns."""
-    rebooted = view.boots != state.boots
-    memories = [
-        _remember(memory, imu, view, now, rebooted, settings)
-        for memory, imu in zip(state.memories, view.imus, strict=True)
-    ]
+    memories = tuple(copy(memory) for memory in state.memories)
+    for memory, imu in zip(memories, view.imus, strict=True):
+        if view.boots != state.boots:
+            # Parameters outlive a boot. The next report shows how it began.
+            memory.seen = memory.against_since = None
+            memory.lane_angle = 0.0
+            memory.without_notch = memory.ours
+        _remember(memory, imu, view, now, settings)
     _note_lanes(memories, view, now - state.at, settings)
     _release(memories, view, now)
     _hold_worst(memories, view, now, settings)
@@ -257,28 +264,20 @@ def decide(
     for k, memory in enumerate(memories):
         if _is_due(k, memories, view, now, settings):
             orders.append(Order(k, not memory.held))
-            memories[k] = memory._replace(
-                ours=True,
-                tries=memory.tries + 1,
-                out_sent=now if memory.held else memory.out_sent,
-                back_sent=memory.back_sent if memory.held else now,
-            )
-    next_state = PolicyState(
-        tuple(memories),
-        state.announced,
-        view.boots,
-        now,
-        *_lanes(state, memories, view, now),
-    )
+            memory.ours = True
+            memory.tries += 1
+            if memory.held:
+                memory.out_sent = now
+            else:
+                memory.back_sent = now
+    lost, since = _lanes(state, memories, view, now)
     announced = dict(state.announced)
     words = []
-    for key, condition in _conditions(next_state, view, now):
-        last = announced.get(key)
-        is_new = condition != (
-            last.condition if last else _USUAL.get(key, Condition.FINE)
-        )
-        is_late = last and condition in REPEATED and now - last.at >= REPEAT
-        if is_new or is_late:
+    for key, condition in _conditions(memories, view, now, lost):
+        usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
+        last = announced.get(key, Announced(usual, now))
+        is_late = condition in REPEATED and now - last.at >= REPEAT
+        if condition != last.condition or is_late:
             announced[key] = Announced(condition, now)
             words.append((key, condition))
     doubtful = any(
@@ -291,76 +290,69 @@ def decide(
     return Decision(
         orders=tuple(orders),
         words=tuple(words),
-        state=next_state._replace(announced=announced),
+        state=PolicyState(memories, announced, view.boots, now, lost, since),
         hurry=(view.armed and doubtful) or unsettled,
     )
 
 
 def _remember(
-    memory: Memory,
-    imu: Imu,
-    view: View,
-    now: int,
-    rebooted: bool,
-    settings: PolicySettings,
-) -> Memory:
+    memory: Memory, imu: Imu, view: View, now: int, settings: PolicySettings
+) -> None:
     """Update a memory from the present view, before any decision."""
-    if rebooted:
-        # Parameters outlive a boot. The next report shows how it began.
-        memory = memory._replace(
-            seen=None, against_since=None, lane_angle=0.0, without_notch=memory.ours
-        )
     if view.restore and memory.ours:
-        memory = memory._replace(left_alone=True)
+        memory.left_alone = True
     if view.disarmed >= GROUNDED:
-        memory = memory._replace(left_alone=False, taken=0, lane_angle=0.0)
+        memory.left_alone = False
+        memory.taken = 0
+        memory.lane_angle = 0.0
     if imu.use is not None:
-        memory = _hear(memory, imu.use, imu.heard)
-    agreed = imu.agreed is not None and now - imu.agreed >= ACQUAINTED
-    bad_since = (memory.bad_since or now) if is_bad(imu, settings) else None
-    apart_since = (memory.apart_since or now) if is_apart(imu, settings) else None
-    return memory._replace(
-        acquainted=memory.acquainted or agreed,
-        bad_since=bad_since,
-        apart_since=apart_since,
-    )
+        _hear(memory, imu.use, imu.heard)
+    if imu.agreed is not None and now - imu.agreed >= ACQUAINTED:
+        memory.acquainted = True
+    memory.bad_since = (memory.bad_since or now) if is_bad(imu, settings) else None
+    is_off = is_apart(imu, settings)
+    memory.apart_since = (memory.apart_since or now) if is_off else None
 
 
-def _hear(memory: Memory, use: bool, heard: int) -> Memory:
+def _hear(memory: Memory, use: bool, heard: int) -> None:
     """Compare a report of INS_USE, received at heard, ns, with our orders."""
     ordered_at = max(memory.out_sent, memory.back_sent)
-    ordered = None if ordered_at == NEVER else memory.back_sent > memory.out_sent
-    is_first = memory.seen is None and ordered is None
-    if use not in (memory.seen, ordered) and not is_first:
+    # Without an order of this run, what is ours is out by the last run's.
+    ordered = memory.back_sent > memory.out_sent
+    is_first = memory.seen is None and ordered_at == NEVER
+    expected = (memory.seen,) if ordered_at == NEVER else (memory.seen, ordered)
+    if use not in expected and not is_first:
         since = heard if memory.against_since is None else memory.against_since
         if heard - ordered_at < STALE_ANSWER:
-            return memory
+            return
         if heard - since < LASTING:
-            return memory._replace(against_since=since)
-    memory = memory._replace(against_since=None)
+            memory.against_since = since
+            return
+    memory.against_since = None
     changed = memory.seen is not None and use != memory.seen
-    out_settled = heard - memory.out_sent >= SETTLED
+    settled = heard - memory.out_sent >= SETTLED
     if not memory.ours:
         by_others = changed
-    elif memory.held:
+    elif ordered:
+        # Out again, long after our last order to take it out.
+        by_others = not use and changed and settled
+    else:
         # Out before and now in use: not by us. Never reported out: our order was lost,
         # or, if this run sent none, somebody has put the IMU back.
         by_others = use and (changed or memory.out_sent == NEVER)
-    else:
-        # Out again, long after our last order to take it out.
-        by_others = not use and changed and out_settled
-    is_over = use and (not memory.held or memory.out_sent != NEVER) and out_settled
+    is_over = use and (not memory.held or memory.out_sent != NEVER) and settled
     if use and memory.seen is None and not memory.tries:
         # The first report since the boot: the IMU was in use from the start.
-        memory = memory._replace(without_notch=False)
+        memory.without_notch = False
+    memory.seen = use
     if by_others or (memory.ours and is_over):
-        left_alone = memory.left_alone or by_others
-        memory = memory._replace(ours=False, held=False, tries=0, left_alone=left_alone)
-    return memory._replace(seen=use)
+        memory.ours = memory.held = False
+        memory.tries = 0
+        memory.left_alone |= by_others
 
 
 def _note_lanes(
-    memories: list[Memory], view: View, elapsed: int, settings: PolicySettings
+    memories: Sequence[Memory], view: View, elapsed: int, settings: PolicySettings
 ) -> None:
     """Follow how far each EKF lane was misled in the time elapsed, ns.
 
@@ -370,69 +362,46 @@ def _note_lanes(
     seconds = min(max(elapsed, 0), NS) / NS
     for k, memory in enumerate(memories):
         source = view.imus[k if view.imus[k].use else first]
-        angle = memory.lane_angle
-        if view.armed and source.delivers and is_apart(source, settings):
-            angle += source.size * seconds
-        elif angle < LOST_LANE:
-            angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
-        memories[k] = memory._replace(lane_angle=angle)
+        # While two others are bad a healthy one is apart from both.
+        is_off = is_apart(source, settings) and (source.named or not source.ok)
+        if view.armed and source.delivers and is_off:
+            memory.lane_angle += source.size * seconds
+        elif memory.lane_angle < LOST_LANE:
+            memory.lane_angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
 
 
-def _release(memories: list[Memory], view: View, now: int) -> None:
-    """Rules 1 and 5: let go of IMUs that should be back in use."""
+def _release(memories: Sequence[Memory], view: View, now: int) -> None:
+    """Rules 1 and 4: let go of IMUs that should be back in use."""
     none_left = all(
         memory.ours or imu.use is False
         for memory, imu in zip(memories, view.imus, strict=True)
     )
-    for k, memory in enumerate(memories):
-        imu = view.imus[k]
+    for memory, imu in zip(memories, view.imus, strict=True):
         pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
         agrees = imu.agreed is not None and now - imu.agreed >= pause
         may = view.monitored if view.armed else not imu.named
-        if memory.held and (
-            view.restore
-            or none_left
-            or (agrees and may and imu.delivers and not memory.without_notch)
-        ):
-            memories[k] = memory._replace(held=False, tries=0)
+        heals = agrees and may and imu.delivers and not memory.without_notch
+        if memory.held and (view.restore or none_left or heals):
+            memory.held = False
+            memory.tries = 0
 
 
 def _hold_worst(
-    memories: list[Memory], view: View, now: int, settings: PolicySettings
+    memories: Sequence[Memory], view: View, now: int, settings: PolicySettings
 ) -> None:
-    """Rules 2 and 3: hold the worst bad IMU, or make room for it."""
+    """Rule 2: hold the worst bad IMU."""
     bad = [
         k
-        for k, imu in enumerate(view.imus)
-        if is_bad(imu, settings) and imu.use and not memories[k].held
+        for k, memory in enumerate(memories)
+        if is_bad(view.imus[k], settings)
+        and not memory.held
+        and not objection(k, memories, view, now, settings)
     ]
-    if not bad:
-        return
-    worst = max(bad, key=lambda k: view.imus[k].size)
-    why_not = objection(worst, memories, view, now, settings)
-    if not why_not:
-        memory = memories[worst]
-        memories[worst] = memory._replace(
-            held=True, tries=0, taken=memory.taken + (not memory.ours)
-        )
-    unlimited = settings._replace(limit=len(memories))
-    if why_not != "limit" or objection(worst, memories, view, now, unlimited):
-        return
-    held = [k for k, memory in enumerate(memories) if memory.held]
-    sizes = {k: _held_size(view.imus[k]) for k in held}
-    least = min(held, key=sizes.__getitem__, default=worst)
-    if view.imus[worst].size >= WORSE * sizes.get(least, math.inf):
-        memories[least] = memories[least]._replace(held=False, tries=0)
-
-
-def _held_size(imu: Imu) -> float:
-    """Return how bad an IMU is that is out of use, rad/s; unknown: infinite.
-
-    One without samples has size 0: the autopilot does not use it whatever INS_USE is.
-    """
-    if not imu.delivers:
-        return 0.0
-    return math.inf if math.isnan(imu.size) else imu.size
+    if bad:
+        memory = memories[max(bad, key=lambda k: view.imus[k].size)]
+        memory.taken += not memory.ours
+        memory.held = True
+        memory.tries = 0
 
 
 def _is_due(
@@ -442,8 +411,9 @@ def _is_due(
     now: int,
     settings: PolicySettings,
 ) -> bool:
-    """Rule 4: return whether an order for IMU k is to be sent now."""
-    memory, imu = memories[k], view.imus[k]
+    """Rule 3: return whether an order for IMU k is to be sent now."""
+    memory = memories[k]
+    imu = view.imus[k]
     last = memory.out_sent if memory.held else memory.back_sent
     pause = RETRY if memory.tries < QUICK_TRIES else SLOW_RETRY
     if not view.linked or (memory.tries and now - last < pause):
@@ -460,50 +430,48 @@ def _lanes(
     state: PolicyState, memories: Sequence[Memory], view: View, now: int
 ) -> tuple[bool, int | None]:
     """Return whether at most one EKF lane is left, and since when that is otherwise."""
-    pairs = list(zip(memories, view.imus, strict=True))
-    usable = sum(memory.ours or imu.use is True for memory, imu in pairs)
-    good = sum(
-        imu.use is True and memory.lane_angle < LOST_LANE for memory, imu in pairs
-    )
-    is_known = view.armed and all(imu.use is not None for imu in view.imus)
-    lost = good <= 1 < usable if is_known else state.lanes_lost
+    good = sum(memory.lane_angle < LOST_LANE for memory in memories)
+    lost = good <= 1 if view.armed else state.lanes_lost
     if lost == state.lanes_lost:
         return lost, None
     since = now if state.lanes_since is None else state.lanes_since
     return (lost, None) if now - since >= LASTING else (not lost, since)
 
 
-_USUAL = {VEHICLE: Condition.LANES}  #: Needs no announcement at the start.
-
-
 def _conditions(
-    state: PolicyState, view: View, now: int
+    memories: Sequence[Memory], view: View, now: int, lanes_lost: bool
 ) -> list[tuple[int, Condition]]:
-    """Return the condition of each IMU and of the vehicle."""
+    """Return the condition of each IMU and of the vehicle: the first that applies."""
     longest = [
         memory.apart_since is not None and now - memory.apart_since >= UNNAMED
-        for memory in state.memories
+        for memory in memories
     ]
-    disagree = all(longest)
+    # Where no two agree nobody is the odd one.
+    none_agree = all(longest)
     found = [
-        (k, _condition(memory, view.imus[k], view, now, longest[k] and not disagree))
-        for k, memory in enumerate(state.memories)
+        (k, _condition(memory, view.imus[k], view, now, longest[k] and not none_agree))
+        for k, memory in enumerate(memories)
     ]
-    lanes = Condition.LAST_LANE if state.lanes_lost else Condition.LANES
-    found.append((VEHICLE, Condition.DISAGREE if disagree else lanes))
+    left = sum(memory.seen is not False for memory in memories)
+    by_us = any(memory.ours and memory.seen is False for memory in memories)
+    checks = (
+        (view.armed and by_us and left <= 1, Condition.LAST_IMU),
+        (lanes_lost, Condition.LAST_LANE),
+        (none_agree and not any(imu.ok for imu in view.imus), Condition.DISAGREE),
+    )
+    found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
     return found
 
 
 def _condition(
     memory: Memory, imu: Imu, view: View, now: int, apart: bool
 ) -> Condition:
-    """Return the condition of one IMU: the first that applies."""
     since = (now if memory.bad_since is None else memory.bad_since) + REACTION
     is_out = memory.ours and memory.seen is False
-    in_use = memory.seen is not False
+    is_danger = view.armed and memory.seen is not False and now >= since
     asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
     checks = (
-        (view.armed and in_use and now >= since, Condition.DANGER),
+        (is_danger, Condition.DANGER),
         (asked_back, Condition.STUCK_OUT),
         (memory.without_notch, Condition.REBOOT),
         (is_out and not view.armed and imu.named, Condition.STAYS_OUT),
@@ -511,4 +479,9 @@ def _condition(
         (memory.left_alone, Condition.LEFT_ALONE),
         (apart, Condition.APART),
     )
-    return next((condition for holds, condition in checks if holds), Condition.FINE)
+    return _first(checks, Condition.FINE)
+
+
+def _first(checks: Sequence[tuple[bool, Condition]], usual: Condition) -> Condition:
+    """Return the first condition that holds, or else the usual one."""
+    return next((condition for holds, condition in checks if holds), usual)

@@ -29,7 +29,8 @@ WORDS = {
     Condition.LEFT_ALONE: Words(WARNING, "set by others, left alone"),
     Condition.APART: Words(WARNING, "differs from the others"),
     Condition.DISAGREE: Words(WARNING, "no two IMUs agree"),
-    Condition.LANES: Words(INFO, "two EKF lanes or more again"),
+    Condition.REDUNDANT: Words(INFO, "two IMUs and EKF lanes or more again"),
+    Condition.LAST_IMU: Words(CRITICAL, "one IMU left in use: land"),
     Condition.LAST_LANE: Words(CRITICAL, "one EKF lane left: land"),
 }
 

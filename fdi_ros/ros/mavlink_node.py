@@ -143,9 +143,9 @@ class AutopilotNode(CheckedNode):
                 f"failover is {params['failover']!r}, with {units} topics and messages {params['messages']!r}, expected"
                 f" input: imus, 2 to {len(INS_USE)} imus.topics, and messages: scaled"
             )
-        if not 1 <= params["failover_limit"] < units:
+        if params["failover_limit"] >= units:
             raise ConfigError(
-                f"failover_limit is {params['failover_limit']}, expected 1 to {units - 1}"
+                f"failover_limit is {params['failover_limit']}, expected 0 to {units - 1}"
             )
         path = Path(
             params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")

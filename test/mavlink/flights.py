@@ -41,7 +41,7 @@ class Flight:
     def __init__(self, seed: int) -> None:
         self.random = random = np.random.default_rng(seed)
         self.count = int(random.integers(2, 4))
-        self.settings = PolicySettings(limit=int(random.integers(1, self.count)))
+        self.settings = PolicySettings(limit=int(random.integers(0, self.count)))
         self.loss = float(random.choice([0.0, 0.2, 0.4]))
         self.slow = int(random.choice([10, 100, 400])) * MS
         self.now = 100 * NS
@@ -56,7 +56,8 @@ class Flight:
         self.notch = [True for _ in every]
         self.armed = True
         self.boots = 0
-        self.without_any = 0  # time without an IMU in use, ns
+        self.is_without = False  # no IMU is in use
+        self.without_any = 0  # for how long, since the link was there, ns
         self.taken_by_others = -NS  # when a station last took an IMU out of use, ns
         # The policy's view.
         self.named = [False for _ in every]
@@ -210,20 +211,24 @@ class Flight:
             alike = abs(others[0] - others[1]) < self.settings.min_size
             assert self.error[k] >= self.settings.min_size or (alike and all(others))
             assert min(others) <= self.error[k] or (alike and all(others))
-        assert sum(one.ours for one in self.state.memories) <= self.settings.limit
+        limit = self.settings.limit or self.count - 1
+        assert sum(one.ours for one in self.state.memories) <= limit
 
     def check_vehicle(self) -> None:
         """Check that our hand has not taken the last IMU out of use."""
         if any(self.use):
+            self.is_without = False
             self.without_any = 0
             return
-        if not self.without_any and OURS in self.by:
+        if not self.is_without and OURS in self.by:
             # Only a station that acts within the age of our reports can bring this about.
             trip = FRESH + LATE_ANSWER + 2 * self.slow + STEP
             assert self.now - self.taken_by_others <= trip, "the last one, by our hand"
             self.done["station within a round trip"] += 1
-        self.without_any += STEP
-        if OURS in self.by and self.linked and not self.loss:
+        self.is_without = True
+        # Without a link nothing can be put back: the time counts from its return.
+        self.without_any = self.without_any + STEP if self.linked else 0
+        if OURS in self.by and not self.loss:
             assert self.without_any <= 2 * NS, "none in use for long"
 
     def fly(self, seconds: float = 60.0) -> Counter[str]:

@@ -28,8 +28,15 @@ CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 DANGER = "faulty AND IN USE: land"
 
 
-@pytest.mark.parametrize("seeds", [range(25 * k, 25 * (k + 1)) for k in range(4)])
-def test_the_vehicle_never_loses_its_last_imu_by_our_hand(seeds: range) -> None:
+#: Flights that failed once: the report of an order to take an IMU out came after its
+#: release (493), the link fell silent (1170).
+ODD_SEEDS = (493, 1170)
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(25), range(25, 50), range(50, 75), [*range(75, 98), *ODD_SEEDS]]
+)
+def test_the_vehicle_never_loses_its_last_imu_by_our_hand(seeds: Sequence[int]) -> None:
     """By the truth of random flights; `python -m mavlink.flights 20000` for more."""
     done = sum((Flight(seed).fly() for seed in seeds), Counter())
     kinds = ("out of use", "in use", "DANGER", "LEFT_ALONE", "STAYS_OUT", "LAST_LANE")
@@ -43,7 +50,7 @@ class Monitored(Conversation):
         self,
         path: Path,
         *autopilots: Autopilot,
-        limit: int = 1,
+        limit: int = 0,
         min_size: float = 0.03,
         **settings,
     ) -> None:
@@ -156,14 +163,32 @@ def test_a_harmless_error_takes_no_slot(flying: Monitored) -> None:
     assert not any(DANGER in text for text in flying.texts)
 
 
-def test_a_worse_error_takes_the_slot_of_a_lesser_one(flying: Monitored) -> None:
-    flying.fault(2, 0.06, seconds=5.0)
+def test_two_bad_imus_are_both_out_and_the_last_one_stays(flying: Monitored) -> None:
+    """A bad IMU that goes back for a worse one misleads two EKF lanes: ground at 21 m/s."""
+    flying.fault(2, 0.3, seconds=4.0)
+    flying.fault(3, 1.0, seconds=8.0)
+    assert flying.in_use == [True, False, False]
+    assert [value for *_, value in flying.autopilots[0].sets].count(1.0) == 0
+    assert "one IMU left in use: land" in flying.texts
+    assert not any("lane" in text or "differs" in text for text in flying.texts)
+    flying.fault(1, 0.5, seconds=2.0)
+    assert flying.in_use == [True, False, False]
+    assert flying.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
+    flying.heal(1, 1.0)
+    flying.heal(3, 5.0)
     assert flying.in_use == [True, False, True]
-    flying.fault(1, 1.0, seconds=1.0)
-    assert flying.in_use == [False, True, True]
-    orders = [(name, value) for _, name, value in flying.autopilots[0].sets]
-    last = list(dict.fromkeys(orders))[-2:]
-    assert last == [("INS_USE2", 1.0), ("INS_USE", 0.0)]
+    assert "two IMUs and EKF lanes or more again" in flying.texts
+
+
+def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None:
+    autopilot = Autopilot("ardupilot")
+    flying = Monitored(tmp_path, autopilot, limit=1).run(10.0)
+    autopilot.armed = True
+    flying.run(3.0)
+    flying.fault(2, 0.3, seconds=4.0)
+    flying.fault(3, 1.0, seconds=4.0)
+    assert flying.in_use == [True, False, True]
+    assert "IMU 3 (imu_3) faulty AND IN USE: land" in flying.texts
 
 
 @pytest.mark.parametrize("size", [0.0, 0.02])
@@ -205,6 +230,26 @@ def test_a_large_error_of_a_unit_needs_no_name_but_a_doubt(
     assert (flying.autopilots[0].sets[0][0] - at) / NS <= 0.35
 
 
+def test_a_clear_error_does_not_wait_for_the_monitor(flying: Monitored) -> None:
+    """It excludes a spike for 0.2 s; three samples far off while two IMUs agree are none."""
+    at = flying.now
+    flying.fault(1, (1.0, -2.0, 0.5), [OK] * 3, seconds=0.2)
+    flying.heal(1, 5.0)
+    assert (flying.autopilots[0].sets[0][0] - at) / NS <= 0.15
+    assert flying.in_use == [True] * 3
+    flying.autopilots[0].sets.clear()
+    for seconds in (0.02, 0.04):
+        flying.fault(2, 3.0, [SUSPECT] * 3, seconds=seconds)
+        flying.heal(2, 1.0)
+    assert not flying.autopilots[0].sets
+
+
+def test_a_clear_error_while_the_others_differ_names_nobody(flying: Monitored) -> None:
+    flying.fault(1, (1.0, -2.0, 0.5), [OK] * 3)
+    flying.fault(2, 0.3, [OK] * 3, seconds=3.0)
+    assert not flying.autopilots[0].sets
+
+
 def test_two_imus_that_differ_are_no_name(tmp_path: Path) -> None:
     autopilot = Autopilot("ardupilot", units=2)
     talk = Monitored(tmp_path, autopilot).run(10.0)
@@ -215,8 +260,7 @@ def test_two_imus_that_differ_are_no_name(tmp_path: Path) -> None:
 
 
 def test_a_fault_whose_onset_nobody_saw_is_answered(flying: Monitored) -> None:
-    """The link is cut for 3 s at the onset; before that another IMU held the slot."""
-    flying.fault(2, 0.06, seconds=2.0)
+    """The link is cut for 3 s at the onset."""
     flying.cut = True
     flying.fault(1, 1.0, seconds=3.0)
     flying.cut = False
@@ -278,10 +322,10 @@ def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -
     flying.fault(1, 1.0, seconds=1.0)
     flying.heal(1, 15.0)
     assert not any("lane" in text for text in flying.texts)
-    flying.states[:] = [UNCHECKED] * 9
+    flying.autopilots[0].read_only.update(PARAMETERS)
     for imu in (1, 2):
-        flying.fault(imu, 2.5, [UNCHECKED] * 3, seconds=1.5)
-        flying.fault(imu, 0.0, [UNCHECKED] * 3, seconds=1.0)
+        flying.fault(imu, 2.5, seconds=1.5)
+        flying.heal(imu, 1.0)
     assert "one EKF lane left: land" in flying.texts
 
 
@@ -528,7 +572,7 @@ def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:
     assert "IMU 1 (imu_1) faulty AND IN USE: land" in talk.texts
 
 
-def test_an_imu_without_samples_gives_its_slot_away(flying: Monitored) -> None:
+def test_an_imu_without_samples_is_no_hindrance(flying: Monitored) -> None:
     autopilot = flying.autopilots[0]
     flying.fault(3, 0.2, seconds=2.0)
     autopilot.units = 2

@@ -203,7 +203,7 @@ def test_what_is_wrong_is_one_line() -> None:
         "-p failover:=px4": "failover is 'px4', expected one of: off, ardupilot",
         "-p failover:=off -p rate:=0.1": "rate is 0.1 Hz",
         "-p failover:=ardupilot": "expected input: imus, 2 to 3 imus.topics, and messages: scaled",
-        "-p failover:=ardupilot -p failover_limit:=2 -p input:=imus -p imus.topics:=[a,b]": "expected 1 to 1",
+        "-p failover:=ardupilot -p failover_limit:=2 -p input:=imus -p imus.topics:=[a,b]": "expected 0 to 1",
         "-p signing_key:=/nowhere/key -p rate:=100.0": "cannot read signing_key /nowhere/key",
     }
     assert_refused("mavlink_node", refused, "--ros-args")
