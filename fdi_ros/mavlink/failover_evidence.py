@@ -142,6 +142,8 @@ class Evidence:
         self.begun = 0  #: Since when it has sent them without a break, ns.
         self.raw = RawComparison(count, interval)
         self.imus: tuple[Imu, ...] = (Imu(),) * count
+        #: Raw difference of each IMU to the nearest other one now, rad/s; NaN: unknown.
+        self.apart = [math.nan] * count
         self._min_size = min_size
         self._fewest = max(FEWEST, QUICK // interval + 1)
         self._states: list[set[float]] = [set()] * count
@@ -158,7 +160,7 @@ class Evidence:
 
     def look(self, delivers: Sequence[bool], now: int) -> tuple[Imu, ...]:
         """Return the IMUs at time now, ns, given which of them deliver samples."""
-        apart: dict[tuple[int, int], float] = {}
+        apart: dict[tuple[int, int], float] = {}  # rad/s, by pair
         for pair in combinations(range(len(delivers)), 2):
             if delivers[pair[0]] and delivers[pair[1]]:
                 difference = self.raw.between(*pair, now)
@@ -175,6 +177,7 @@ class Evidence:
             # One difference that is unknown may be the one in which the IMU agrees.
             known = own and not any(map(math.isnan, own))
             size = min(own) if known else math.nan
+            self.apart[k] = size
             agrees = size < self._min_size
             faulty = ChannelState.FAULTY in self._states[k]
             voted = k == odd and now - self._odd_since >= lasting

@@ -14,7 +14,7 @@ monitor's state. What the autopilot uses is in the texts of failover.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fdi_ros.mavlink.link import Link
 from fdi_ros.mavlink.protocol import ENOUGH, MESSAGES, MS, NS, RESOLUTION, numbers
@@ -188,6 +188,9 @@ EVERY = NS  # between two texts, ns
 AT_ONCE = 5  # texts that may follow one another at once after a quiet time
 SETTLE = NS // 5  # what changes within so long is put together, ns
 SILENT = 3 * NS  # a monitor that reports nothing for so long is silent, ns
+STANDING = (
+    2 * NS
+)  # `NOTHING_SEEN` is announced if it stands so long, ns: one late unit is none
 GRAVE = 0.03  # rad/s; ArduCopter flies with a smaller error of a gyro
 FROZEN = "FROZEN"  # in place of the state of a channel that is not declared: its unit gives old values
 _STATES = {
@@ -215,6 +218,11 @@ def _format_whole(line: StatusLine) -> str:
     return NOTHING_SEEN if NOTHING_SEEN in line.message else ""
 
 
+def _fit(name: str, words: str) -> str:
+    """Return a text about a unit or channel; of a name that is too long, its end."""
+    return f"FDI: {name[-(LENGTH - len(f'FDI:  {words}')) :]} {words}"
+
+
 class Announcer:
     """Decides which texts are sent, and when, about channels in units of three.
 
@@ -222,12 +230,16 @@ class Announcer:
     ----------
     channels
         Names of the channels; reports on others are ignored.
-    brief
-        Failover sends texts of its own: sets and good news stay in the diagnostics.
+    apart
+        Beside failover, which sends texts of its own: by how much the raw rate of a unit,
+        from 0, differs from every other one now, rad/s; NaN: unknown. Sets and good news
+        stay in the diagnostics then, and a name waits while the raw rates contradict it.
     """
 
-    def __init__(self, channels: Sequence[str], brief: bool = False) -> None:
-        self._brief = brief
+    def __init__(
+        self, channels: Sequence[str], apart: Callable[[int], float] | None = None
+    ) -> None:
+        self._raw_apart = apart
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
         self._now: dict[str, tuple[str, str]] = {
             **dict.fromkeys(channels, ("OK", "")),
@@ -242,6 +254,7 @@ class Announcer:
         self._changed: int | None = (
             None  # when the first of what has changed since the last texts did, ns
         )
+        self._nothing_since: int | None = None
         self._tokens, self._filled = float(AT_ONCE), 0
 
     def hear(self, lines: Sequence[StatusLine], now: int) -> None:
@@ -252,7 +265,11 @@ class Announcer:
             if line.value("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
                 state = FROZEN
             if line.name == WHOLE:
-                self._note(WHOLE, (_format_whole(line), ""), now)
+                words = _format_whole(line)
+                is_none = words == NOTHING_SEEN
+                self._nothing_since = (self._nothing_since or now) if is_none else None
+                if now - (self._nothing_since or 0) >= STANDING:
+                    self._note(WHOLE, (words, ""), now)
             elif line.name in self._apart and (state in _STATES or state in _FINE):
                 self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
                 error = abs(line.number("estimated error (rad/s)"))
@@ -275,16 +292,28 @@ class Announcer:
             return []
         self._changed = None
         alike = self._alike()
-        if self._brief:
+        if self._raw_apart is not None:
             quiet = [names for names in alike if self._now[names[0]][0] in _QUIET]
             self._said |= {name: self._now[name] for names in quiet for name in names}
-            alike = [names for names in alike if names not in quiet]
+            alike = [
+                names
+                for names in alike
+                if names not in quiet and not self._is_contradicted(names)
+            ]
         pending = [(self._text(names), names) for names in alike]
         # The gravest first.
         told = sorted(pending, key=lambda one: one[0][0])[: int(self._tokens)]
         self._tokens -= len(told)
         self._said |= {name: self._now[name] for _, names in told for name in names}
         return [text for text, _ in told]
+
+    def _is_contradicted(self, names: tuple[str, ...]) -> bool:
+        """Return whether the raw rates agree, though the monitor names channels of a unit."""
+        if self._raw_apart is None or self._now[names[0]][0] != "FAULTY":
+            return False
+        unit = next(k for k, one in enumerate(self._units) if names[0] in one)
+        error = max(map(self._errors.__getitem__, names))
+        return self._raw_apart(unit) < min(GRAVE, error / 2)
 
     def _alike(self) -> list[tuple[str, ...]]:
         """Return what has changed, together where it stands alike: the channels of a set, those of a whole unit."""
@@ -319,7 +348,7 @@ class Announcer:
         if state == "FAULTY" and max(map(self._errors.__getitem__, names)) < GRAVE:
             severity = WARNING
         who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
-        return severity, f"FDI: {who} {words}"[:LENGTH]
+        return severity, _fit(who, words)
 
     def _set_text(self, group: str) -> str:
         """Text for a set of channels, their names separated by commas; of whole units those are named."""
@@ -328,9 +357,9 @@ class Announcer:
             unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)
         ]
         if len(units) == 1 and len(names) == 3:
-            return f"FDI: {units[0]} faulty (axis cannot be told apart)"[:LENGTH]
+            return _fit(units[0], "faulty (axis cannot be told apart)")
         if len(names) == 1:
-            return f"FDI: {group} likely faulty"[:LENGTH]
+            return _fit(group, "likely faulty")
         texts = [
             f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
         ]

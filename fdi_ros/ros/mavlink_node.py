@@ -94,8 +94,6 @@ class AutopilotNode(CheckedNode):
         channels = config.channel_names or [
             f"{name}.{axis}" for name in names for axis in "xyz"
         ]
-        brief = params["failover"] != "off"
-        self._announcer = Announcer(channels, brief) if params["statustext"] else None
         self._sends_values: bool = params["named_values"]
         # In full, as it stands in diagnostics: without the first slash.
         self._monitor = expand_topic_name(
@@ -104,6 +102,8 @@ class AutopilotNode(CheckedNode):
         self._failover = (
             None if params["failover"] == "off" else self._make_failover(params)
         )
+        apart = self._failover and self._failover.evidence.apart.__getitem__
+        self._announcer = Announcer(channels, apart) if params["statustext"] else None
         if (
             self._announcer is not None
             or self._sends_values

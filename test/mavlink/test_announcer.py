@@ -3,6 +3,8 @@
 
 """What the ground station is told: declarations, soon, in few words, and never more than a link bears."""
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,7 +26,12 @@ BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz
 
 
 def report(
-    name: str, state: str, group: str = "", apart: str = "", repeats: str = ""
+    name: str,
+    state: str,
+    group: str = "",
+    apart: str = "",
+    repeats: str = "",
+    error: str = "",
 ) -> StatusLine:
     """What a monitor reports of a channel."""
     values = {
@@ -32,6 +39,7 @@ def report(
         "one of": group,
         "apart (rad/s)": apart,
         "repeats for (s)": repeats,
+        "estimated error (rad/s)": error,
     }
     return StatusLine(Level.OK, name, "", values=tuple(values.items()))
 
@@ -39,8 +47,8 @@ def report(
 class Ground:
     """A ground station that keeps what it is told, at 20 looks a second."""
 
-    def __init__(self, channels: list[str] = CHANNELS) -> None:
-        self.announcer, self.now = Announcer(channels), 100 * NS
+    def __init__(self, channels: list[str] = CHANNELS, apart=None) -> None:
+        self.announcer, self.now = Announcer(channels, apart), 100 * NS
         self.told: list[tuple[float, int, str]] = []
 
     def hear(self, *reports: StatusLine, wait: float = 1.0) -> list[tuple[int, str]]:
@@ -49,7 +57,7 @@ class Ground:
         for k in range(round(wait * 20)):
             self.now += NS // 20
             if k % 20 == 19:
-                self.announcer.hear([], self.now)
+                self.announcer.hear(reports, self.now)
             self.told += [
                 (self.now / NS, *text) for text in self.announcer.due(self.now)
             ]
@@ -161,6 +169,41 @@ def test_the_whole_is_told_too() -> None:
     assert ground.announcer.due(ground.now + 5 * NS) == [
         (CRITICAL, "FDI: the monitor is silent")
     ]
+
+
+def test_one_late_unit_is_no_loss_of_redundancy() -> None:
+    """The others could not be judged for 0.3 s in healthy flights, and before take-off."""
+    ground = Ground()
+    words = f"3 of 9 channels healthy; {NOTHING_SEEN}"
+    for _ in range(3):
+        ground.hear(StatusLine(Level.ERROR, WHOLE, words), wait=0.9)
+        ground.hear(StatusLine(Level.OK, WHOLE, "9 of 9 channels healthy"), wait=0.5)
+    assert ground.told == []
+
+
+def test_beside_failover_a_name_waits_while_the_raw_rates_contradict_it() -> None:
+    """A unit that was off is named for seconds after its fault is over."""
+    apart = [0.002, 0.3, math.nan]
+    ground = Ground(apart=apart.__getitem__)
+    assert ground.hear(report("imu_1.x", "FAULTY"), wait=5.0) == []
+    assert ground.hear(report("imu_1.x", "OK")) == []
+    assert ground.hear(report("imu_1.x", "FAULTY", error="0.3")) == []
+    for unit in (2, 3):
+        told = [(CRITICAL, f"FDI: imu_{unit}.y faulty")]
+        assert ground.hear(report(f"imu_{unit}.y", "FAULTY")) == told
+    apart[0] = 0.1
+    assert ground.hear() == [(CRITICAL, "FDI: imu_1.x faulty")]
+    apart[0] = 0.012
+    harmless = report("imu_1.z", "FAULTY", error="-0.012")
+    assert ground.hear(harmless) == [(WARNING, "FDI: imu_1.z faulty")]
+    assert ground.hear(*(report(name, "OK") for name in CHANNELS)) == []
+
+
+def test_of_a_name_that_is_too_long_the_end_is_kept() -> None:
+    channels = [f"the_imu_on_the_left_hand_side_of_the_nose.{axis}" for axis in "xyz"]
+    ((_, text),) = Ground(channels).hear(report(channels[0], "FAULTY"))
+    assert len(text) == LENGTH
+    assert text.endswith("_hand_side_of_the_nose.x faulty")
 
 
 STATES = ["OK", "SUSPECT", "FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED", "EXCLUDED"]
