@@ -102,7 +102,11 @@ class AutopilotNode(CheckedNode):
         self._failover = (
             None if params["failover"] == "off" else self._make_failover(params)
         )
-        apart = self._failover and self._failover.evidence.apart.__getitem__
+        apart = (
+            None
+            if self._failover is None
+            else self._failover.evidence.apart.__getitem__
+        )
         self._announcer = Announcer(channels, apart) if params["statustext"] else None
         if (
             self._announcer is not None
