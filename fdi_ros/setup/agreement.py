@@ -115,25 +115,25 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
         doubt = (
             ""
             if len(most) > 1
-            else " (or the other way round: nothing decides between two)"
+            else " (or the other one is wrong: two units cannot tell)"
         )
         true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
         shares = [
             _in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES
         ]
-        words = f"{name} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])}, against {others}{doubt}: mend its driver"
-        words += f" or mount, {mend}"
+        words = f"{name} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])}, unlike {others}{doubt}: correct its"
+        words += f" driver or mount, {mend}"
         if max(shares) < SAME:
-            words = f"{name} does not turn as {others} do ({max(*shares, 0.0):.0%} in common): its mount in the config"
-            words += f" is wrong, it is not on the same body, or its clock is off by seconds{doubt}"
+            words = f"{name} does not measure the rotation of {others} ({max(*shares, 0.0):.0%} shared): its mount"
+            words += f" in the config is wrong, it is not on the same body, or its clock is off by seconds{doubt}"
     elif 2 * len(most) > len(units):
-        words = f"{name} shows {np.median(ratio[odd, most]):.3g} times the rotation that {others} show: mend it {mend}"
+        words = f"{name} measures {np.median(ratio[odd, most]):.3g} times the rotation of {others}: repair it {mend}"
     else:
         low, high = (
             int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax)
         )
-        words = f"{' and '.join(names)} do not show one rotation, and nothing decides which is right: {names[high]}"
-        words += f" shows {ratio[high, low]:.3g} times that of {names[low]}; mend the one that is wrong"
+        words = f"{' and '.join(names)} measure different rotations, and the data cannot tell which is right:"
+        words += f" {names[high]} measures {ratio[high, low]:.3g} times the rotation of {names[low]}; repair one"
     raise DisagreementError(words)
 
 
@@ -182,13 +182,13 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
             nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])
         ]
         which = (
-            f", and nothing decides which of {', '.join(alike)} is right"
+            f", and the data cannot tell which of {', '.join(alike)} is right"
             if len(alike) > 1
             else ""
         )
         raise DisagreementError(
-            f"{name} does not follow the rotation: it shows {shows} the {seen:.2f} rad/s rms that the others see along"
-            f" its axis{which}; mend {'the one that is wrong' if which else 'it'} or name it in excluded_channels"
+            f"{name} does not follow the rotation: it measures {shows} the {seen:.2f} rad/s rms of the others along"
+            f" its axis{which}; repair {'the wrong one' if which else 'it'} or name it in excluded_channels"
         )
 
 
@@ -275,7 +275,7 @@ def _against(first: Array, unit: Array) -> Mount:
     """Return the mount of a unit with rates (W, 3) against the first one (W, 3), rad/s."""
     if len(unit) < LEAST_WINDOWS:
         return Mount(
-            f"NOT KNOWN: only {len(unit) * WINDOW:.0f} s in which every unit gives values"
+            f"NOT KNOWN: all units give values together for only {len(unit) * WINDOW:.0f} s"
         )
     most, second = np.sqrt(
         np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
@@ -285,7 +285,7 @@ def _against(first: Array, unit: Array) -> Mount:
     rotation, mirrored, uncertainty = find_turn(first, unit)
     if math.isinf(uncertainty):
         return Mount(
-            "NOT KNOWN: it and the first unit never turn about two axes together"
+            "NOT KNOWN: it and the first unit share no rotation about two axes"
         )
     power, square = (
         max(float((first**2).sum()), 1e-30),
@@ -295,14 +295,14 @@ def _against(first: Array, unit: Array) -> Mount:
     shared, error = 1.0 - missed, math.sqrt(float(np.mean(square)) * uncertainty)
     if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
         return Mount(
-            "NOT KNOWN: mirrored against the first unit",
+            "NOT KNOWN: mirrored relative to the first unit",
             shared,
             contradicts=True,
             mirrored=True,
         )
     # Most of the rotation then differs.
     if shared < 0.5:
-        words = f"NOT KNOWN: it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
+        words = f"NOT KNOWN: it does not measure the rotation of the first unit ({max(shared, 0.0):.0%} shared)"
         return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
@@ -326,7 +326,7 @@ def _against(first: Array, unit: Array) -> Mount:
     if error >= LARGEST_DOUBT:
         # The identity is the assumption of a starting config.
         words = f"NOT MEASURED, uncertain by {np.degrees(error):.0f} deg: vibration"
-        words += " hides the turns that would show it"
+        words += " masks the turns that would show it"
         return Mount(words, shared, np.eye(3), off, error)
     turn = "as the first" if (nearest == np.eye(3)).all() else f"turned: body {along}"
     words = f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"

@@ -380,7 +380,7 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
         first = next(span for span in clear if int(share.argmax()) in span.channels)
         raise DisagreementError(
             f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of the recording (from"
-            f" {first.start:.1f} s): faulty; mend it, cut it out with --start and --end, or name it in"
+            f" {first.start:.1f} s): faulty; repair it, leave this part out with --start and --end, or name it in"
             " excluded_channels"
         )
     return replace(data, z=z)

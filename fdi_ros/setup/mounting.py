@@ -183,11 +183,13 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     )
 
 
-RHO_TITLE = "|rho| of the normalised residuals: 1 cannot be told apart"
+RHO_TITLE = (
+    "Correlation |rho| of the normalised residuals; 1: faults cannot be told apart"
+)
 WAITING_HINT = (
-    "Smallest error, rad/s, found on average within a time. The bound of the best test, which knows channel and size"
-    " (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A samples"
-    " to a false alarm; noise taken as white. Of the channel that needs the largest; on the page a band for all."
+    "Smallest error, rad/s, that the best possible test finds within a time, on average. This test knows channel and"
+    " size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A"
+    " samples between false alarms, in white noise. For the channel with the largest value; the page has all channels."
 )
 
 
@@ -250,7 +252,7 @@ def _losses(
         ),
         Column("detectable", seen),
         Column("isolable", isolated),
-        Column("", words(seen), ("still seen",)),
+        Column("", words(seen), ("still detected",)),
         Column("", words(isolated), ("still isolated",)),
     ]
 
@@ -295,17 +297,17 @@ def pair_lines(result: Mounting) -> list[str]:
         why = f"faults of {names[i]} and {names[j]} look the same"
         if abs(cosine) > SAME_DIRECTION:
             why = f"{names[i]} and {names[j]} measure the same axis"
-        lines.append(f"{why}: a fault in either is seen, which one is not")
+        lines.append(f"{why}: a fault of either is detected, but not which one")
     hard = "{} and {} are hard to tell apart (|rho| {:.3f})"
     lines += [
         hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar
     ]
     blind = np.flatnonzero(~g.detectable).tolist()
     lines += [
-        f"a fault of {names[i]} is never seen: no other channel checks it"
+        f"a fault of {names[i]} is never detected: no other channel checks it"
         for i in blind
     ]
-    return lines or ["every single fault is seen and can be told from all others"]
+    return lines or ["every single fault can be detected and isolated"]
 
 
 def _double_words(result: Mounting) -> str:
@@ -315,7 +317,7 @@ def _double_words(result: Mounting) -> str:
         (loss for loss in result.double if np.isfinite(loss.gdop)),
         key=lambda loss: loss.gdop,
     )
-    words = f"two lost: {len(spanning)} of {len(result.double)} pairs leave a rate"
+    words = f"after the loss of two: {len(spanning)} of {len(result.double)} pairs leave a rate"
     if not spanning:
         return words
     best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
@@ -325,7 +327,7 @@ def _double_words(result: Mounting) -> str:
     )
     return (
         f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
-        f" of these, {seen} still see a third fault in some channel and {named} can isolate it in some"
+        f" with {seen} of them a third fault is detected on at least one channel, with {named} isolated on at least one"
     )
 
 
@@ -346,10 +348,10 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
 
 
 def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
-    """Smallest faults: seen in one sample, and found by waiting."""
+    """Smallest faults: detected in one sample, and over time."""
     hint = (
-        f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
-        f" {result.false_alarm_probability:.3g} a sample. Smaller faults need time: below."
+        f"Detected in one sample at rest with probability {DETECTION:.0%}, at a false-alarm probability of"
+        f" {result.false_alarm_probability:.3g} a sample. Smaller faults take longer, see below."
     )
     worst = np.array([sizes.max(axis=1) for sizes in result.waiting.values()])
     heads = [f"{wait:g} s" for wait in WAITS]
@@ -358,9 +360,13 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
         Column("", worst, heads, _size, unit.factor),
     ]
     return [
-        Section("Smallest faults seen", hint, told(_channels(result, unit), unit)),
         Section(
-            "Found by waiting",
+            "Smallest faults detected in one sample",
+            hint,
+            told(_channels(result, unit), unit),
+        ),
+        Section(
+            "Smallest faults detected over time",
             unit.named(WAITING_HINT),
             told(waited),
             [_waiting_figure(result, unit)],
@@ -410,7 +416,7 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
             f"({unit.name})^2, at rest.",
             _matrix("xyz", covariance, ".3e"),
         ),
-        Section("Look-alikes", RHO_TITLE, _matrix(names, rho, ".3f"), [drawn_rho]),
+        Section("Similar faults", RHO_TITLE, _matrix(names, rho, ".3f"), [drawn_rho]),
         Section("After each possible first fault", _double_words(result), losses),
     ]
 

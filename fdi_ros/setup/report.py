@@ -70,10 +70,10 @@ FLOOR, LEAST_NAMED = 0.1, 0.9
 LEAST_JUDGED = 0.5
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
-    "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"
-    " vibration adds is measured by the monitor as it goes."
+    "Standard deviation of one sample, over windows of 10 s, vibration included. noise_std (marked at the left) is the"
+    " level of the quietest windows; the monitor measures in flight what vibration adds."
 )
-BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
+BIAS_HINT = "Estimate over the recording, minus the mean of each channel. The common part is observable only at rest."
 
 
 def calibration_findings(
@@ -99,8 +99,8 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     (least, most), (low, high) = (
         (std.min() * factor, std.max() * factor) for std in (floor.std, usual)
     )
-    words = f"noise_std {least:.2g} to {most:.2g} {name}, from the quietest {floor.share:.0%} of the recording; usually"
-    words += f" {low:.2g} to {high:.2g}"
+    words = f"noise_std {least:.2g} to {most:.2g} {name}, in the quietest {floor.share:.0%} of the recording;"
+    words += f" median with vibration {low:.2g} to {high:.2g}"
     largest = int(floor.std.argmax())
     yield Finding(
         Role.FOUND,
@@ -111,7 +111,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
         float(floor.error[largest]),
     )
     words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
-    words += "biases walk" if walk.value else "no walk of the biases shown, below"
+    words += "bias walk" if walk.value else "bias walk too small to measure, below"
     words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     for delay in result.delays:
@@ -128,20 +128,18 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
         )
 
 
-def _delay_words(delay: StampDelay, taken_off: bool) -> str:
-    """Describe the delay of stamps, and whether the config takes this delay off."""
+def _delay_words(delay: StampDelay, corrected: bool) -> str:
+    """Describe the delay of stamps, and whether the config corrects for this delay."""
     if abs(delay.value) < delay.error:
-        return (
-            f"delay against the first unit not measured (+-{1e3 * delay.error:.2g} ms)"
-        )
-    side = "late (measured earlier than stamped)"
+        return f"delay relative to the first unit: zero within +-{1e3 * delay.error:.2g} ms"
+    side = "late (measured before the stamp)"
     if delay.value < 0:
-        side = "early (measured later than stamped)"
-    taken = "taken off" if delay.shown else "not taken off: it may be none"
-    if not taken_off:
-        taken = "not taken off: one message"
+        side = "early (measured after the stamp)"
+    what = "corrected" if delay.shown else "not corrected: it may be zero"
+    if not corrected:
+        what = "not corrected: all come in one message"
     size = f"{1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms"
-    return f"stamps {size} {side} against the first unit, {taken}"
+    return f"stamps {size} {side} relative to the first unit, {what}"
 
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
@@ -149,12 +147,12 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
     found, share = result.estimate, result.estimate.floor.share
     if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
-        words = f"nowhere at rest: what all biases have in common looks like a rotation (+-{common * unit.factor:.2g}"
-        words += f" {unit.name}); noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s,"
+        words = f"never at rest: a bias common to all gyros looks like a rotation (+-{common * unit.factor:.2g}"
+        words += f" {unit.name}), and noise_std is from the quietest motion. Let the vehicle stand still for 10 s,"
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif share <= LEAST_SHARE:
-        words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
+        words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest gives a better value"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
     error, rms = result.axis_errors, np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
@@ -162,8 +160,8 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         along, about = (
             ("", "") if len(unmeasured) == 3 else (f" along {which}", f" about {which}")
         )
-        words = f"scale factors{along}: not measured (no turns{about} beyond what vibration explains); they stay near"
-        words += " those configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
+        words = f"scale factors{along}: not measured (no turns{about} larger than the vibration); the configured values"
+        words += " and their uncertainty are kept. Turn the vehicle back and forth at about 1 rad/s"
         yield Finding(
             Role.UNKNOWN,
             "scale factors",
@@ -178,8 +176,8 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
             f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})"
             for a in poor
         )
-        words = f"too little rotation about {turns} of {body_frame}: the axes stay near those configured there."
-        words += " Turn it back and forth about them, some 1 rad/s"
+        words = f"axes: too little rotation about {turns} of {body_frame}; the result stays near the configured axes."
+        words += " Turn the vehicle back and forth about these axes at about 1 rad/s"
         yield Finding(
             Role.UNKNOWN,
             "axes",
@@ -194,7 +192,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
             dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late)
         )
         worst = max(d.error for d in late)
-        words = f"delays of {', '.join(names)} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth"
+        words = f"delays of {', '.join(names)} are known only to {1e3 * worst:.1f} ms: turn back and forth faster"
         yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
 
 
@@ -206,7 +204,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
             f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s"
             for who, a, b in result.faults
         ]
-        words = f"the monitor declares channels in this very recording: {first_of(spans, 3, '; ')}"
+        words = f"the monitor declares a fault in this recording: {first_of(spans, 3, '; ')}"
         struck = sorted({i for span in result.faults for i in span.channels})
         yield Finding(
             Role.WARNING,
@@ -229,7 +227,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     noise = found.floor.std
     if noisy := much_noisier(noise, result.units):
         words = noisier_words(names, noise, result.units, unit.name, unit.factor)
-        words += " at rest: loose, badly isolated, of another make, or faulty"
+        words += " at rest: loosely mounted, poorly damped, of another type, or faulty"
         worst, beside = max(noisy, key=lambda one: noise[one[0]])
         who = [names[i] for i, _ in noisy]
         yield Finding(
@@ -238,14 +236,14 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
     for what, values, bound, form, factor in (
         (
-            "axes turned from their nominal ones",
+            "axes rotated from nominal",
             result.angle,
             LARGE_ANGLE,
             "{:.1f} deg",
             np.degrees(1.0),
         ),
         (
-            "scale factors off their nominal ones",
+            "scale factors off nominal",
             result.factor - 1.0,
             LARGE_SCALE,
             "{:+.1%}",
@@ -285,7 +283,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         value=rate,
     )
     if known := sum(mount.shown for mount in found.mounts[1:]):
-        words = f"mounts: {known} of {len(found.mounts) - 1} against {found.config.imu_names[0]}"
+        words = f"mounts: {known} of {len(found.mounts) - 1} measured relative to {found.config.imu_names[0]}"
         yield Finding(Role.FOUND, "mounts", words, value=known)
     if result is not None:
         yield from calibration_findings(result, found.config.body_frame, unit)
@@ -322,25 +320,23 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(warning, "agreement", found.refused, headline="DO NOT USE")
     elif found.calibration is None and not units:
         words = (
-            f"the axes of the array are not known (a cone is assumed): {found.refused}"
+            f"the axes of the array are unknown (a cone is assumed): {found.refused}"
         )
         yield Finding(warning, "axes", words, headline="DO NOT USE")
     elif tried.judged < LEAST_JUDGED:
         note = tried.note or "channels are missing"
-        words = (
-            f"only {tried.judged:.0%} of the samples of the proof are judged: {note}"
-        )
+        words = f"the monitor judges only {tried.judged:.0%} of the samples in the proof: {note}"
         yield Finding(
             warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
         )
     elif tried.declared:
-        words = f"the monitor declares {times_words(tried.declared)} on {proof.source}: a gyro is faulty there, or the"
-        words += " settings do not fit it"
+        words = f"the monitor declares {times_words(tried.declared)} in {proof.source}: a gyro is faulty there, or the"
+        words += " settings are wrong"
         yield Finding(
             warning, "declared", words, list(tried.declared), headline="DO NOT USE"
         )
     elif found.kept:
-        words = f"on {proof.source}, {found.kept}; the settings before are written"
+        words = f"in {proof.source} {found.kept}; the previous settings are written"
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
         yield _usable(found, tried, unit)
@@ -357,17 +353,17 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
     words = f"no false alarm in {found.proof.source}{unused}."
     isolated, biases = tried.isolated_of
     if not found.mounting.losses[0].isolable:
-        words += " A fault is detected, but not the channel that has it."
+        words += " A fault is detected, but its channel cannot be identified."
         return Finding(Role.WORTH, "proof", words, headline="USABLE")
     if not biases:
         return Finding(Role.WORTH, "proof", words, headline="USABLE")
     low, high = (f"{size * unit.factor:.3g}" for size in (SIZES[0], SIZES[-1]))
     words += f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
-    words += f" {isolated} were found."
+    words += f" {isolated} were isolated."
     named, of = tried.isolated[FLOOR]
     if named < LEAST_NAMED * of:
         words += f" Of {of} with {FLOOR * unit.factor:.3g} {unit.name}, {named} were"
-        words += f" found, fewer than {LEAST_NAMED:.0%}: expect large faults alone."
+        words += f" isolated, fewer than {LEAST_NAMED:.0%}: expect to isolate large faults only."
         headline = "USABLE FOR LARGE FAULTS ONLY"
         return Finding(
             Role.WARNING, "proof", words, (), named, None, LEAST_NAMED * of, headline
@@ -384,24 +380,25 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(
             Role.UNKNOWN,
             "mounts",
-            f"mounts taken for the identity: {words}",
+            f"mount unknown, identity assumed: {words}",
             list(unshown),
         )
     if not found.chosen:
         return
     if source_of(found.config).units:
-        words = "where the vehicle's forward, left and up are: the body frame is that of the mounts, all units"
-        words += " together; turn all axes of the config if it is mounted otherwise"
+        first = found.config.imu_names[0]
+        words = f"the orientation of the body: {first} is assumed to be mounted along the body axes. If it is not,"
+        words += " rotate all axes in the config together"
     elif found.calibration is None:
-        words = "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
-        words += " worth anything before the true ones stand there (geometry.axes, or a preset)"
+        words = "the axes of the array: the config assumes a cone. The monitor's results are meaningless until you put"
+        words += " in the true axes (geometry.axes, or a preset)"
     else:
-        words = "the body frame: of an array only how its channels hang together is seen; the axes of its first three"
-        words += " are an assumption (a cone)"
+        words = "the body frame: a recording shows only the axes of an array relative to each other; those of the first"
+        words += " three channels are assumed (a cone)"
     yield Finding(Role.UNKNOWN, "body frame", words)
     turn_on = found.config.bias.turn_on_std
-    words = "the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
-    words += f" (bias.turn_on_std: {turn_on * unit.factor:.3g} {unit.name} is assumed)"
+    words = "the range of the gyros (health.max_rate: see the data sheet), and how much a bias changes from one start"
+    words += f" to the next (bias.turn_on_std: {turn_on * unit.factor:.3g} {unit.name} is assumed)"
     yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on)
     possible = [
         report
@@ -411,7 +408,7 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     if others := [
         report.topic.name for report in possible if report not in found.chosen
     ]:
-        words = f"topics that were not used, though they could be gyros: {', '.join(others)}"
+        words = f"topics that may be gyros, but were not used: {', '.join(others)}"
         yield Finding(Role.UNKNOWN, "topics", words, others)
 
 
@@ -489,7 +486,7 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
         Column(
             "",
             _beyond_error(result.angle, result.angle_error, degrees, ".3f"),
-            ("off nominal deg",),
+            ("from nominal deg",),
         ),
         Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
         Column("bias", found.bias),
@@ -502,14 +499,12 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
         Column(
             "noise_median",
             np.median(found.moment, axis=0),
-            ("usually rad/s",),
+            ("median rad/s",),
             ".5f",
             rate,
         ),
         Column("noise_largest", found.moment.max(axis=0)),
-        Column(
-            "not_used", lost, ("not used",), lambda counts: str(sum(counts.values()))
-        ),
+        Column("not_used", lost, ("lost",), lambda counts: str(sum(counts.values()))),
     ]
 
 
@@ -539,7 +534,7 @@ def _mounts(found: SetupResult) -> list[Column]:
         ),
         Column("off_rad", [mount.off for mount in mounts]),
         Column("", [mount.words for mount in mounts], ("mount",)),
-        Column("", shared, ("motion in common with the first",)),
+        Column("", shared, ("rotation shared with the first",)),
     ]
 
 
@@ -598,13 +593,13 @@ def _sections(
 ) -> tuple[list[str], list[Section]]:
     """Return the verdict with its basis, and the other sections."""
     proof, result, first = found.proof, found.calibration, verdict_of(findings)
-    hint = f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
-    hint += f" to be isolated within {WITHIN:g} s."
+    hint = f"Replay of {proof.source}: unchanged, then with a bias injected on each channel at {TIMES} times."
+    hint += f" Isolated: within {WITHIN:g} s."
     bag, config = shlex.quote(bag), shlex.quote(config)
     steps = [
-        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
-        f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
-        f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
+        f"fdi replay {bag} --config {config} --report replay.html   # the verdict on this recording",
+        f"fdi sweep {bag} --config {config} --report sweep.html     # which faults the monitor would find in it",
+        f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest, and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
     steps = [

@@ -124,15 +124,15 @@ class Proof:
         if before.baseline is None:
             return ""
         if after.baseline is None:
-            return f"it judges nothing: {after.note}"
+            return f"the new settings judge nothing: {after.note}"
         if new:
-            return f"it declares {times_words(new)}"
+            return f"the new settings declare {times_words(new)}"
         # Smaller losses occur at the edge of a gap.
         if before.judged - after.judged > 0.02:
-            return f"{after.judged:.0%} of the samples are judged instead of {before.judged:.0%}"
+            return f"the new settings judge {after.judged:.0%} of the samples instead of {before.judged:.0%}"
         # One fewer is chance.
         if tried_before == tried and was - now > 1:
-            return f"{now} of {tried} biases are isolated instead of {was}"
+            return f"the new settings isolate {now} of {tried} biases instead of {was}"
         return ""
 
 
@@ -211,14 +211,14 @@ class SetupResult(LearnedSettings):
         rested = (
             self.calibration is not None and self.calibration.estimate.rest_seconds > 0
         )
-        noise = "at rest" if rested else "the lower envelope in motion"
+        noise = "at rest" if rested else "in the quietest motion"
         guess = "measured" if calibrated else "a guess"
         remarks = {
             "sample_rate": "as recorded",
-            "imus.mounts": "see the page for what is known of them",
-            "imus.delays": "against the first: measured",
-            "geometry.axes": "mounts included: measured",
-            "noise.noise_std": f"{noise}: measured"
+            "imus.mounts": "the page states how well each is known",
+            "imus.delays": "measured, relative to the first unit",
+            "geometry.axes": "measured; mounts included",
+            "noise.noise_std": f"measured {noise}"
             if calibrated
             else "measured, roughly",
             "noise.scale_std": guess,
@@ -360,7 +360,7 @@ def _proved(
     learned, apart, source = (
         block,
         proof is not None,
-        "the same recording, too short to keep a part of it aside",
+        "the same recording (too short to hold a part back)",
     )
     if proof is not None:
         bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
@@ -431,7 +431,9 @@ def _with_mounts(
         if len(odd) > len(mounts) - 1 - len(odd):
             odd = [names[0]] if len(mounts) > 2 else [f"{names[0]} or {odd[0]}"]
         words = f"{' and '.join(odd)} is mirrored: one axis is reversed (a left turn reads as a right one), or two are"
-        words += " swapped; no mount does that: mend its driver, or leave its topic out"
+        words += (
+            " swapped; no mount does that: correct its driver, or leave its topic out"
+        )
         return replace(before, why=DisagreementError(words))
     lost = [
         k
@@ -449,7 +451,7 @@ def _with_mounts(
     )
     who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
     why = CalibrationError(
-        f"the recording does not show how {who} mounted against {names[0]}"
+        f"the recording does not show how {who} mounted relative to {names[0]}"
     )
     return replace(careful, why=why)
 

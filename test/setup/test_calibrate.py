@@ -114,7 +114,7 @@ def test_any_recording_gives_settings_with_errors_as_stated(kind, rate, change):
 def test_without_rest_the_common_part_of_the_biases_is_said_to_be_unknown():
     one, result = made(0, "flight alone")
     assert result.bias_std.min() > 0.005
-    assert "nowhere at rest" in said(result, Role.UNKNOWN)[0]
+    assert "never at rest" in said(result, Role.UNKNOWN)[0]
     # Between channels they are known all the same.
     apart = np.eye(9) - one.axes @ np.linalg.pinv(one.axes)
     assert np.abs(apart @ (result.estimate.bias - one.bias)).max() < 0.002
@@ -201,20 +201,20 @@ def test_contradictions_are_refused_and_named():
             calibrate(Block(stamp, change), config)
 
     refused(
-        r"imu_2 shows 5\d.\d times the rotation that imu_1 and imu_3 show",
+        r"imu_2 measures 5\d.\d times the rotation of imu_1 and imu_3",
         np.s_[3:6],
         57.3 * z[:, 3:6],
     )
     refused(
-        r"imu_2 shows a roll to the right as one to the left, against imu_1 and imu_3: mend",
+        r"imu_2 shows a roll to the right as one to the left, unlike imu_1 and imu_3: correct",
         3,
         -z[:, 3],
     )
-    swapped = "imu_3 has swapped axes: its channels x, y, z are y, z, x of its mount as configured, against imu_1 and"
+    swapped = "imu_3 has swapped axes: its channels x, y, z are y, z, x of its mount as configured, unlike imu_1 and"
     refused(swapped, [6, 7, 8], z[:, [7, 8, 6]])
     noise = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(z))
     refused("imu_2", 5, noise, one.config)
-    off = r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; mend it"
+    off = r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; repair it"
     late = np.s_[len(z) // 4 :]
     refused(off, 4, z[late, 4] + 0.1, rows=late)
     for words, block in (

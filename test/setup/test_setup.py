@@ -81,8 +81,8 @@ def test_a_mount_that_is_not_shown_is_not_known():
     for z, words in (
         (about_one, "too little about a second axis"),
         (noise, "it does not turn"),
-        (apart, "does not turn as the first unit does"),
-        (silent, "in which every unit gives values"),
+        (apart, "does not measure the rotation of the first unit"),
+        (silent, "all units give values together for only"),
     ):
         mount = find_mounts(ready(Block(unit.block.stamp, z)))[1]
         assert mount.rotation is None
@@ -95,9 +95,9 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
         "setup", CONE, "--output", file, "--json", tmp_path / "cone.json", "--degrees"
     )
     assert code == 0
-    assert "mounts: 1 of 1 against imu_1" in out
+    assert "mounts: 1 of 1 measured relative to imu_1" in out
     assert re.search(r"^new +nothing", out, re.MULTILINE)
-    assert "the body frame is that of the mounts" in out
+    assert "imu_1 is assumed to be mounted along the body axes" in out
     names = ("cone.yaml", "cone.html", "cone.json")
     assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
     config = Config.from_file(file)
@@ -114,7 +114,7 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     assert "geometry:" in page
     assert re.match(
         r"USABLE: no false alarm in the last 15 s \(not used for fitting\)\. Of 36 test faults added there"
-        r" \(1.72 to 17.2 deg/s\), \d+ were found\.",
+        r" \(1.72 to 17.2 deg/s\), \d+ were isolated\.",
         out,
     )
     assert "noise, deg/s" in page
@@ -276,10 +276,10 @@ def test_settings_are_never_worse_than_those_before():
     )
     nothing = Tried(None, "only three channels", {})
     for old, new, worse in (
-        (before, fewer, "28 of 36 biases are isolated instead of 30"),
+        (before, fewer, "the new settings isolate 28 of 36 biases instead of 30"),
         (before, chance, ""),
         (fewer, before, ""),
-        (before, nothing, "it judges nothing: only three channels"),
+        (before, nothing, "the new settings judge nothing: only three channels"),
         (nothing, before, ""),
     ):
         assert Proof("", True, 36.0, old, new).worse == worse
@@ -301,7 +301,7 @@ def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
     code, out, _ = fdi(*verb)
     assert code == 4
     assert out.startswith(
-        "NO BETTER THAN BEFORE: on the last 15 s, 28 of 54 biases are isolated"
+        "NO BETTER THAN BEFORE: in the last 15 s 28 of 54 biases are isolated"
     )
     assert "set: nothing" in out
     assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
@@ -333,17 +333,17 @@ def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi, tmp_path):
 UNSHOWN = {
     "short": ["NOT CALIBRATED: the recording is 6.0 s long", "mounts: 1 of 1"],
     "still": [
-        "mounts taken for the identity: imu_2 (NOT KNOWN: it does not turn",
+        "mount unknown, identity assumed: imu_2 (NOT KNOWN: it does not turn",
         "scale factors: not measured (no tu",
     ],
     "array": [
         "DO NOT USE: the axes of the array",
-        "those in the config are an assumption (a cone)",
+        "the config assumes a cone",
         r"/gy\n\x1b[2Jros",
     ],
     "factor": [
-        "DO NOT USE: imu_1 and imu_2 do not show one rotation",
-        "times that of imu_1",
+        "DO NOT USE: imu_1 and imu_2 measure different rotations",
+        "times the rotation of imu_1",
         "which faults can be isolated is not known",
     ],
 }
@@ -447,7 +447,7 @@ def test_settings_from_heavy_vibration_are_for_large_faults_only(
     first = out.splitlines()[0]
     assert code == 4
     assert first.startswith("USABLE FOR LARGE FAULTS ONLY: no false alarm in the last")
-    named = int(re.search(r"Of 18 with 0.1 rad/s, (\d+) were found", first)[1])
+    named = int(re.search(r"Of 18 with 0.1 rad/s, (\d+) were isolated", first)[1])
     assert named <= 16
     assert "mounts: 2 of 2" not in out
     pairs = re.findall(r"(-?[0-9.]+(?:e-?\d+)?) \+- ([0-9.]+(?:e-?\d+)?)", out)
