@@ -29,8 +29,8 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
-from fdi_ros.report.layout import RADIANS, Unit, first_of
-from fdi_ros.system.text import shown
+from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.system.text import first_of, shown
 
 _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]

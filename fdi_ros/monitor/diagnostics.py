@@ -17,7 +17,8 @@ from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.sources import source_of
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.monitor.output import Topic
-from fdi_ros.system.text import plus_minus, shown
+from fdi_ros.monitor.soundness import Concern, Word, live_word
+from fdi_ros.system.text import first_of, plus_minus, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
@@ -33,6 +34,7 @@ OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the cl
 CERTAIN = 4.0  # standard deviations from which a delay between units is reported
 LEAST_DELAY = 0.001
 """Smallest delay that is reported, s. Less is usual between drivers: 0.01 rad/s in turns of 10 rad/s^2."""
+MOST_CONCERNS = 3  # reasons not to call the whole healthy that its line lists
 NEARLY = 0.8  # share of ``bias.max_drift`` from which a drift is reported before the bias counts as a fault
 
 
@@ -136,19 +138,40 @@ def describe(
     silent: float | None = None,
     since: Sequence[int] | None = None,
     warning: str = "",
+    concerns: Sequence[Concern] = (),
 ) -> list[StatusLine]:
-    """Describe a monitor: the whole first, then every channel and every input. All names begin with the prefix.
+    """Describe a monitor: the whole first, then every channel and every input topic.
 
-    ``figures``: more key-values for the whole. ``silent``: time without samples, s,
-    which makes all STALE, or None while samples come. ``since``: stamps of the messages
-    that brought the channels into their states, ns, by default those of the samples.
-    ``warning``: further faults of the whole, in words.
+    Parameters
+    ----------
+    status
+        The monitor after its last sample.
+    prefix
+        What all names begin with.
+    inputs
+        Its input topics.
+    figures
+        More keys and values for the whole.
+    silent
+        Time without samples, s, which makes all lines STALE; None while samples come.
+    since
+        Stamps of the messages that brought the channels into their states, ns; None: those of
+        the samples.
+    warning
+        Further faults of the whole, in words; empty: none.
+    concerns
+        Reasons not to call channels or units healthy, as `RecentHealth` gives them.
     """
     worse = _find_worse(status)
-    level, message = _whole_message(status, worse)
+    level, message = _whole_message(status, worse, concerns)
+    for channel in status.channels:
+        if about := _words_about(channel.name, concerns):
+            worse[channel.name] = [*worse.get(channel.name, ()), *about]
     if warning:
         level, message = max(level, Level.WARN), f"{message}; {warning}"
-    rows = [(WHOLE, level, message, (*_whole_values(status), *figures))]
+    word = Word.CANNOT_TELL if silent is not None else live_word(status, concerns)
+    values = (("verdict", word.value), *_whole_values(status), *figures)
+    rows = [(WHOLE, level, message, values)]
     for k, channel in enumerate(status.channels):
         values = _channel_values(
             channel, status, k, since[k] if since else channel.since
@@ -161,7 +184,11 @@ def describe(
         words += f"; {warning}" if warning else ""
         rows = [(name, Level.STALE, words, values) for name, _, _, values in rows]
     rows += [
-        (f"{INPUT}{line.name}", *_input_message(line), _input_values(line))
+        (
+            f"{INPUT}{line.name}",
+            *_input_message(line, _words_about(line.name, concerns)),
+            _input_values(line),
+        )
         for line in inputs
     ]
     hardware = status.config.hardware_id
@@ -169,6 +196,11 @@ def describe(
         StatusLine(level, prefix + name, message, hardware, values)
         for name, level, message, values in rows
     ]
+
+
+def _words_about(name: str, concerns: Sequence[Concern]) -> list[str]:
+    """Return what the concerns say of a channel or unit."""
+    return [one.words for one in concerns if name in one.who]
 
 
 def degraded(status: Status) -> dict[str, str]:
@@ -222,15 +254,23 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
 
 
 def _whole_message(
-    status: Status, worse: Mapping[str, Sequence[str]]
+    status: Status, worse: Mapping[str, Sequence[str]], concerns: Sequence[Concern]
 ) -> tuple[Level, str]:
     total = len(status.channels)
-    healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
+    doubtful = {name for one in concerns for name in one.who}
+    for unit in status.units:
+        if unit.name in doubtful:
+            doubtful.update(unit.channels)
+    healthy = sum(
+        channel.state == ChannelState.OK and channel.name not in doubtful
+        for channel in status.channels
+    )
     about = [channel.name for channel in status.channels if channel.name in worse]
     words = [
         status.note,
         *_format_units(status, worse),
         f"degraded: {', '.join(about)}" if about else "",
+        first_of(list(map(str, concerns)), MOST_CONCERNS, "; ") if concerns else "",
     ]
     count, note = (
         f"{healthy} of {total} channels healthy",
@@ -238,7 +278,9 @@ def _whole_message(
     )
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
-    odd = worse or status.copies or any(unit.frozen for unit in status.units)
+    odd = (
+        worse or concerns or status.copies or any(unit.frozen for unit in status.units)
+    )
     complete = healthy == total and len(status.can_isolate) == total and not odd
     level = (
         Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
@@ -498,8 +540,9 @@ def frame_words(first: str, now: str) -> str:
     return f"frame_id was {shown(first)!r} in the first message and is {shown(now)!r}: another sensor?"
 
 
-def _input_message(line: InputStatus) -> tuple[Level, str]:
-    odd = [
+def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
+    odd = [*more]
+    odd += [
         f"{kind_in_words} ({line.recent[kind]})"
         for kind, kind_in_words in ODD.items()
         if line.recent.get(kind)

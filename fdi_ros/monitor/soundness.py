@@ -13,12 +13,16 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.noise import much_noisier
 from fdi_ros.system.text import listed
+
+if TYPE_CHECKING:
+    from fdi_ros.monitor.status import ChannelStatus, Status
 
 LEAST_CHECKED = 0.5
 """Share of its samples in which the others must have checked a healthy channel."""
@@ -81,7 +85,7 @@ class UnitHealth:
     slow_to_s: float | None = None
     """End of that time, s; None: no such time, or it lasts to the end."""
     slow_rate_hz: float | None = None
-    """Messages per second during that time, Hz."""
+    """Messages per second during that time, Hz. Live: lately."""
     delay_s: float | None = None
     """Delay of its stamps against the first unit, s; negative: early; None: not measured."""
     delay_std_s: float | None = None
@@ -177,14 +181,37 @@ def word_of(concerns: Iterable[Concern]) -> Word:
     return Word.LOOK if words else Word.HEALTHY
 
 
+def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
+    """Return the first word of the verdict on a monitor at its last sample."""
+    if any(map(is_declared, status.channels)):
+        return Word.FAULTY
+    far = any(map(status.is_far, status.channels))
+    if not status.has_rate or not status.can_detect or far:
+        return Word.CANNOT_TELL
+    states = {channel.state for channel in status.channels}
+    if ChannelState.UNCHECKED in states:
+        return Word.CANNOT_TELL
+    if states != {ChannelState.OK}:
+        return Word.LOOK
+    return word_of(concerns)
+
+
+def is_declared(channel: ChannelStatus) -> bool:
+    """Whether a channel is declared faulty, alone or in a set, or is silent."""
+    declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS, ChannelState.STALE)
+    return channel.state in declared
+
+
 def _is_slow(unit: UnitHealth) -> bool:
     return unit.delivered < LEAST_DELIVERED or unit.slow_from_s is not None
 
 
 def _slow_words(unit: UnitHealth) -> str:
     words = f"delivered {100 * unit.delivered:.0f} % of its messages"
-    if unit.slow_from_s is None:
+    if unit.slow_rate_hz is None:
         return words
+    if unit.slow_from_s is None:
+        return f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz)"
     until = "to the end" if unit.slow_to_s is None else f"to {unit.slow_to_s:.0f} s"
     return (
         f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz from"

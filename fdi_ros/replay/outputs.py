@@ -30,6 +30,7 @@ from fdi_ros.monitor.diagnostics import (
 )
 from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.replay.run import Sink
 from fdi_ros.system.files import LATEST
 
@@ -115,6 +116,7 @@ class OutputBag(Sink):
         self._before: list[tuple[Newest, dict[str, int]]] = [
             (Newest(), {}) for _ in config.topics
         ]
+        self._health = RecentHealth()
         self._shift = 0  # stamp of a sample minus that of its message, ns
         self._later = 0  # time of recording minus stamp, ns: what is written stands beside the message that brought it
 
@@ -155,11 +157,11 @@ class OutputBag(Sink):
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Write the regular diagnostics: once a second of the recording."""
         now = max(topic.log_time for topic in samples.newest)
-        self._diagnose(
-            pipeline,
-            now,
-            [self._input_status(k, samples, now) for k in range(len(samples.topics))],
-        )
+        inputs = [
+            self._input_status(k, samples, now) for k in range(len(samples.topics))
+        ]
+        self._health.add(pipeline.status(), inputs, now * 1e-9)
+        self._diagnose(pipeline, now, inputs)
 
     def _input_status(self, k: int, samples: Samples, now: int) -> InputStatus:
         """Describe a topic after the messages read so far, by the clock of the recorder."""
@@ -210,7 +212,8 @@ class OutputBag(Sink):
     def _diagnose(
         self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]
     ) -> None:
-        lines = describe(pipeline.status(), inputs=inputs)
+        concerns = self._health.concerns
+        lines = describe(pipeline.status(), inputs=inputs, concerns=concerns)
         self._writer.write(
             self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now)
         )

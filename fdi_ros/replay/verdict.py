@@ -15,8 +15,8 @@ from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import Word, word_of
 from fdi_ros.replay.episodes import MOST_TOLD, Episode, Size
 from fdi_ros.replay.summary import Judgement, ReplayVerdict
-from fdi_ros.report.layout import RADIANS, Unit, first_of
-from fdi_ros.system.text import listed
+from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.system.text import first_of, listed
 
 LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""

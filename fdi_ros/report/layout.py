@@ -160,15 +160,6 @@ def indented(lines: Iterable[str]) -> str:
     return "".join(f"  {line}\n" for line in lines)
 
 
-def first_of(
-    words: Sequence[str], most: int, between: str = ", ", last: str = " and"
-) -> str:
-    """Return the first of some words, and how many more there are."""
-    return between.join(words[:most]) + (
-        f"{last} {len(words) - most} more" if len(words) > most else ""
-    )
-
-
 def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
     """Return a number with a unit, or a dash where it is not known, or not finite."""
     return "-" if value is None or not math.isfinite(value) else f"{value:{form}}{unit}"

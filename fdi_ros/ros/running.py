@@ -42,6 +42,7 @@ from fdi_ros.monitor.receiver import (
     SilenceClock,
     Watchdog,
 )
+from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus, Status
 from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
@@ -302,6 +303,7 @@ class Running:
         )
         self._restarts = receiver.restarts
         self._bias_outcome = -1
+        self._health = RecentHealth()
         self._changed = [(0, 0)] * len(receiver.pipeline.channel_names)
         """By channel: stamps in ns of the sample that last changed its state, and of the message behind that sample."""
 
@@ -380,8 +382,14 @@ class Running:
             self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
             for topic in self.topics if is_open else ():
                 topic.check_sources(self._node, self.topics, log)
+            self._read_health(now)
             self._report()
             self._count_anew(now)
+
+    def _read_health(self, now: int) -> None:
+        """Read what channels and units delivered, once in the period of the reports."""
+        inputs = [topic.status(now) for topic in self.topics]
+        self._health.add(self.receiver.pipeline.status(), inputs, now * 1e-9)
 
     def _now(self) -> int:
         """Return the time by which silence is judged, ns."""
@@ -508,6 +516,7 @@ class Running:
                     )
                 ],
                 warning="; ".join(filter(None, self._warnings(status, clock))),
+                concerns=self._health.concerns,
             )
         self._diagnostics.publish(encode_diagnostics(lines, clock))
 

@@ -110,6 +110,12 @@ class Picture:
             else found
         )
 
+    @property
+    def verdict(self) -> str:
+        """Verdict on the whole: its word, and the message of the monitor."""
+        word = self.whole.value("verdict")
+        return f"{word}: {self.whole.message}" if word else self.whole.message
+
     def update_channels(self, channels: Mapping[str, StatusLine]) -> None:
         """Keep the present channels and remember which changed state."""
         moves: dict[tuple[Level, str], list[str]] = {}
@@ -318,7 +324,7 @@ class LineReport:
             self._said,
         )
         whole = picture.waiting or (
-            "" if picture.is_silent("diagnostics") else picture.whole.message
+            "" if picture.is_silent("diagnostics") else picture.verdict
         )
         self._caption, self._said = picture.caption, whole
         lines = [(now, picture.caption)] if picture.caption != caption else []
@@ -382,7 +388,7 @@ def draw(picture: Picture, width: int) -> Group:
         )
     if not picture.is_silent("diagnostics"):
         parts.append(
-            Text(shown(picture.whole.message, LINE), style=COLOURS[picture.whole.level])
+            Text(shown(picture.verdict, LINE), style=COLOURS[picture.whole.level])
         )
     if not picture.channels:
         return Group(*parts)

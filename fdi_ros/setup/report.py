@@ -33,7 +33,6 @@ from fdi_ros.report.layout import (
     drawn,
     escape,
     figures_of,
-    first_of,
     page,
     text_of,
     time_layout,
@@ -45,7 +44,7 @@ from fdi_ros.setup.calibrate import UNMEASURED, Calibration, StampDelay
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, Tried, times_words
-from fdi_ros.system.text import LINE, shown
+from fdi_ros.system.text import LINE, first_of, shown
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown

@@ -38,7 +38,6 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, parse_swept, sweep
-from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import (
@@ -50,7 +49,7 @@ from fdi_ros.setup.calibrate import (
     reference_channels,
 )
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import first_of, shown
 
 #: biases tried, rad/s
 SIZES = (0.03, 0.1, 0.3)

@@ -49,6 +49,15 @@ def listed(words: Sequence[str], last: str = "and") -> str:
     return f" {last} ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
 
 
+def first_of(
+    words: Sequence[str], most: int, between: str = ", ", last: str = " and"
+) -> str:
+    """Return the first of some words, and how many more there are."""
+    return between.join(words[:most]) + (
+        f"{last} {len(words) - most} more" if len(words) > most else ""
+    )
+
+
 def did_you_mean(word: str, choices: Sequence[str]) -> str:
     """Return a hint for a word that is none of the choices: the closest one, or all of them."""
     close = difflib.get_close_matches(word, choices, n=1)

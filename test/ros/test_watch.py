@@ -41,6 +41,7 @@ def channel(
 
 def whole(message: str, **more: str) -> StatusLine:
     figures = {
+        "verdict": "FAULTY",
         "statistic": "3.1",
         "threshold": "19.7",
         "protection level (rad/s)": "0.01 0.02 0.03",
@@ -92,7 +93,7 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(
     lines = drawn(picture, width)
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
-    assert picture.whole.message in text
+    assert f"FAULTY: {picture.whole.message}" in text
     assert f"imu_2.y OK -> FAULTY: {WORDS}" in text
     assert "input imu_3: silent for 1.2 s" in text
     (row,) = [line for line in lines if line.startswith("imu_2.y")]
@@ -134,7 +135,7 @@ def test_each_change_is_reported_once_and_the_whole_when_it_is_new(
     said = [line.split("  ", 1)[1] for line in report.lines()]
     assert said[0] == "imu_1.x, imu_1.y  OK -> SUSPECT: disagrees"
     assert said[1].startswith(
-        "9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7"
+        "FAULTY: 9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7"
     )
     # More than is remembered: those that are.
     for _ in range(2 * REMEMBERED):

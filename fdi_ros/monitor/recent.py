@@ -1,0 +1,175 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Health of channels and units over the last minute of a running monitor.
+
+`RecentHealth` counts what a replay counts over a whole recording, and asks the same function
+for concerns. So diagnostics and `fdi watch` give the verdict that a replay of the last minute
+would give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.states import ChannelState
+from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.monitor.soundness import (
+    LEAST_DELIVERED,
+    ChannelHealth,
+    Concern,
+    UnitHealth,
+    concerns_of,
+    is_declared,
+)
+
+if TYPE_CHECKING:
+    from fdi_ros.monitor.diagnostics import InputStatus
+    from fdi_ros.monitor.status import Status
+
+READINGS = 60
+"""Readings that are kept, one a second."""
+LEAST_READINGS = 10
+"""Readings that a share needs, and over which the rate of a unit is measured."""
+LEAST_RESIDUALS = 30
+"""Residuals that a comparison of noise needs."""
+USUAL_QUANTILE = 0.9
+"""Quantile of the rates of a unit that is its usual rate."""
+MOST_RATES = 600
+"""Rates of a unit from which its usual rate is found; the oldest are forgotten."""
+
+_COUNTED = ("samples", "missing", "non-finite", "out of range", "spikes")
+_UNCHECKED = (ChannelState.UNCHECKED, ChannelState.STALE)
+
+
+class _Reading(NamedTuple):
+    """Counts of a monitor at one moment."""
+
+    at: float
+    """Time, s."""
+    counts: NDArray[np.int64]
+    """(5, n) counts of each channel, in the order of ``_COUNTED``."""
+    unchecked: Mask
+    """(n,) channels that no other channel checks."""
+    residual: Array
+    """(n,) residuals of the channels that are OK, rad/s; NaN for the others."""
+    received: Int
+    """(u,) messages of each input topic."""
+
+
+class RecentHealth:
+    """Health over the last minute, from a reading once a second."""
+
+    def __init__(self) -> None:
+        self._readings: deque[_Reading] = deque(maxlen=READINGS)
+        self._rates: deque[Array] = deque(maxlen=MOST_RATES)
+        self._concerns: list[Concern] = []
+
+    def add(self, status: Status, inputs: Sequence[InputStatus], at: float) -> None:
+        """Read the counts of a monitor at a time, s. Readings begin anew if time goes back."""
+        reading = _reading(status, inputs, at)
+        if self._readings and not at > self._readings[-1].at:
+            self._readings.clear()
+        self._readings.append(reading)
+        units = list(self._units(status, inputs))
+        self._concerns = concerns_of(list(self._channels(status)), units)
+
+    @property
+    def concerns(self) -> list[Concern]:
+        """Reasons not to call the monitored channels healthy, by the last reading."""
+        return self._concerns
+
+    def _channels(self, status: Status) -> Iterator[ChannelHealth]:
+        """Yield each channel that is in use and not declared faulty."""
+        first, last = self._readings[0], self._readings[-1]
+        samples, missing, non_finite, at_end, spikes = last.counts - first.counts
+        total = samples + missing
+        unchecked = np.mean([one.unchecked for one in self._readings], axis=0)
+        rms = self._residual_rms(status)
+        measured = len(self._readings) >= LEAST_READINGS
+        unit_of = {name: unit.name for unit in status.units for name in unit.channels}
+        for i, one in enumerate(status.channels):
+            if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
+                continue
+            # A stream that stands is reported as a whole.
+            delivered = (samples[i] - non_finite[i]) / total[i] if total[i] else 1.0
+            yield ChannelHealth(
+                name=one.name,
+                unit=unit_of.get(one.name, ""),
+                checked=1.0 - float(unchecked[i]) if measured else 1.0,
+                delivered=float(delivered) if measured else 1.0,
+                spikes=int(spikes[i]),
+                saturated_s=float(at_end[i]) / status.config.sample_rate,
+                residual_rms_rad_s=rms[i],
+            )
+
+    def _residual_rms(self, status: Status) -> list[float | None]:
+        """Return the root mean square of each channel's residual, rad/s; None: not compared.
+
+        While a fault is declared, nothing is compared: the fault disturbs the fused rate.
+        """
+        residuals = np.array([one.residual for one in self._readings])
+        enough = np.isfinite(residuals).sum(axis=0) >= LEAST_RESIDUALS
+        if any(map(is_declared, status.channels)) or not enough.any():
+            return [None] * len(status.channels)
+        square = np.nansum(residuals**2, axis=0) / np.isfinite(residuals).sum(axis=0)
+        return [
+            math.sqrt(value) if known else None
+            for value, known in zip(square.tolist(), enough, strict=True)
+        ]
+
+    def _units(
+        self, status: Status, inputs: Sequence[InputStatus]
+    ) -> Iterator[UnitHealth]:
+        """Yield how each input topic delivered, against its usual rate and the other topics."""
+        rate = self._rate(LEAST_READINGS)
+        if rate is None or not len(rate):
+            return
+        usual = np.quantile([*self._rates, rate], USUAL_QUANTILE, axis=0)
+        usual = np.maximum(usual, 1e-9)
+        # All topics lack what a busy computer lost.
+        best = float((rate / usual).max())
+        if best > 0.0 and (rate >= LEAST_DELIVERED * best * usual).all():
+            self._rates.append(rate)
+        mean = self._rate(READINGS)
+        mean = rate if mean is None else mean
+        shares = mean / usual / max(float((mean / usual).max()), 1e-9)
+        for line, share, own, normal in zip(inputs, shares, rate, usual, strict=True):
+            yield UnitHealth(
+                name=line.name,
+                topic=line.topic,
+                delivered=float(share),
+                rate_hz=float(normal),
+                slow_rate_hz=float(own),
+            )
+
+    def _rate(self, readings: int) -> Array | None:
+        """Return the messages of each topic per second over the last readings, Hz; None: too few."""
+        last = self._readings[-1]
+        if len(self._readings) < LEAST_READINGS:
+            return None
+        first = self._readings[-min(readings, len(self._readings))]
+        rate: Array = (last.received - first.received) / (last.at - first.at)
+        return rate
+
+
+def _reading(status: Status, inputs: Sequence[InputStatus], at: float) -> _Reading:
+    channels = status.channels
+    return _Reading(
+        at=at,
+        counts=np.array([[one.counts[kind] for one in channels] for kind in _COUNTED]),
+        unchecked=np.array([one.state in _UNCHECKED for one in channels]),
+        residual=np.array(
+            [
+                one.residual if one.state == ChannelState.OK else math.nan
+                for one in channels
+            ]
+        ),
+        received=np.array([line.received for line in inputs]),
+    )

@@ -1,0 +1,93 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Health of a running monitor: the verdict that a replay of the last minute would give."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from monitor.streams import RATE, parallel, stream, struck
+from numpy.typing import NDArray
+
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.recent import RecentHealth
+
+SECOND = round(RATE)
+
+
+def reports(
+    block: Block, received: NDArray[np.int64] | None = None
+) -> Iterator[dict[str, StatusLine]]:
+    """Yield the diagnostics of three units after each second of a stream.
+
+    ``received`` (seconds, 3): messages of each unit so far; None: one a sample.
+    """
+    pipeline, health = (
+        Pipeline(parallel(3, detector__name="sequential")),
+        RecentHealth(),
+    )
+    for k in range(len(block) // SECOND):
+        pipeline.process(block[k * SECOND : (k + 1) * SECOND])
+        counts = [SECOND * (k + 1)] * 3 if received is None else received[k].tolist()
+        inputs = [
+            InputStatus(f"imu_{u + 1}", f"/imu_{u + 1}", count, RATE, 0.01, True)
+            for u, count in enumerate(counts)
+        ]
+        health.add(pipeline.status(), inputs, float(k + 1))
+        lines = describe(pipeline.status(), "", inputs=inputs, concerns=health.concerns)
+        yield {line.name: line for line in lines}
+
+
+def healthy(seconds: int) -> Block:
+    return stream(Pipeline(parallel(3)).geometry, seconds * SECOND)
+
+
+def test_a_healthy_monitor_is_healthy_at_every_report():
+    for lines in reports(healthy(40)):
+        assert lines["monitor"].value("verdict") == "HEALTHY"
+        assert {line.level for line in lines.values()} == {Level.OK}
+
+
+def test_spikes_are_named_for_a_minute_and_forgotten():
+    block = healthy(90)
+    block.z[5 * SECOND : 20 * SECOND : SECOND, 4] += 5.0
+    *_, at_30 = list(reports(block[: 30 * SECOND]))
+    assert at_30["monitor"].value("verdict") == "LOOK"
+    assert "imu_2.y has 15 spikes of one sample" in at_30["monitor"].message
+    assert at_30["monitor"].message.startswith("8 of 9 channels healthy")
+    assert at_30["imu_2.y"].level == Level.WARN
+    *_, last = reports(block)
+    assert last["monitor"].value("verdict") == "HEALTHY"
+
+
+def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():
+    steps = np.full((700, 3), SECOND)
+    steps[30:, 1] = SECOND // 3
+    health, pipeline = RecentHealth(), Pipeline(parallel(3))
+    pipeline.process(healthy(2))
+    status = pipeline.status()
+    for k, counts in enumerate(np.cumsum(steps, axis=0).tolist()):
+        inputs = [
+            InputStatus(f"imu_{u}", f"/imu_{u}", count, RATE, 0.01, True)
+            for u, count in enumerate(counts)
+        ]
+        health.add(status, inputs, float(k))
+        assert not health.concerns or k > 30
+        assert health.concerns or k < 40
+    (one,) = health.concerns
+    assert str(one) == "imu_1 delivered 33 % of its messages (33 instead of 100 Hz)"
+
+
+def test_a_declared_fault_is_faulty_and_what_is_unchecked_cannot_be_told():
+    faults = ["channel=imu_2.y kind=bias size=0.3 start=3"]
+    names = Pipeline(parallel(3)).channel_names
+    *_, last = reports(struck(healthy(8), faults, names))
+    assert last["monitor"].value("verdict") == "FAULTY"
+    alone = healthy(8)
+    alone.z[3 * SECOND :, 3:] = np.nan
+    *_, last = reports(alone)
+    assert last["monitor"].value("verdict") == "FAULTY"
+    lines = describe(Pipeline(parallel(2)).status())
+    assert dict(lines[0].values)["verdict"] == "CANNOT TELL"
