@@ -59,12 +59,11 @@ class Observer(Watcher):
 
     def is_over(self) -> bool:
         """Look at what the monitor says now; return whether the flight is over."""
-        state = (
-            "now"
-            if self._now >= self._start
-            else f"to come {self.fault.start:g} s after the start"
+        begun = self._now >= self._start
+        state = "since" if begun else "to come at"
+        self.picture.caption = (
+            f"recorded flight; fault {state} {self.fault.start:g} s: {self.fault}"
         )
-        self.picture.caption = f"recorded flight; fault {state}: {self.fault}"
         for name, line in self.picture.channels.items():
             since = line.number("state since (stamp, s)")
             if name not in self.struck:
@@ -75,13 +74,16 @@ class Observer(Watcher):
 
     def summary(self) -> tuple[list[str], bool]:
         """Return lines that say what came of it, and whether the monitor did what it should."""
-        lines = [f"injected    {self.fault} (it is not in the recording)"]
-        lines += [
-            f"isolated    {name}, {self.delays[name]:.2f} s after its first faulty message"
-            if name in self.delays
-            else f"missed      {name} was not isolated"
-            for name in sorted(self.struck)
-        ]
+        start = self.fault.start
+        lines = [f"{start:.2f} s  the demo adds the fault: {self.fault}"]
+        for name in sorted(self.struck):
+            if name in self.delays:
+                at, after = start + self.delays[name], self.delays[name]
+                lines.append(
+                    f"{at:.2f} s  the monitor names {name}, {after:.2f} s later"
+                )
+            else:
+                lines.append(f"the monitor did not name {name}")
         in_set = {
             name
             for name, line in self.picture.channels.items()
@@ -89,9 +91,9 @@ class Observer(Watcher):
         }
         others = (self.others | in_set) - self.struck
         lines.append(
-            f"others      {', '.join(sorted(others))} declared too"
+            f"wrongly named: {', '.join(sorted(others))}"
             if others
-            else "others      none declared"
+            else "no healthy gyro was named"
         )
         return lines, self.delays.keys() >= self.struck and not others
 
@@ -130,6 +132,22 @@ def running(commands: dict[str, list[str]]) -> Iterator[Callable[[], None]]:
             nodes[name] = subprocess.Popen(command, stdout=log, stderr=log), log
             stack.callback(end, nodes[name][0])
         yield check
+
+
+def _introduction(
+    names: Sequence[str], struck: set[str], fault: Fault, seconds: float
+) -> str:
+    """Return what the demo shows, before anything happens."""
+    units = sorted({name.rpartition(".")[0] for name in names})
+    return (
+        f"This demo plays {seconds:.0f} s of a recorded flight ({BAG.relative_to(ROOT)}) to the\n"
+        f"monitor (fdi_node, ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}). It measures with {len(names)} gyros:"
+        f" {', '.join(units)}, three\naxes each. {fault.start:g} s after the start"
+        f" {', '.join(sorted(struck))} goes wrong: the demo adds\n    {fault}\n"
+        "The monitor should name that gyro, and no other. Below: its residual (how far each gyro\n"
+        "is from what the others measure), its state, and the evidence for a fault, which\n"
+        "names a gyro when it reaches the threshold.\n"
+    )
 
 
 def fly(
@@ -174,11 +192,7 @@ def fly(
             f"wait:={PATIENCE}",
         ],
     }
-    domain = os.environ["ROS_DOMAIN_ID"]
-    print(
-        f"{end - begin:.0f} s of {BAG.relative_to(ROOT)} to fdi_node, ROS_DOMAIN_ID {domain}",
-        flush=True,
-    )
+    print(_introduction(names, struck, fault, end - begin), flush=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         # One process compiles, and all find it done.

@@ -240,7 +240,12 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
         key=lambda child: natural_order(child.name),
     )
     if not paths:
-        raise BagError(f"{path} is a folder without .mcap, .db3 or .csv files")
+        logs = any(
+            child.is_file() and child.name.lower().endswith(LOG_SUFFIXES)
+            for child in path.iterdir()
+        )
+        more = ": name one of its flight logs, or run fdi fleet on it" if logs else ""
+        raise BagError(f"{path} is a folder without .mcap, .db3 or .csv files{more}")
     if len(paths) > FILES:
         damage.add(
             f"{len(paths)} files, expected at most {FILES}: the others were left out"

@@ -28,7 +28,7 @@ from fdi_ros.cli import STOPPED
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.system import BAGS, POOL, PROGRESS, require, resolve, shipped_files
-from fdi_ros.system.text import LINE, shown
+from fdi_ros.system.text import LINE, did_you_mean, shown
 
 # Verbs ----------------------------------------------------------------------------------------------------------------
 
@@ -192,11 +192,11 @@ VERBS = {
         (*BAGS, *PROGRESS),
     ),
     "inspect": Verb(
-        "say what is in a recording and print a starting config for it",
+        "say what is in a recording, and write a config to start from",
         ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
         {
             "bag": {},
-            "--output --write": takes_path("write the config to a file, too"),
+            "--output --write": takes_path("write the config to this file"),
             **RESULTS,
             "--degrees": {},
         },
@@ -446,7 +446,8 @@ def main(
 def _run(argv: Sequence[str] | None) -> int:
     """Run a verb and return its exit code."""
     parser = _parser()
-    given = parser.parse_args(argv)
+    given, unknown = parser.parse_known_args(argv)
+    _refuse(parser, given.verb, unknown)
     if given.verb is None:
         parser.print_help()
         return 0
@@ -525,6 +526,31 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, and end."""
         super().error(shown(message, LINE))
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a verb or a choice that is unknown, with the closest one."""
+        choices = tuple(action.choices or ())
+        if choices and value not in choices:
+            name = str(action.metavar or action.option_strings[0])
+            hint = did_you_mean(str(value), choices)
+            raise argparse.ArgumentError(None, f"no such {name}: {value!r}, {hint}")
+
+
+def _refuse(parser: argparse.ArgumentParser, verb: str, words: Sequence[str]) -> None:
+    """Refuse words that a verb does not take, with the closest option for the first."""
+    if not words:
+        return
+    unknown = next((word for word in words if word.startswith("-")), "")
+    if verb and unknown:
+        options = [
+            option
+            for names in VERBS[verb].arguments
+            for option in names.split()
+            if option.startswith("-")
+        ]
+        hint = did_you_mean(unknown.partition("=")[0], [*options, "--help"])
+        parser.error(f"fdi {verb} has no option {unknown!r}, {hint}")
+    parser.error(f"unrecognized arguments: {' '.join(words)}")
 
 
 class _PrintCompletion(argparse.Action):

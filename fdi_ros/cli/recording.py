@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def run_inspect(arguments: Namespace) -> int:
-    """Print what it is fit for, a table of the topics, and a config to start from."""
+    """Print what it is fit for and a table of the topics; write a config to start from."""
     outputs, unit = (
         Outputs(arguments, ("json", "output"), [arguments.bag]),
         unit_of(arguments.degrees),
@@ -44,9 +45,10 @@ def run_inspect(arguments: Namespace) -> int:
     config, refused = _starting_config(reports, arguments.bag)
     found = verdict_of(recording_findings(reports, refused, unit))
     text = f"{found.words}\n{recording_text(reports, arguments.bag)}"
-    text += topics_text(reports, damage, unit) + (
-        "" if config is None else f"\n{config}"
-    )
+    text += topics_text(reports, damage, unit)
+    if config is not None and arguments.output is None:
+        bag = shlex.quote(shown(arguments.bag))
+        text += f"\na config to start from: fdi inspect {bag} --output my_gyros.yaml\n"
     figures = recording_figures(reports, arguments.bag, damage)
     figures |= {
         **findings_figures(list(recording_findings(reports, refused))),

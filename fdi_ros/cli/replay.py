@@ -28,7 +28,7 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
-from fdi_ros.inspection.fitness import refuse_unfit
+from fdi_ros.inspection.fitness import not_configured, refuse_unfit
 from fdi_ros.inspection.starting_config import assumed_config
 from fdi_ros.mavlink.failover_replay import Change, failover_text
 from fdi_ros.model.geometry import Geometry
@@ -116,6 +116,9 @@ def run_replay(arguments: Namespace) -> int:
         words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
         words += f"note: no --config, so assumed: {assumed.words}\n"
+    else:
+        unused = not_configured(arguments.bag, config)
+        words += "".join(f"note: {line}\n" for line in unused)
     code = outputs.finish(words, severity=summary.verdict.severity)
     if arguments.check is not None:
         return _say_check(arguments, outputs, summary, unmet)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import logging
 import multiprocessing
@@ -52,6 +51,7 @@ from fdi_ros.setup.mounting import (
 )
 from fdi_ros.system import BAGS, shipped_files, there
 from fdi_ros.system.files import plain
+from fdi_ros.system.text import did_you_mean
 
 MADE = "diagnostics.yaml"  # the file that can be made for nodes
 _NODE_NAME = re.compile(
@@ -105,12 +105,7 @@ def run_shipped(arguments: Namespace) -> int:
         names = [path.name for path in files]
         files = [path for path in files if path.name == arguments.name]
         if not files:
-            close = difflib.get_close_matches(arguments.name, names, n=1)
-            hint = (
-                f"did you mean {close[0]!r}?"
-                if close
-                else f"expected one of: {', '.join(names)}"
-            )
+            hint = did_you_mean(arguments.name, names)
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
     outputs = Outputs(arguments, ("json",), files)
     if not arguments.node:

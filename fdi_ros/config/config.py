@@ -10,7 +10,6 @@ declared beside the field and appear in ``ros2 param describe``.
 
 from __future__ import annotations
 
-import difflib
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,7 +41,7 @@ from fdi_ros.config.settings import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.files import NAME
-from fdi_ros.system.text import html_table, shown
+from fdi_ros.system.text import did_you_mean, html_table, shown
 from fdi_ros.system.yaml_file import parse_yaml, read_yaml
 
 
@@ -207,15 +206,7 @@ PARAMETERS: dict[str, Field] = {
 
 def unknown_parameter(name: str) -> str:
     """Return the error line for an unknown parameter, with the most similar name."""
-    # Comparing very long names takes long and cannot succeed.
-    close = (
-        difflib.get_close_matches(name, PARAMETERS, n=1) if len(name) <= NAME else []
-    )
-    return f"unknown parameter {shown(name)!r}" + (
-        f", did you mean {close[0]!r}?"
-        if close
-        else f", expected one of: {', '.join(PARAMETERS)}"
-    )
+    return f"unknown parameter {shown(name)!r}, {did_you_mean(name, tuple(PARAMETERS))}"
 
 
 def check_lengths(config: Config, per: str, count: int) -> None:

@@ -13,6 +13,7 @@ import pkgutil
 from typing import TYPE_CHECKING, Any
 
 from fdi_ros.errors import DetectorError
+from fdi_ros.system.text import did_you_mean
 
 if TYPE_CHECKING:
     from fdi_ros.detectors.base import Detector
@@ -39,7 +40,7 @@ def detector_class(name: str) -> type[Detector]:
     """Class of a detector by name; `DetectorError` if there is none of that name lists those there are."""
     if name not in DETECTORS:
         raise DetectorError(
-            f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}"
+            f"unknown detector {name!r}, {did_you_mean(name, tuple(DETECTORS))}"
         )
     found: type[Detector] = pkgutil.resolve_name(f"{__name__}.{DETECTORS[name]}")
     return found

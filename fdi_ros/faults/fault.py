@@ -30,6 +30,7 @@ from fdi_ros.faults.kinds import (
     check_fields,
 )
 from fdi_ros.model.samples import Array, Block, Mask
+from fdi_ros.system.text import did_you_mean
 from fdi_ros.system.yaml_file import read_yaml
 
 
@@ -73,7 +74,7 @@ class Fault:
             ]
             if not found:
                 raise FaultError(
-                    f"fault on unknown channel {name!r}, expected one of: {', '.join(channel_names)}"
+                    f"fault on unknown channel {name!r}, {did_you_mean(name, channel_names)}"
                 )
             struck += [i for i in found if i not in struck]
         if self.kind.whole_unit and len(struck) != 3:
@@ -119,7 +120,7 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
     """
     if name not in FAULT_KINDS:
         raise FaultError(
-            f"unknown fault kind {name!r}, expected one of: {', '.join(FAULT_KINDS)}"
+            f"unknown fault kind {name!r}, {did_you_mean(name, tuple(FAULT_KINDS))}"
         )
     kind, given = (
         FAULT_KINDS[name],

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi_ros.bag.reader import Recording
 from fdi_ros.compiling.compiled import MAX_CHANNELS
 from fdi_ros.config.config import Config, is_plain_name
 from fdi_ros.core.sources import SOURCES
@@ -141,6 +142,19 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
     if words := one_clock(chosen):
         raise BagError(f"{bag} needs one clock: {words}")
     return chosen
+
+
+def not_configured(bag: Path, config: Config) -> list[str]:
+    """Return a line for each topic that carries gyros and is not in a config."""
+    configured = {name.lstrip("/") for name in config.topics}
+    with Recording(bag) as recording:
+        return [
+            f"{shown(topic.name)} carries gyros and is not in the config: it was not judged"
+            for topic in recording.topics
+            if topic.type == SOURCES[config.input].type
+            and topic.name.lstrip("/") not in configured
+            and topic.name.rpartition("/")[2] not in _OF_A_MONITOR
+        ]
 
 
 def _unusable(report: TopicReport) -> str:

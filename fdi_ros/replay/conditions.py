@@ -20,6 +20,7 @@ from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.replay.summary import Judgement
 from fdi_ros.replay.verdict import LEAST_JUDGED
 from fdi_ros.replay.words import unchecked_words
+from fdi_ros.system.text import did_you_mean
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
@@ -208,7 +209,7 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
             )
             if not meant:
                 raise ConfigError(
-                    f"--check: {text!r} names no channel, expected one of: {', '.join(names)}"
+                    f"--check: {text!r} names no channel, {did_you_mean(part, names)}"
                 )
             found.append(Condition(text, parts.pop(0).lower(), channels=meant))
             continue
@@ -228,7 +229,7 @@ def _on_quantity(part: str) -> Condition:
     name, sign, number = match[1], match[2] or "", match[3]
     if name not in _QUANTITIES:
         raise ConfigError(
-            f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(_QUANTITIES)}"
+            f"--check: {part!r} begins with {name!r}, {did_you_mean(name, tuple(_QUANTITIES))}"
         )
     if sign not in _QUANTITIES[name]:
         expected = " or ".join(

@@ -13,6 +13,8 @@ from datetime import datetime, timezone
 
 from fdi_ros.system.files import EARLIEST, LATEST
 
+#: choices that are listed beside the closest one
+MOST_CHOICES = 30
 #: characters of a text from a file, and of a whole line with such texts, that are shown
 WORD, LINE = (
     120,
@@ -59,11 +61,20 @@ def first_of(
 
 
 def did_you_mean(word: str, choices: Sequence[str]) -> str:
-    """Return a hint for a word that is none of the choices: the closest one, or all of them."""
-    close = difflib.get_close_matches(word, choices, n=1)
-    if close:
-        return f"did you mean {close[0]!r}?"
-    return f"expected one of: {', '.join(choices)}"
+    """Return a hint for a word that is none of the choices: the closest one, and a short list."""
+    # Comparing very long words takes long and cannot succeed.
+    close = difflib.get_close_matches(word, choices, n=1) if len(word) <= WORD else []
+    # Which other number was meant, nobody can guess.
+    other_number = close and _without_digits(word) == _without_digits(close[0])
+    hint = f"did you mean {close[0]!r}?" if close and not other_number else ""
+    if hint and len(choices) > MOST_CHOICES:
+        return hint
+    known = f"expected one of: {', '.join(choices) or 'none'}"
+    return f"{hint} {known[0].upper()}{known[1:]}" if hint else known
+
+
+def _without_digits(word: str) -> str:
+    return "".join(letter for letter in word if not letter.isdigit())
 
 
 def plus_minus(value: float, std: float) -> str:

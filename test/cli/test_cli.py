@@ -21,9 +21,12 @@ import pytest
 from bag import logs
 
 from fdi_ros.cli import command_line
+from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import progress
+from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import FAULT_KINDS
+from fdi_ros.inspection.fitness import not_configured
 from fdi_ros.signals import STOPPING
 from fdi_ros.system import shipped_files
 
@@ -449,6 +452,9 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ),
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
+        (f"{REPLAY} --detector sequental", "did you mean 'sequential'?"),
+        (f"{REPLAY} --fault 'channel=g1 kind=bais size=1'", "did you mean 'bias'?"),
+        (f"{REPLAY} --fault 'channel=g_1 kind=bias size=1'", "did you mean 'g1'?"),
         (f"{REPLAY} --detector magic", "unknown detector 'magic', expected one of"),
         (f"{REPLAY} --fault kind=bias", "fault needs channel"),
         (f"{REPLAY} --start 9 --end 3", "expected 0 <= start < end"),
@@ -468,7 +474,7 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ),
         (
             f"{REPLAY} --check 'false=0 dlay<1'",
-            "'dlay<1' begins with 'dlay', expected one of",
+            "'dlay<1' begins with 'dlay', did you mean 'delay'?",
         ),
         (
             f"{REPLAY} --check 'delay>1'",
@@ -511,6 +517,37 @@ def test_bad_input_is_one_line_and_exit_code_2(
         places[name.upper()].write_text(f"/**:\n  ros__parameters:\n    {settings}\n")
     monkeypatch.chdir(tmp_path)
     assert said in refused(*(places.get(word, word) for word in shlex.split(words)))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("replya x", "no such VERB: 'replya', did you mean 'replay'?"),
+        ("replay x --confg y", "has no option '--confg', did you mean '--config'?"),
+        ("fleet x --output y --calibrate eech", "did you mean 'each'?"),
+    ],
+)
+def test_a_mistyped_word_of_the_command_line_is_answered_by_the_closest(
+    words, said, capsys
+):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_folder_of_flight_logs_leads_to_fleet(refused, root, tmp_path):
+    shutil.copy(root / "bags" / "copter_crash.tlog", tmp_path)
+    assert "run fdi fleet on it" in refused("replay", tmp_path)
+
+
+def test_gyros_that_the_config_leaves_out_are_named(flight):
+    topics = ["/imu_1/data_raw", "/imu_2/data_raw"]
+    for configured, named in ((topics, 0), ([topics[0], "/other"], 1)):
+        parameters = {"input": "imus", "imus.topics": configured}
+        lines = not_configured(flight, Config.from_parameters(parameters))
+        assert len(lines) == named
+        assert all(line.startswith("/imu_2/data_raw carries gyros") for line in lines)
 
 
 @pytest.mark.parametrize("words", [["shipped"], ["--help"], ["replay", "--help"]])

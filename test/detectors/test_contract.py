@@ -535,7 +535,7 @@ def test_unknown_option_or_detector(name):
     ):
         create_detector(name, usual_geometry(name), CONSTANT, sensitivity=3)
     with pytest.raises(
-        DetectorError, match=rf"unknown detector '{name}s', expected one of: .*{name}"
+        DetectorError, match=rf"unknown detector '{name}s', did you mean '{name}'"
     ):
         create_detector(f"{name}s", usual_geometry(name), CONSTANT)
 
