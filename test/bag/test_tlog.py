@@ -116,7 +116,7 @@ def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path):
 LOG = telemetry(Autopilot("px4", rates=SCALED), seconds=3.0)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     places=st.lists(
         st.tuples(st.integers(0, len(LOG) - 1), st.binary(max_size=40)),

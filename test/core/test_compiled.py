@@ -75,7 +75,16 @@ def warm(started):
     return package, outcomes[0][0]
 
 
-def start(copy, **environment):
+WHERE = """
+import logging, sys
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+from fdi_ros.compiling.cache import folder
+print("kept in", folder())
+print("says nothing")
+"""
+
+
+def start(copy, script=SCRIPT, **environment):
     place = {
         "PYTHONPATH": str(copy),
         "HOME": str(copy.parent / "home"),
@@ -91,7 +100,7 @@ def start(copy, **environment):
         {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT},
     )
     return subprocess.Popen(
-        [sys.executable, "-B", "-c", SCRIPT], env=env, cwd=copy, text=True, **out
+        [sys.executable, "-B", "-c", script], env=env, cwd=copy, text=True, **out
     )
 
 
@@ -138,15 +147,16 @@ def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_writte
 
 
 def test_installation_that_cannot_be_written(copy):
+    """The results go to the home, without one to a temporary folder that nobody else can write."""
     # A file is where a folder would be, which fails for every user, root too.
     (copy / "fdi_ros" / "__pycache__").write_text("")
-    kept, _, output = outcome(start(copy))
-    assert kept.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
-    assert "compiled it" in output
+    home = outcome(start(copy, WHERE))[0]
+    assert home.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
     # Nor a home, whatever the umask.
     before = os.umask(0)
     try:
         kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+        assert "compiled it" in output
         assert "compiled it" not in outcome(start(copy, HOME="/proc/nothing"))[2]
     finally:
         os.umask(before)
@@ -157,7 +167,8 @@ def test_installation_that_cannot_be_written(copy):
         assert not one.stat().st_mode & 0o022, one
     # A folder that others can write may hold what they like: it is not used.
     kept.parent.chmod(0o777)
-    assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
+    other = outcome(start(copy, WHERE, HOME="/proc/nothing"))[0]
+    assert other.parent != kept.parent
 
 
 class Planted:
@@ -170,36 +181,53 @@ class Planted:
         return Path.touch, (self.mark,)
 
 
-@pytest.mark.parametrize(
-    "what", ["mine", "open to all", "a link", "a stranger's", "a stranger's folder"]
-)
-def test_code_that_somebody_else_may_have_put_there_is_not_run(warm, what):
+def plant(index, mark, what):
+    """Put there what is run where it is loaded, as somebody else could have."""
+    index.write_bytes(pickle.dumps(Planted(mark)))
+    if what == "open to all":
+        index.chmod(0o666)
+    if what == "a link":
+        index.symlink_to(index.rename(index.parent.parent / index.name))
+    if what == "a stranger's":
+        os.chown(index, 54321, 0)
+
+
+def skip_unless_root(what):
     if "stranger" in what and os.geteuid() != 0:
         pytest.skip("only root can give a file to another user")
+
+
+@pytest.mark.parametrize("what", ["mine", "open to all", "a link", "a stranger's"])
+def test_a_file_that_somebody_else_may_have_put_there_is_not_loaded(
+    what, tmp_path, said
+):
+    skip_unless_root(what)
+    inside, mark = tmp_path / "cache", tmp_path / "mark"
+    inside.mkdir()
+    _Kept(str(inside), "function", "stamp").save("key", "data")
+    (index,) = inside.glob("*.nbi")
+    plant(index, mark, what)
+    assert _Kept(str(inside), "function", "stamp").load("key") is None
+    # What this user has put there is run: that is how the others would be.
+    assert mark.exists() == (what == "mine")
+    assert any("is not used: " in line for line in said.messages) == (what != "mine")
+
+
+@pytest.mark.parametrize("what", ["open to all", "a stranger's folder"])
+def test_code_that_somebody_else_may_have_put_there_is_not_run(warm, what):
+    skip_unless_root(what)
     copy, made = warm
     mark = copy.parent / "mark"
     for index in made.rglob("*.nbi"):
-        index.write_bytes(pickle.dumps(Planted(mark)))
-        if what == "open to all":
-            index.chmod(0o666)
-        if what == "a link":
-            index.symlink_to(index.rename(copy.parent / index.name))
-        if what == "a stranger's":
-            os.chown(index, 54321, 0)
+        plant(index, mark, what)
     if what == "a stranger's folder":
         for folder in (made, made.parent):
             os.chown(folder, 54321, 0)
-    process = start(copy)
-    # What this user has put there is run: that is how the others would be.
-    if what == "mine":
-        process.communicate(timeout=300)
-        assert mark.exists()
-        return
-    kept, says, output = outcome(process)
+    kept, says, output = outcome(start(copy))
     assert not mark.exists()
     assert says == "0 0"
     assert "is not used: " in output
-    assert (kept == made) == (what != "a stranger's folder")
+    assert (kept == made) == (what == "open to all")
     if what == "open to all":
         # What it has compiled anew is its own.
         assert "is not used: " not in outcome(start(copy))[2]
