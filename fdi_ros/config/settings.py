@@ -569,7 +569,8 @@ MAVLINK = {
     "monitor": _of_node("fdi_node", "name of the monitor whose declarations are sent"),
     "statustext": _of_node(True, "send declarations as STATUSTEXT"),
     "named_values": _of_node(
-        False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"
+        False,
+        "send statistic, threshold and readiness as NAMED_VALUE_FLOAT fdi_stat, fdi_limit, fdi_ready",
     ),
     "signing_key": _of_node(
         "",

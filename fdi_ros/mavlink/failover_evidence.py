@@ -22,7 +22,8 @@ from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
 CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
-DECAY = 0.5  #: Time constant with which the largest size of late decays, s.
+DECAY = 0.5  #: Time constant with which the largest size of late decays, s,
+HEALED = NS // 2  #: until the IMU has agreed for this time, ns.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
 VOTE = 2.0  #: In a set of several IMUs, the odd one must be so many ``min_size`` off.
 LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
@@ -178,7 +179,9 @@ class Evidence:
             known = own and not any(map(math.isnan, own))
             size = min(own) if known else math.nan
             self.apart[k] = size
-            agrees = size < self._min_size
+            agreed = (before.agreed or now) if size < self._min_size else None
+            if before.size > size and (agreed is None or now - agreed < HEALED):
+                size = max(size, before.size * held)
             faulty = ChannelState.FAULTY in self._states[k]
             voted = k == odd and now - self._odd_since >= lasting
             imus.append(
@@ -186,8 +189,8 @@ class Evidence:
                     named=faulty or voted,
                     ok=self._states[k] == {ChannelState.OK},
                     delivers=delivers[k],
-                    size=max(size, before.size * held) if before.size > size else size,
-                    agreed=(before.agreed or now) if agrees else None,
+                    size=size,
+                    agreed=agreed,
                 )
             )
         self.imus = tuple(imus)

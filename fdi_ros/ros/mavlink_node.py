@@ -27,6 +27,7 @@ from fdi_ros.config.config import is_plain_name
 from fdi_ros.config.settings import MAVLINK
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.core.sources import ChannelsSource
+from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
@@ -276,6 +277,11 @@ class AutopilotNode(CheckedNode):
             for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
                 if not math.isnan(value := whole.number(key)):
                     self._vehicle.send_value(name, value, now)
+            is_sound = whole.level != Level.STALE and not any(
+                line.value("state") == ChannelState.FAULTY.name for line in lines
+            )
+            protects = failover is None or failover.status(now)[0] == Level.OK
+            self._vehicle.send_value("fdi_ready", float(is_sound and protects), now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
         topics = [

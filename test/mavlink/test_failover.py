@@ -250,6 +250,18 @@ def test_a_clear_error_while_the_others_differ_names_nobody(flying: Monitored) -
     assert not flying.autopilots[0].sets
 
 
+def test_an_imu_that_healed_while_the_link_was_cut_stays_in_use(
+    flying: Monitored,
+) -> None:
+    """It is still named, and its error was large: a second later nothing is done or said."""
+    flying.cut = True
+    flying.fault(1, 2.0, seconds=1.0)
+    flying.cut = False
+    flying.fault(1, 0.0, seconds=3.0)
+    assert not flying.autopilots[0].sets
+    assert not any(DANGER in text for text in flying.texts)
+
+
 def test_two_imus_that_differ_are_no_name(tmp_path: Path) -> None:
     autopilot = Autopilot("ardupilot", units=2)
     talk = Monitored(tmp_path, autopilot).run(10.0)

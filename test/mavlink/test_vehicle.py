@@ -21,6 +21,7 @@ from fdi_ros.mavlink.report import Reporter
 from mavlink.autopilots import NS, UTC, Autopilot, Conversation
 
 MS = 1_000_000
+ROOT = Path(__file__).parents[2]
 KEY = bytes(range(32))
 
 
@@ -359,3 +360,15 @@ def test_addresses_of_strangers_take_no_memory() -> None:
     assert len(talk.vehicle._parsers) <= 9
     talk.run(3.0)
     check_flight(talk)
+
+
+def test_the_script_of_the_docs_finds_name_and_value_in_a_message() -> None:
+    """A script of ArduPilot gets a message from its checksum on, then as it was sent."""
+    script = (ROOT / "docs" / "flight_stack.md").read_text()
+    sent = mavlink.MAVLink(None, 1, 191).named_value_float_encode(7, b"fdi_ready", 1.0)
+    data = b"??" + bytes(sent.pack(mavlink.MAVLink(None, 1, 191)))
+    first, last = map(int, re.search(r"message:sub\((\d+), (\d+)\)", script).groups())
+    at = int(re.search(r'unpack\("<f", message, (\d+)\)', script)[1])
+    assert data[first - 1 : last] == b"fdi_ready"
+    assert struct.unpack_from("<f", data, at - 1) == (1.0,)
+    assert int(re.search(r"NAMED_VALUE_FLOAT = (\d+)", script)[1]) == sent.id

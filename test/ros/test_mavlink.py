@@ -90,10 +90,12 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(
         assert abs(stamps_of(ears.imu[0])[-1] - now) < 30 * NS
         assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
         assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
+        assert wait(lambda: autopilot.values.get("fdi_ready") == 1.0), monitor.said()
         strike()
         told = (2, "FDI: imu_2.y faulty")
         assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
-        assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
+        assert wait(lambda: autopilot.values["fdi_ready"] == 0.0)
+        assert {"fdi_stat", "fdi_limit"} <= autopilot.values.keys()
         assert autopilot.values["fdi_limit"] > 0
         assert {command[0] for command in autopilot.commands} == {511}
 
