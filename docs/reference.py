@@ -81,6 +81,14 @@ WHEN = {
     "integrity.exposure": "Flights are shorter or longer than an hour.",
     "integrity.max_rate": "The vehicle turns faster or more slowly.",
     "integrity.max_acceleration": "As before.",
+    "accelerometers.enabled": "Accelerometers are not to be judged, or a unit without any is a fault.",
+    "accelerometers.noise_std": "Always: as measured in flight, vibration included.",
+    "accelerometers.scale_std": "The accelerometers are calibrated, or from the works.",
+    "accelerometers.bias_walk": "They warm up in flight.",
+    "accelerometers.turn_on_std": "They are calibrated, or from the works.",
+    "accelerometers.max_drift": "You know what a healthy bias may do.",
+    "accelerometers.max_acceleration": "Their range is another one.",
+    "accelerometers.positions": "The units are more than a few centimetres apart.",
 }
 """When one would change a parameter."""
 

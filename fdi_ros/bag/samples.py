@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
+from fdi_ros.monitor.accelerometers import varies
 from fdi_ros.monitor.building import build_geometry
 
 #: messages handed on together: enough that calls do not count, little enough for the
@@ -70,16 +72,18 @@ class Samples:
         recording.require(self.topics, self.source.type)
         self.alignment = Alignment(*self.source.alignment)
         first = self.source.channels_of(0, build_geometry(config).n)
-        self._width = first.stop - first.start  # values in a message
+        self._width = first.stop - first.start  # channels in a message
+        is_felt = config.has_units and config.accelerometers.enabled != "off"
+        self._values = 6 if is_felt else self._width  # read of a message
         columns = [
             ("topic", "i8"),
             ("log_time", "i8"),
             ("stamp", "i8"),
-            ("values", "f8", (self._width,)),
+            ("values", "f8", (self._values,)),
         ]
         self._row = np.dtype(columns)
         """Decoded message: index of the topic, times, ns (without a stamp the time of
-        recording), rates, rad/s.
+        recording), rates, rad/s, and accelerations, m/s^2.
         """
         self._span = (start, end)
         self._taps = taps
@@ -94,6 +98,9 @@ class Samples:
         end.
         """
         self.messages = 0  #: used so far
+        self.felt: tuple[int, ...] = ()
+        """Numbers of the units whose accelerometers are to be judged, by the messages of the
+        first block, as `fdi_ros.monitor.accelerometers.felt_units` finds them."""
         self.malformed = dict.fromkeys(
             self.topics, 0
         )  #: malformed messages of each topic
@@ -108,6 +115,8 @@ class Samples:
         `BagError` if no message can be used, or the rate contradicts the config.
         """
         for messages in self._portions():
+            if not self.messages:
+                self.felt = self._felt_in(messages)
             self.messages += len(messages)
             if self.period:
                 self._note_newest(messages)
@@ -121,6 +130,20 @@ class Samples:
         if self.source.stamped and len(rest := self.alignment.flush()):
             yield as_block(rest, len(self.topics))
         self._check_rate(None)
+
+    def _felt_in(self, messages: Rows) -> tuple[int, ...]:
+        if self._values == self._width:
+            return ()
+        units = range(len(self.topics))
+        of_units = [messages["values"][messages["topic"] == unit] for unit in units]
+        forces = [values[:, self._width :] for values in of_units]
+        if not any(map(varies, forces)):
+            return ()
+        return tuple(
+            unit
+            for unit, force in enumerate(forces)
+            if not len(force) or not np.isnan(force).all()
+        )
 
     def _check_rate(self, stamp: Int | None) -> None:
         """Collect stamps (k,), ns, and check the rate once enough arrived; None at the end."""
@@ -219,7 +242,7 @@ class Samples:
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages and those outside the span are left out."""
         decoded = self.source.decode(
-            batch.buffer, batch.offset, batch.length, self._width
+            batch.buffer, batch.offset, batch.length, self._values
         )
         stamp = decoded.stamp if self.source.stamped else batch.log_time
         keep = decoded.good
@@ -269,13 +292,22 @@ def read_block(
 
 
 def joined(blocks: Sequence[Block]) -> Block:
-    """Join consecutive blocks."""
-    received = [
-        np.ones(b.z.shape, dtype=bool) if b.received is None else b.received
-        for b in blocks
+    """Join consecutive blocks; those without accelerations have received none where others have some."""
+
+    def half(parts: Sequence[Block]) -> Block:
+        return Block(
+            np.concatenate([b.stamp for b in parts]),
+            np.concatenate([b.z for b in parts]),
+            np.concatenate([b.delivered for b in parts]),
+        )
+
+    felt = [b.acceleration for b in blocks if b.acceleration is not None]
+    if not felt:
+        return half(blocks)
+    shapes = [(len(b), felt[0].z.shape[1]) for b in blocks]
+    others = [
+        b.acceleration
+        or Block(b.stamp, np.full(shape, np.nan), np.zeros(shape, dtype=bool))
+        for b, shape in zip(blocks, shapes, strict=True)
     ]
-    return Block(
-        np.concatenate([b.stamp for b in blocks]),
-        np.concatenate([b.z for b in blocks]),
-        np.concatenate(received),
-    )
+    return replace(half(blocks), acceleration=half(others))

@@ -31,8 +31,8 @@ from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.inspection.fitness import not_configured, refuse_unfit
 from fdi_ros.inspection.starting_config import assumed_config
 from fdi_ros.mavlink.failover_replay import Change, failover_text
-from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.accelerometers import possible_names
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outputs import CsvFile, OutputBag
@@ -65,7 +65,9 @@ def run_replay(arguments: Namespace) -> int:
     required = (
         []
         if arguments.check is None
-        else parse_check(arguments.check, len(faults), geometry.channel_names)
+        else parse_check(
+            arguments.check, len(faults), possible_names(config, geometry.channel_names)
+        )
     )
     sources = [arguments.bag, *arguments.config, arguments.scenario]
     outputs = Outputs(
@@ -80,7 +82,7 @@ def run_replay(arguments: Namespace) -> int:
     )
     with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
         sinks = [
-            *_sinks(arguments, config, geometry, stack),
+            *_sinks(arguments, config, stack),
             *([report] if report else []),
         ]
         part = (arguments.start, arguments.end)
@@ -112,6 +114,7 @@ def run_replay(arguments: Namespace) -> int:
         changes = [
             Change(one.at_s, one.channel, one.state, one.error or 0.0)
             for one in summary.scores.events
+            if one.channel in geometry.channel_names
         ]
         words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
@@ -142,24 +145,17 @@ def _say_check(
     return 1 if unmet else 0
 
 
-def _sinks(
-    arguments: Namespace, config: Config, geometry: Geometry, stack: ExitStack
-) -> list[Sink]:
+def _sinks(arguments: Namespace, config: Config, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
     sinks: list[Sink] = []
     if arguments.csv is not None:
         path = stack.enter_context(whole(arguments.csv))
         sinks.append(
-            CsvFile(
-                stack.enter_context(path.open("w", newline="", encoding="utf-8")),
-                geometry.channel_names,
-            )
+            CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")))
         )
     if arguments.output is not None:
         path = stack.enter_context(whole(arguments.output))
-        sinks.append(
-            stack.enter_context(OutputBag(path, config, geometry.channel_names))
-        )
+        sinks.append(stack.enter_context(OutputBag(path, config)))
     return sinks
 
 

@@ -24,6 +24,7 @@ from fdi_ros.config.settings import (
     ALL_NODES,
     INPUTS,
     MONITOR,
+    AccelerometersConfig,
     BiasConfig,
     ChannelsConfig,
     DecisionConfig,
@@ -70,6 +71,7 @@ class Config:
     health: HealthConfig = field(default_factory=HealthConfig)
     decision: DecisionConfig = field(default_factory=DecisionConfig)
     integrity: IntegrityConfig = field(default_factory=IntegrityConfig)
+    accelerometers: AccelerometersConfig = field(default_factory=AccelerometersConfig)
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> Config:

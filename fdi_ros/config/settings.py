@@ -488,6 +488,64 @@ class IntegrityConfig:
     )
 
 
+@dataclass(frozen=True)
+class AccelerometersConfig:
+    """The accelerometers of the units, judged beside the gyros; values of one channel, or one per channel."""
+
+    enabled: str = setting(
+        "auto",
+        "judge the accelerometers; auto: of units whose messages carry accelerations (not -1 in the covariance, not all"
+        " zero), if these are two or more",
+        choices=("auto", "on", "off"),
+    )
+    noise_std: tuple[float, ...] = _per_channel(
+        (0.2,),
+        "standard deviation of the additive error in one sample",
+        "m/s^2",
+        1e-6,
+        1e3,
+    )
+    scale_std: tuple[float, ...] = _per_channel(
+        (0.01,), "standard deviation of the scale factor", "", 0.0, 1.0
+    )
+    bias_walk: tuple[float, ...] = _per_channel(
+        (0.0075,),
+        "random walk of the bias of an accelerometer in flight",
+        "m/s^2/sqrt(s)",
+        0.0,
+        100.0,
+    )
+    turn_on_std: float = setting(
+        0.5,
+        "standard deviation of a bias from one start to the next",
+        "m/s^2",
+        0.0,
+        100.0,
+    )
+    max_drift: float = setting(
+        5.0,
+        "a bias is followed in flight up to this far; beyond, the accelerometer has drifted",
+        "m/s^2",
+        0.0,
+        1000.0,
+    )
+    max_acceleration: tuple[float, ...] = _per_channel(
+        (156.9,),
+        "a value beyond this is out of range (saturated)",
+        "m/s^2",
+        1.0,
+        1e5,
+    )
+    positions: tuple[float, ...] = _per_triad(
+        (),
+        "position of each triad in the body frame, from the first, 3 numbers per triad; empty: all at one place",
+        "m",
+        -10.0,
+        10.0,
+        each=3,
+    )
+
+
 # Parameters of the nodes that are no settings of the monitor ---------------------------------------------------------
 
 

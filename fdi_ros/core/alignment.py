@@ -43,6 +43,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ _IDLE, _FORMING, _RESTARTING = range(3)
 
 @compiled
 def enter(aligner: Aligner, j: int, stamp: int) -> None:
-    """Take a message of unit j, ``aligner.rate`` at stamp, ns, if there can be one; then take out its samples."""
+    """Take a message of unit j, rate and felt force of the aligner at stamp, ns; then take out its samples."""
     if not 0 <= j < aligner.n:
         return
     unit = aligner.units[j]
@@ -99,7 +100,7 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
     for i in range(aligner.n):
         aligner.units[i].off = False
     unit.lag, unit.parted, unit.leapt = max(lag, 0), False, False
-    _accept(aligner, unit, stamp, aligner.rate)
+    _accept(aligner, unit, stamp, aligner.rate, aligner.felt)
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
         unit.begin = unit.end
@@ -185,7 +186,9 @@ def _is_outside(aligner: Aligner, j: int, stamp: int) -> bool:
 
 
 @compiled
-def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
+def _accept(
+    aligner: Aligner, unit: Unit, stamp: int, rate: Array, force: Array
+) -> None:
     """Let a message wait."""
     step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
     message = unit.messages[unit.end % RING]
@@ -194,7 +197,7 @@ def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
         unit.usual[0], unit.usual[1]
     )
     for a in range(3):
-        message.rate[a] = rate[a]
+        message.rate[a], message.force[a] = rate[a], force[a]
     unit.usual[0], unit.usual[1] = unit.usual[1], step
     unit.newest = stamp
     unit.end += 1
@@ -215,7 +218,7 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
         unit.off_first = stamp
     unit.off, unit.off_last = True, stamp
     for a in range(3):
-        unit.off_rate[a] = aligner.rate[a]
+        unit.off_rate[a], unit.off_force[a] = aligner.rate[a], aligner.felt[a]
     here, there, new = 0, 0, True
     for i in range(aligner.n):
         if is_live(aligner, i) and _stands_at(aligner, aligner.units[i], stamp):
@@ -270,7 +273,7 @@ def _restart(aligner: Aligner) -> None:
         unit.parted = unit.leapt = False
         if _stands_at(aligner, unit, stamp):
             unit.lag = max(stamp - unit.off_last, 0)
-            _accept(aligner, unit, unit.off_last, unit.off_rate)
+            _accept(aligner, unit, unit.off_last, unit.off_rate, unit.off_force)
         unit.off = False
 
 
@@ -308,7 +311,9 @@ def _form(aligner: Aligner, sample: Sample) -> bool:
         _add(aligner, j, stamp, step, sample)
         for a in range(3):
             if parted:
-                sample.z[3 * j + a], sample.received[3 * j + a] = math.nan, False
+                i = 3 * j + a
+                sample.z[i], sample.received[i] = math.nan, False
+                sample.force[i], sample.felt[i] = math.nan, False
     aligner.formed, aligner.last = True, stamp
     return True
 
@@ -351,6 +356,7 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
         unit.used, passed = match + 1, max(stamp, message.stamp)
         for a in range(3):
             sample.z[3 * j + a] = message.rate[a]
+            sample.force[3 * j + a] = message.force[a]
     elif 0 < after < unit.end and message.bridges and before.stamp <= stamp:
         unit.counters.interpolated += 1
         share = (stamp - before.stamp) / message.step
@@ -358,15 +364,29 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
             sample.z[3 * j + a] = before.rate[a] + share * (
                 message.rate[a] - before.rate[a]
             )
+            sample.force[3 * j + a] = before.force[a] + share * (
+                message.force[a] - before.force[a]
+            )
     else:
         unit.counters.missing += 1
         received = False
         for a in range(3):
-            sample.z[3 * j + a] = math.nan
+            sample.z[3 * j + a] = sample.force[3 * j + a] = math.nan
+    felt = has_force(sample.force, 3 * j)
     for a in range(3):
         sample.received[3 * j + a] = received
+        sample.felt[3 * j + a] = felt
     while unit.begin < unit.end and unit.messages[unit.begin % RING].stamp <= passed:
         unit.begin += 1
+
+
+@compiled
+def has_force(force: Array, start: int) -> bool:
+    """Whether three values from a place on are a specific force: one that is not there is NaN on all axes."""
+    missing = 0
+    for a in range(3):
+        missing += math.isnan(force[start + a])
+    return missing < 3
 
 
 @compiled
@@ -399,15 +419,15 @@ def align_messages(
     rows: NDArray[Any],
     unit: Int,
     stamp: Int,
-    rate: Array,
+    values: Array,
     start: int,
     samples: NDArray[Any],
 ) -> tuple[int, int]:
     """Enter messages (M,) in order of arrival from number `start` on, as long as there is room for samples (S,).
 
-    Of each: unit, stamp, ns, rate (M, 3) rad/s; the `Aligner` is in rows (1,). Returned
-    are the number of the next message to be entered, and of samples formed. Fewer than
-    S: all is done.
+    Of each: unit, stamp, ns, values (M, 6): rate, rad/s, and specific force, m/s^2; the
+    `Aligner` is in rows (1,). Returned are the number of the next message to be
+    entered, and of samples formed. Fewer than S: all is done.
     """
     aligner, count = rows[0], 0
     while count < len(samples):
@@ -415,7 +435,8 @@ def align_messages(
             count += 1
         elif start < len(stamp):
             for a in range(3):
-                aligner.rate[a] = rate[start, a]
+                aligner.rate[a] = values[start, a]
+                aligner.felt[a] = values[start, 3 + a]
             enter(aligner, unit[start], stamp[start])
             start += 1
         else:
@@ -461,18 +482,22 @@ class Alignment:
         return self._aligned(
             np.array([unit]),
             np.array([stamp]),
-            np.array([rate], dtype=np.float64).reshape(1, 3),
+            np.array([rate], dtype=np.float64).reshape(1, -1),
         )
 
-    def push_block(self, unit: Int, stamp: Int, rate: Array) -> Block:
-        """Take recorded messages, (M,), (M,) ns, (M, 3) rad/s, in order of arrival."""
-        return as_block(self._aligned(unit, stamp, rate), self.units)
+    def push_block(self, unit: Int, stamp: Int, values: Array) -> Block:
+        """Take recorded messages in order of arrival and return the samples that they complete.
+
+        Messages: unit (M,), stamp (M,) ns, values (M, 3) rad/s, or (M, 6) with the
+        specific force behind them, m/s^2, all NaN where a message has none.
+        """
+        return as_block(self._aligned(unit, stamp, values), self.units)
 
     def flush(self) -> NDArray[Any]:
         """Return what is left at the end of a recording, without waiting for any unit, (S,) `Sample`."""
         self.rows["phase"], self.rows["force"] = _FORMING, _ALL
         return self._aligned(
-            np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3))
+            np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 6))
         )
 
     def is_live(self, unit: int) -> bool:
@@ -502,21 +527,29 @@ class Alignment:
         """Added to the stamps of the samples, ns; 0 until all clocks were set back."""
         return int(self.rows["shift"][0])
 
-    def _aligned(self, unit: Int, stamp: Int, rate: Array) -> NDArray[Any]:
+    def _aligned(self, unit: Int, stamp: Int, values: Array) -> NDArray[Any]:
+        if values.shape[1] == 3:
+            values = np.hstack([values, np.full_like(values, np.nan)])
         parts, start = [], 0
         while True:
             samples = allocate(Sample, min(len(stamp) - start + 64, 8192))
-            start, count = align_messages(self.rows, unit, stamp, rate, start, samples)
+            start, count = align_messages(
+                self.rows, unit, stamp, values, start, samples
+            )
             parts.append(samples[:count])
             if count < len(samples):
                 return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def as_block(samples: NDArray[Any], units: int) -> Block:
-    """Block of samples, (S,) `Sample`."""
-    received = samples["received"][:, : 3 * units].astype(np.bool_)
-    return Block(
-        samples["stamp"].copy(),
-        samples["z"][:, : 3 * units].copy(),
-        None if received.all() else received,
-    )
+    """Block of samples, (S,) `Sample`, with the accelerations of all units if any has one."""
+    stamp, n = samples["stamp"].copy(), 3 * units
+
+    def half(values: str, there: str) -> Block:
+        received = samples[there][:, :n].astype(np.bool_)
+        z = samples[values][:, :n].copy()
+        return Block(stamp, z, None if received.all() else received)
+
+    block = half("z", "received")
+    felt = samples["felt"][:, :n].any()
+    return replace(block, acceleration=half("force", "felt")) if felt else block

@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.alignment import enter, next_sample
-from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
-from fdi_ros.core.path import Path, step
+from fdi_ros.core.messages import (
+    GOOD,
+    fill_force,
+    fill_half,
+    fill_imu,
+    fill_integrity,
+)
+from fdi_ros.core.path import Path, step_halves, wants_supply
 from fdi_ros.core.records import Aligner, Live
 from fdi_ros.model.samples import Bytes
 
@@ -81,13 +87,28 @@ def receive_arrived(live: Live, code: int, stamp: int) -> int:
     sample.shift = live.clock_shift
     for i in range(live.channels):
         sample.received[i] = True
+        sample.felt[i] = False
     live.ready = True
     return MORE
 
 
 @compiled
+def fill_accelerometers(
+    paths: tuple[Path, Path], live: Live, fused: Bytes, integrity: Bytes
+) -> None:
+    """Write what the accelerometers gave into the messages about the last sample."""
+    gyros, core = paths[0].core[0].settings, paths[1].core[0]
+    natural = core.settings.natural
+    if core.last.valid:
+        fill_force(fused, live.fused_at, natural, core.last.rate, core.last.covariance)
+    behind = live.integrity_at + 8 * (gyros.n + 7)
+    fill_half(integrity, behind, core.last, core.settings.n, natural)
+
+
+@compiled
 def process(
-    path: Path,
+    paths: tuple[Path, Path],
+    halves: int,
     aligner: NDArray[Any],
     live: NDArray[Any],
     events: NDArray[Any],
@@ -96,17 +117,19 @@ def process(
 ) -> int:
     """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
 
-    ``aligner``, ``live``: (1,) records. ``events`` takes its events, ``fused`` and
-    ``integrity`` the messages to be published about it.
+    ``paths``, ``halves``: as for `run`. ``aligner``, ``live``: (1,) records. ``events``
+    takes its events, ``fused`` and ``integrity`` the messages to be published about it.
     """
-    monitor, main = live[0], path.core[0]
+    monitor, main = live[0], paths[0].core[0]
     if not monitor.ready:
         return 0
     sample = monitor.sample
-    count = step(path, sample, 0, events, 0)
-    if count < 0:
-        return SUPPLY | MORE
+    # Those of the gyros stand already where the accelerometers waited.
+    begun = monitor.events if main.half > 0 else 0
+    count, waits = step_halves(paths, halves, sample, 0, events, begun)
     monitor.events = count
+    if waits:
+        return SUPPLY | MORE
     flags = WORKED | HAS_EVENTS if count > 0 else WORKED
     if main.last.valid:
         fill_imu(
@@ -119,11 +142,13 @@ def process(
         flags |= HAS_RATE
     else:
         monitor.without_rate += 1
-    if main.wanted or main.copies.found:
+    if wants_supply(paths, halves):
         flags |= SUPPLY
     fill_integrity(
         integrity, monitor.integrity_at, main.last, main.settings.n, sample.shift
     )
+    if halves == 2:
+        fill_accelerometers(paths, monitor, fused, integrity)
     monitor.shift = sample.shift
     monitor.ready = next_sample(aligner[0], sample)
     return flags | MORE if monitor.ready else flags

@@ -15,6 +15,7 @@ its own size counted from after the encapsulation.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -31,9 +32,9 @@ from fdi_ros.system.files import NAME
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
 ENCAPSULATION = 4  # bytes before the first field
-IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
-"""Doubles of an Imu: all, and those before the angular velocity: orientation and its
-covariance."""
+IMU_DOUBLES, IMU_BEFORE_RATE, IMU_BEFORE_FORCE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9, 3 + 9
+"""Doubles of an Imu: all; those before the angular velocity: orientation and its
+covariance; and from there on those before the linear acceleration."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
 LAST_STAMP = (
@@ -143,6 +144,22 @@ def read_rate(
     return sec * _NS + nanosec
 
 
+@compiled
+def read_force(data: Bytes, at: int, little: bool, force: Array) -> None:
+    """Read the specific force of an Imu, m/s^2, into force (3,); NaN if the message has none.
+
+    ``at``: where the angular velocity begins, as `place_after_header` returns it. An
+    Imu without an accelerometer has -1 as the first element of the covariance (REP-145),
+    or zeros.
+    """
+    start = at + 8 * IMU_BEFORE_FORCE
+    read_doubles(data, start, 3, little, force)
+    first = np.int64(read_bits(data, start + 24, 8, little)).view(np.float64)
+    if first == -1.0 or (force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0):
+        for a in range(3):
+            force[a] = math.nan
+
+
 def frame_of(data: bytes) -> str:
     """Return the frame_id of a serialised message that begins with a std_msgs/Header; empty: it has none to read."""
     begin = ENCAPSULATION + 12
@@ -164,7 +181,7 @@ class Decoded(NamedTuple):
 
     code: Bytes  # (k,) `GOOD`, or what is wrong
     stamp: Int  # (k,) ns; 0 for messages that carry none
-    values: Array  # (k, c) rad/s
+    values: Array  # (k, c) rad/s; of an Imu from the fourth on m/s^2
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -197,7 +214,8 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     """Write stamp, ns, rate (3,) rad/s and covariance into one serialised Imu, made from an `ImuTemplate`.
 
     ``at``: where the rate begins, as the template says. Of the covariance the upper
-    triangle is given, (6,) (rad/s)^2. Little endian.
+    triangle is given, (6,) (rad/s)^2. The specific force is marked absent: `fill_force`
+    may follow. Little endian.
     """
     seconds, rest = stamp // _NS, stamp % _NS
     for k in range(4):
@@ -205,33 +223,69 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
         out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255
     _write_doubles(out, at, rate, _IN_ORDER, 3)
     _write_doubles(out, at + 24, covariance, _FULL, 9)
+    for k in range(3):
+        _write_double(out, at + 8 * (IMU_BEFORE_FORCE + k), 0.0)
+    for k in range(9):
+        _write_double(out, at + 8 * (IMU_BEFORE_FORCE + 3 + k), -1.0 if k == 0 else 0.0)
 
 
-def integrity_labels(names: Sequence[str]) -> list[str]:
-    """Return what each value of the integrity message is, for channels of these names."""
-    return [
-        "statistic",
-        "threshold",
-        *(f"state {name}" for name in names),
-        *(f"protection level {axis} [rad/s]" for axis in "xyz"),
-        "stamp [s]",
-        "stamp [ns]",
-    ]
+@compiled
+def fill_force(
+    out: Bytes, at: int, natural: float, force: Array, covariance: Array
+) -> None:
+    """Write specific force (3,) and covariance (6,) into an Imu that `fill_imu` has filled.
+
+    Both are in units of ``natural``, m/s^2, and of its square.
+    """
+    start = at + 8 * IMU_BEFORE_FORCE
+    for k in range(3):
+        _write_double(out, start + 8 * k, natural * force[k])
+    for k in range(9):
+        value = natural * natural * covariance[_FULL[k]]
+        _write_double(out, start + 24 + 8 * k, value)
+
+
+def integrity_labels(names: Sequence[str], n: int) -> list[str]:
+    """Return what each value of the integrity message is; the first n names are of gyros, others of accelerometers."""
+
+    def half(own: Sequence[str], of: str, unit: str) -> list[str]:
+        return [
+            f"{of}statistic",
+            f"{of}threshold",
+            *(f"state {name}" for name in own),
+            *(f"{of}protection level {axis} [{unit}]" for axis in "xyz"),
+        ]
+
+    gyros = [*half(names[:n], "", "rad/s"), "stamp [s]", "stamp [ns]"]
+    other = half(names[n:], "accelerometers ", "m/s^2") if names[n:] else []
+    return gyros + other
 
 
 @compiled
 def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> None:
-    """Write the values that `integrity_labels` names into a Float64MultiArray; out and at as for `fill_imu`.
+    """Write what `integrity_labels` names first, of gyros and stamp, into a Float64MultiArray.
 
-    The stamp is that of the sample less ``shift``, ns.
+    ``out``, ``at``: as for `fill_imu`. The stamp is that of the sample less ``shift``,
+    ns.
+    """
+    end = fill_half(out, at, row, n, 1.0)
+    stamp = row.stamp - shift
+    _write_double(out, end, stamp // _NS)
+    _write_double(out, end + 8, stamp % _NS)
+
+
+@compiled
+def fill_half(out: Bytes, at: int, row: OutputRow, n: int, natural: float) -> int:
+    """Write statistic, threshold, states and level of n channels from a byte on, and return the byte behind them.
+
+    ``natural``: unit of the level, rad/s or m/s^2.
     """
     _write_double(out, at, row.statistic)
     _write_double(out, at + 8, row.threshold)
     _write_doubles(out, at + 16, row.state, _IN_ORDER, n)
-    _write_doubles(out, at + 16 + 8 * n, row.level, _IN_ORDER, 3)
-    stamp = row.stamp - shift
-    _write_double(out, at + 40 + 8 * n, stamp // _NS)
-    _write_double(out, at + 48 + 8 * n, stamp % _NS)
+    for k in range(3):
+        _write_double(out, at + 16 + 8 * (n + k), natural * row.level[k])
+    return at + 16 + 8 * (n + 3)
 
 
 class ImuTemplate:

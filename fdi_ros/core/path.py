@@ -27,6 +27,7 @@ from fdi_ros.core.copies import update_copies
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
 from fdi_ros.core.evidence import fill_suspects, gather_evidence
 from fdi_ros.core.fusion import fuse
+from fdi_ros.core.halves import give_sample
 from fdi_ros.core.health import FINE, OUT_OF_RANGE, check, leave_flickering
 from fdi_ros.core.judging import (
     is_prepared,
@@ -67,35 +68,79 @@ class Path(NamedTuple):
 
 @compiled
 def run(
-    path: Path,
+    paths: tuple[Path, Path],
+    halves: int,
     samples: NDArray[Any],
     start: int,
-    out: NDArray[Any],
+    outs: tuple[NDArray[Any], NDArray[Any]],
     events: NDArray[Any],
     stop_at_event: bool,
 ) -> tuple[int, int, bool]:
-    """Work samples (N,) one after the other, from row `start` on, into ``out`` (N,) `OutputRow`; stamps increase.
+    """Work samples (N,) one after the other, from row `start` on, into ``outs`` (N,) `OutputRow`; stamps increase.
 
-    Work ends when fewer than n of ``events``, `EventRow`, are free; with
+    ``paths``, ``outs``: gyros, accelerometers; the latter count for nothing where
+    ``halves`` is 1. Work ends when too few of ``events``, `EventRow`, are free; with
     `stop_at_event` after the first sample that brings one. Returned are the row at
     which it ended, N if all is done; the number of events; and whether something must
-    be prepared. If it is the detector, for ``sample.mask`` of the core, the row was not
-    worked, and ``now.waiting`` is set; if the row before it lacks its level, the
-    channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
+    be prepared. If it is the detector, for ``sample.mask`` of a core, the row was not
+    worked to its end, and ``now.waiting`` is set; if the row before it lacks its level,
+    the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
-    core, count = path.core[0], 0
+    room = count = 0
+    for half in range(halves):
+        room += paths[half].core[0].settings.n
     for k in range(start, len(samples)):
-        if len(events) - count < core.settings.n:
+        if len(events) - count < room:
             return k, count, False
         before = count
-        count = step(path, samples[k], k, events, before)
-        if count < 0:
-            return k, before, True
-        out[k] = core.last
-        wants = core.wanted != 0 or core.copies.found
+        count, waits = step_halves(paths, halves, samples[k], k, events, before)
+        if waits:
+            return k, count, True
+        for half in range(halves):
+            outs[half][k] = paths[half].core[0].last
+        wants = wants_supply(paths, halves)
         if wants or (stop_at_event and count > before):
             return k + 1, count, wants
     return len(samples), count, False
+
+
+@compiled
+def step_halves(
+    paths: tuple[Path, Path],
+    halves: int,
+    sample: Sample,
+    row: int,
+    events: NDArray[Any],
+    count: int,
+) -> tuple[int, bool]:
+    """Work one sample through the gyros, then through the accelerometers.
+
+    Returned are the number of events, and whether a detector must be prepared: then
+    give the sample again, and it goes on with that half.
+    """
+    gyros = paths[0].core[0]
+    while gyros.half < halves:
+        path = paths[gyros.half]
+        core = path.core[0]
+        if not core.now.waiting:
+            give_sample(core, gyros, sample, gyros.half)
+        after = step(path, core.given, row, events, count)
+        if after < 0:
+            return count, True
+        count = after
+        gyros.half += 1
+    gyros.half = 0
+    return count, False
+
+
+@compiled
+def wants_supply(paths: tuple[Path, Path], halves: int) -> bool:
+    """Whether a half lacks the level of its last sample, or has found copies."""
+    wants = False
+    for half in range(halves):
+        core = paths[half].core[0]
+        wants = wants or core.wanted != 0 or core.copies.found
+    return wants
 
 
 @compiled

@@ -79,6 +79,7 @@ class Accepted:
 
     stamp: Whole  # ns
     rate: Vector  # rad/s
+    force: Vector  # specific force, m/s^2; all NaN: the message has none
     step: Whole  # since the message before, ns
     bridges: Flag  # the span since the message before may be interpolated
 
@@ -108,6 +109,7 @@ class Unit:
     off_first: Whole  # first stamp of the present run outside the time base, ns
     off_last: Whole  # last stamp of the run, ns
     off_rate: Vector  # rad/s
+    off_force: Vector  # m/s^2
     counters: Counters
     messages: Annotated[list[Accepted], RING]
 
@@ -132,6 +134,7 @@ class Aligner:
     force: Whole  # samples up to this stamp are formed without waiting, ns
     moved_to: Whole  # stamp outside the time base where it begins anew, ns
     rate: Vector  # of the message that is entered, rad/s
+    felt: Vector  # its specific force, m/s^2; all NaN: it has none
     units: Annotated[list[Unit], MAX_UNITS]
 
 
@@ -143,6 +146,8 @@ class Sample:
     shift: Whole  # stamp minus that of the message, ns
     z: Channels  # rad/s, NaN where nothing was received
     received: Flags
+    force: Channels  # of the accelerometers, m/s^2, NaN where nothing was received
+    felt: Flags  # `received` of the accelerometers
 
 
 @record
@@ -521,12 +526,14 @@ class EventRow:
 
     row: Whole  # of the sample in its block
     stamp: Whole  # ns
-    channel: Whole
+    channel: Whole  # among all channels of the monitor, gyros first
     before: Small  # `ChannelState`
     after: Small  # `ChannelState`
     reason: Small  # place in `REASONS`
     group: Mask  # AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone
-    error: Real  # estimated error, rad/s; 0 where the reason is neither disagreement nor drift
+    # estimated error in the unit of the quantity; 0 where the reason is neither
+    # disagreement nor drift
+    error: Real
 
 
 @record
@@ -534,6 +541,13 @@ class PathSettings:
     """Settings, which samples do not change. A change of the detector changes some."""
 
     n: Whole  # channels
+    first: Whole  # number of the first of them among all channels of the monitor
+    # what 1 rad/s stands for in the unit of the quantity: values are divided by it as
+    # they enter
+    natural: Real
+    places: Counts  # of each accelerometer among those of a sample
+    arms: Axes  # position of each accelerometer from the first unit, m
+    lever: Flag  # any of them is not zero
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
@@ -670,6 +684,9 @@ class Core:
     )
     last: OutputRow
     now: Current
+    given: Sample  # the sample on its way, its values as the path takes them
+    # half of the monitor that is to work the sample: 0 gyros, 1 accelerometers
+    half: Whole
 
 
 @record

@@ -29,6 +29,7 @@ from fdi_ros.core.messages import (
     ENCAPSULATION,
     FIRST_OWN,
     GOOD,
+    IMU_BEFORE_FORCE,
     IMU_BEFORE_RATE,
     IMU_DOUBLES,
     NO_CDR,
@@ -41,6 +42,7 @@ from fdi_ros.core.messages import (
     place_after_header,
     read_bits,
     read_doubles,
+    read_force,
     read_only,
     read_rate,
 )
@@ -252,6 +254,13 @@ def _imu_read(data: Bytes, offset: int, length: int, rate: Array) -> int:
 
 
 @compiled
+def _imu_read_force(data: Bytes, offset: int, length: int, force: Array) -> None:
+    """Read the specific force of an Imu, whose rate was read, into force (3,)."""
+    at = _imu_place(data, offset, length, 3)
+    read_force(data, at, data[offset + 1] == 1, force)
+
+
+@compiled
 def _imu_decode_into(
     data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
 ) -> None:
@@ -261,6 +270,8 @@ def _imu_decode_into(
             code[k] = -measured
         else:
             stamp[k] = measured
+            if values.shape[1] == 6:
+                _imu_read_force(data, offset[k], length[k], values[k, 3:])
 
 
 @compiled
@@ -270,11 +281,16 @@ def _imu_receive(
     if not 0 <= inlet < aligner[0].n:
         return 0
     measured = _imu_read(data, 0, len(data), aligner[0].rate)
+    if measured >= 0:
+        _imu_read_force(data, 0, len(data), aligner[0].felt)
     return receive_stamped(live[0], aligner[0], inlet, measured, stamp)
 
 
 class ImuSource(UnitSource):
-    """The angular velocity of sensor_msgs/Imu messages, one topic per unit."""
+    """Angular velocity and linear acceleration of sensor_msgs/Imu messages, one topic per unit.
+
+    Reading three values gives the rate, reading six also the specific force.
+    """
 
     type = "sensor_msgs/msg/Imu"
     called = "an Imu"
@@ -288,6 +304,16 @@ class ImuSource(UnitSource):
         if code == NO_RATE:
             return "angular_velocity_covariance[0] is -1: this Imu measures no angular rate (REP-145)"
         return super().explain(code, data, count)
+
+    @classmethod
+    def patch(cls, data: bytes, values: Sequence[float]) -> bytes:
+        """Return a message with another rate, and with six values another specific force, all else as it was."""
+        patched = super().patch(data, values[:3])
+        if len(values) == 6:
+            at = cls.place(as_batch(data)[0], 0, len(data), 3) + 8 * IMU_BEFORE_FORCE
+            force = struct.pack(f"{byte_order(data)}3d", *values[3:])
+            patched = patched[:at] + force + patched[at + len(force) :]
+        return patched
 
 
 # std_msgs/Float64MultiArray

@@ -183,14 +183,12 @@ def write_events(
                     # It gives nothing in this very sample.
                     error = 0.0
             event = events[count]
-            event.row, event.stamp, event.channel, event.error = (
-                row,
-                last.stamp,
-                i,
-                error,
-            )
+            first = core.settings.first
+            event.row, event.stamp, event.channel = row, last.stamp, first + i
+            event.error = core.settings.natural * error
             event.before, event.after, event.reason = core.state[i], after, reason
-            event.group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
+            group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
+            event.group = group << first
             core.state[i], core.since[i], core.error[i] = after, last.stamp, error
             count += 1
     return count

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,16 @@ from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.system.text import did_you_mean
 from fdi_ros.system.yaml_file import read_yaml
 
+ACCELEROMETERS = ".accel"  # stands behind the unit in names of its accelerometers
+ACCELEROMETER = f"{ACCELEROMETERS}_"  # then the axis
+
 
 @dataclass(frozen=True)
 class Fault:
     """One fault. `FaultError` if a value is out of range."""
 
-    #: channel (``imu_2.y``), unit (``imu_2``: all channels), or several with commas
+    #: channel (``imu_2.y``, ``imu_2.accel_y``), gyros or accelerometers of a unit
+    #: (``imu_2``, ``imu_2.accel``), or several with commas
     channel: str
     #: kind of the fault with its options
     kind: FaultKind
@@ -70,18 +74,28 @@ class Fault:
             found = [
                 i
                 for i, known in enumerate(channel_names)
-                if name == known or known.startswith(f"{name}.")
+                if self._is_meant(name, known)
             ]
             if not found:
                 raise FaultError(
                     f"fault on unknown channel {name!r}, {did_you_mean(name, channel_names)}"
                 )
             struck += [i for i in found if i not in struck]
-        if self.kind.whole_unit and len(struck) != 3:
+        gyros = [i for i in struck if ACCELEROMETER not in channel_names[i]]
+        if self.kind.whole_unit and len(gyros) != 3:
             raise FaultError(
-                f"fault {self.kind.name} on {self.channel!r} strikes {len(struck)} channels, expected 3"
+                f"fault {self.kind.name} on {self.channel!r} strikes {len(gyros)} channels, expected 3"
             )
         return tuple(struck)
+
+    def _is_meant(self, name: str, known: str) -> bool:
+        """Whether a name means a channel: a unit stands for its gyros, and for all of it where the unit is lost."""
+        if name == known or known.startswith(
+            f"{name.removesuffix(ACCELEROMETERS)}{ACCELEROMETER}"
+        ):
+            is_unit = name != known and not name.endswith(ACCELEROMETERS)
+            return not is_unit or self.kind.whole_unit
+        return known.startswith(f"{name}.")
 
     def __str__(self) -> str:
         words = [
@@ -194,7 +208,7 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
 class Injector:
     """Injects faults into a stream of blocks, one after the other in the order of the list.
 
-    ``channel_names``: names of the n channels of the stream. ``start_stamp``: origin of
+    ``channel_names``: names of the channels of the stream, gyros first. ``start_stamp``: origin of
     the times of the faults, ns; None means the first sample. `FaultError` if a fault is
     on a channel outside the stream.
     """
@@ -257,16 +271,9 @@ class Injector:
             return block
         if self.start_stamp is None:
             self.start_stamp = int(block.stamp[0])
-        time, active, z = (
-            self.time(block.stamp),
-            self.active(block.stamp),
-            block.z.copy(),
-        )
-        received = (
-            np.ones(z.shape, dtype=bool)
-            if block.received is None
-            else block.received.copy()
-        )
+        time, active = self.time(block.stamp), self.active(block.stamp)
+        z = np.hstack([half.z for half in block.halves])
+        received = np.hstack([half.delivered for half in block.halves])
         for k, fault in enumerate(self.faults):
             index = list(self.channels[k])
             struck = ChannelSamples(
@@ -276,8 +283,11 @@ class Injector:
             with np.errstate(invalid="ignore", over="ignore"):
                 fault.kind.strike(struck, self._memories[k], self._random[k])
             z[:, index], received[:, index] = struck.z, struck.received
-        return Block(
-            block.stamp,
-            z,
-            None if block.received is None and received.all() else received,
+        n = block.z.shape[1]
+        all_came = block.received is None and received[:, :n].all()
+        faulty = Block(block.stamp, z[:, :n], None if all_came else received[:, :n])
+        if block.acceleration is None:
+            return faulty
+        return replace(
+            faulty, acceleration=Block(block.stamp, z[:, n:], received[:, n:])
         )

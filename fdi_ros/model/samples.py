@@ -41,6 +41,9 @@ class Block:
     None: all did. A value that was delivered but is NaN or infinite is a defect of the
     sensor; one that was not delivered is silence. The two are reported in different
     words."""
+    acceleration: Block | None = None
+    """The same samples of the accelerometers, z (N, m) m/s^2, three of every unit. None:
+    no unit has any."""
 
     def __post_init__(self) -> None:
         stamp, z = np.asarray(self.stamp), np.asarray(self.z)
@@ -59,6 +62,9 @@ class Block:
             raise ConfigError(
                 f"received has shape {received.shape} of {received.dtype}, expected {z.shape} bool"
             )
+        other = self.acceleration
+        if other is not None and not np.array_equal(other.stamp, stamp):
+            raise ConfigError("gyros and accelerometers have different stamps")
 
     def __len__(self) -> int:
         return len(self.stamp)
@@ -69,7 +75,13 @@ class Block:
             if len(self)
             else ""
         )
-        return f"Block({len(self)} samples of {np.shape(self.z)[1]} channels{span})"
+        channels = sum(half.z.shape[1] for half in self.halves)
+        return f"Block({len(self)} samples of {channels} channels{span})"
+
+    @property
+    def halves(self) -> tuple[Block, ...]:
+        """Gyros, and accelerometers if there are any."""
+        return (self,) if self.acceleration is None else (self, self.acceleration)
 
     @property
     def delivered(self) -> NDArray[np.bool_]:
@@ -82,4 +94,5 @@ class Block:
 
     def __getitem__(self, rows: slice) -> Block:
         received = None if self.received is None else self.received[rows]
-        return Block(self.stamp[rows], self.z[rows], received)
+        other = None if self.acceleration is None else self.acceleration[rows]
+        return Block(self.stamp[rows], self.z[rows], received, other)

@@ -26,6 +26,7 @@ from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import MAX_RUN_LENGTH, FalseAlarmRate, NoiseModel, normal_isf
+from fdi_ros.model.quantity import RATE
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
@@ -194,7 +195,7 @@ def _fill_settings(
     settings: Any, config: Config, geometry: Geometry, noise: NoiseModel
 ) -> None:
     n, integrity = geometry.n, config.integrity
-    settings["n"] = n
+    settings["n"], settings["natural"] = n, RATE.natural
     describe_sensors(settings["sensors"], geometry, noise)
     settings["largest_noise"] = noise.noise_std.max()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import chain
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.sources import source_of
 from fdi_ros.core.states import ChannelState, Reason
+from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import Concern, Word, live_word
 from fdi_ros.system.text import first_of, plus_minus, shown
@@ -236,15 +237,18 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
 
 
 def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
-    words, bias = [], status.config.bias
+    words, bias, unit = [], status.config.bias, channel.unit
+    own, section = bias.max_drift, "bias"
+    if unit == FORCE.unit:
+        own, section = status.config.accelerometers.max_drift, "accelerometers"
     if channel.noisy:
         times = (
             f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
         )
         words.append(f"noise {times} times noise_std and above the others'")
-    if abs(channel.drift) > NEARLY * bias.max_drift > 0:
-        limit = f"a fault beyond {bias.max_drift:g} (bias.max_drift)"
-        words.append(f"bias has drifted by {_figure(channel.drift)} rad/s, {limit}")
+    if abs(channel.drift) > NEARLY * own > 0:
+        limit = f"a fault beyond {own:g} ({section}.max_drift)"
+        words.append(f"bias has drifted by {_figure(channel.drift)} {unit}, {limit}")
     if status.is_far(channel):
         words.append(
             f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
@@ -261,10 +265,11 @@ def _whole_message(
     for unit in status.units:
         if unit.name in doubtful:
             doubtful.update(unit.channels)
-    healthy = sum(
-        channel.state == ChannelState.OK and channel.name not in doubtful
+    healthy = {
+        channel.name
         for channel in status.channels
-    )
+        if channel.state == ChannelState.OK and channel.name not in doubtful
+    }
     about = [channel.name for channel in status.channels if channel.name in worse]
     words = [
         status.note,
@@ -273,7 +278,7 @@ def _whole_message(
         first_of(list(map(str, concerns)), MOST_CONCERNS, "; ") if concerns else "",
     ]
     count, note = (
-        f"{healthy} of {total} channels healthy",
+        _healthy_words(status, healthy),
         "".join(f"; {one}" for one in words if one),
     )
     if not status.has_rate:
@@ -281,11 +286,25 @@ def _whole_message(
     odd = (
         worse or concerns or status.copies or any(unit.frozen for unit in status.units)
     )
-    complete = healthy == total and len(status.can_isolate) == total and not odd
+    complete = len(healthy) == total and len(status.can_isolate) == total and not odd
     level = (
         Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
     )
     return level, f"{count}; {_reach(status)}{note}"
+
+
+def _healthy_words(status: Status, healthy: Set[str]) -> str:
+    """Return how many channels are healthy; gyros and accelerometers apart where there are both."""
+
+    def counted(some: Sequence[ChannelStatus], called: str) -> str:
+        count = sum(channel.name in healthy for channel in some)
+        return f"{count} of {len(some)} {called}"
+
+    gyros = [one for one in status.channels if one.unit != FORCE.unit]
+    others = status.channels[len(gyros) :]
+    if not others:
+        return f"{counted(gyros, 'channels')} healthy"
+    return f"{counted(gyros, 'gyros')} and {counted(others, 'accelerometers')} healthy"
 
 
 def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[str]:
@@ -388,9 +407,22 @@ def _whole_values(status: Status) -> Values:
             "protection level after one more loss (rad/s)",
             " ".join(map(_figure, status.protection_level_after_loss)),
         ),
+        *_force_values(status.acceleration),
         ("bias", status.bias_state),
         *((f"{unit.name}: stamps late (ms)", _late(unit)) for unit in status.units),
         ("note", status.note),
+    )
+
+
+def _force_values(status: Status | None) -> Values:
+    """Figures of the accelerometers as a whole."""
+    if status is None:
+        return ()
+    return (
+        ("accelerometers: statistic", _figure(status.statistic)),
+        ("accelerometers: threshold", _figure(status.threshold)),
+        ("fused specific force", "yes" if status.has_rate else "no"),
+        ("protection level (m/s^2)", " ".join(map(_figure, status.protection_level))),
     )
 
 
@@ -443,7 +475,7 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
         return f"{_format_set(channel, status)}; {lasting}"
     words = channel.reason.value or channel.state.name.lower()
     if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
-        words = f"{words} by {_figure(abs(channel.error))} rad/s"
+        words = f"{words} by {_figure(abs(channel.error))} {channel.unit}"
     if channel.reason == Reason.INTERMITTENT:
         words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
     ending = {
@@ -476,7 +508,7 @@ def _channel_values(
         if channel.last_received
         else "never"
     )
-    pair = status.apart
+    pair, unit = status.apart, channel.unit
     scales = [
         error
         for error in status.errors
@@ -491,16 +523,16 @@ def _channel_values(
             ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else "",
         ),
         (
-            "apart (rad/s)",
+            f"apart ({unit})",
             plus_minus(pair.size, pair.std)
             if pair and channel.name in pair.channels
             else "",
         ),
-        ("residual (rad/s)", _figure(channel.residual)),
-        ("estimated error (rad/s)", _figure(channel.error)),
-        ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
-        ("of that followed in flight (rad/s)", _figure(channel.drift)),
-        ("bias known to (rad/s)", _figure(channel.bias_std)),
+        (f"residual ({unit})", _figure(channel.residual)),
+        (f"estimated error ({unit})", _figure(channel.error)),
+        (f"bias ({unit})", _figure(status.bias[k]) if k < len(status.bias) else ""),
+        (f"of that followed in flight ({unit})", _figure(channel.drift)),
+        (f"bias known to ({unit})", _figure(channel.bias_std)),
         (
             "scale and misalignment (1)",
             ", ".join(

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from fdi_ros.core.messages import (
     ChannelsTemplate,
     ImuTemplate,
+    fill_force,
+    fill_half,
     fill_imu,
     fill_integrity,
     integrity_labels,
 )
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
+from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Array
 from fdi_ros.system import require
 from fdi_ros.system.text import date_of, html_table
@@ -59,9 +62,10 @@ class Event:
     group: tuple[
         int, ...
     ]  #: AMBIGUOUS: the channels one of which is faulty, otherwise the channel alone.
-    error: float  #: Estimated error of the channel, rad/s, 0 where the reason is neither disagreement nor drift.
+    error: float  #: Estimated error of the channel, 0 where the reason is neither disagreement nor drift.
 
     row: int = field(default=0, compare=False)  #: Row of that sample in its output.
+    unit: str = RATE.unit  #: Of the error: rad/s of a gyro, m/s^2 of an accelerometer.
 
     @property
     def declares(self) -> bool:
@@ -77,7 +81,7 @@ _HEAD = ("stamp s", "channel", "change", "why")
 
 def format_reason(event: Event, names: Sequence[str]) -> str:
     """Return why a channel changed its state. Without names channels are numbered."""
-    size = f" by {abs(event.error):.3g} rad/s" if event.error else ""
+    size = f" by {abs(event.error):.3g} {event.unit}" if event.error else ""
     group = ", ".join(names[i] if names else f"channel {i}" for i in event.group)
     return (
         event.reason.value
@@ -92,8 +96,8 @@ def _cells(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
     return f"{event.stamp / 1e9:.3f}", name, change, format_reason(event, names)
 
 
-def events_of(rows: NDArray[Any]) -> list[Event]:
-    """Return changes of state in order, from their records (E,)."""
+def events_of(rows: NDArray[Any], gyros: int) -> list[Event]:
+    """Return changes of state in order, from their records (E,); channels from ``gyros`` on are accelerometers."""
     return [
         Event(
             stamp=int(row["stamp"]),
@@ -103,10 +107,17 @@ def events_of(rows: NDArray[Any]) -> list[Event]:
             reason=REASONS[row["reason"]],
             group=members(int(row["group"])),
             error=float(row["error"]),
+            unit=RATE.unit if row["channel"] < gyros else FORCE.unit,
             row=int(row["row"]),
         )
         for row in rows
     ]
+
+
+def of_accelerometers(event: Event, gyros: int) -> Event:
+    """Return an event of an accelerometer with the numbers that it has without the gyros."""
+    group = tuple(i - gyros for i in event.group)
+    return replace(event, channel=event.channel - gyros, group=group)
 
 
 def _column(name: str, about: str) -> Any:
@@ -122,11 +133,14 @@ class Output:
     rows
         (N,) records of `fdi_ros.core.records.OutputRow`.
     n
-        Number of channels.
+        Number of gyros.
     events
-        Changes of state within these samples, in order.
+        Changes of state within these samples, in order: of the accelerometers too, with numbers from n on.
     channel_names
-        Of the channels, by default g1, g2, ...
+        Of the gyros, then of the accelerometers, by default g1, g2, ...
+    acceleration
+        The same of the accelerometers, None without any: its figures are in m/s^2 where they are rad/s here, its
+        channels are numbered from 0.
 
     Properties build their arrays on demand: for single samples ten views would cost more than judging.
     """
@@ -157,13 +171,24 @@ class Output:
         n: int,
         events: Sequence[Event] = (),
         channel_names: Sequence[str] = (),
+        acceleration: Output | None = None,
     ) -> None:
         self.rows = rows
         self.n = n
+        self.acceleration = acceleration
         self.events = events
         self.channel_names = tuple(channel_names) or tuple(
             f"g{i + 1}" for i in range(n)
         )
+
+    @property
+    def halves(self) -> tuple[Output, ...]:
+        """Gyros alone, and accelerometers if there are any: each with its own channels and events."""
+        if self.acceleration is None:
+            return (self,)
+        own = [event for event in self.events if event.channel < self.n]
+        gyros = Output(self.rows, self.n, own, self.channel_names[: self.n])
+        return (gyros, self.acceleration)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -177,13 +202,26 @@ class Output:
 
     @property
     def state(self) -> NDArray[np.uint8]:
-        """(N, n) ChannelState of each channel after the sample."""
-        return np.asarray(self.rows["state"][:, : self.n])
+        """(N, n) ChannelState of each channel after the sample; accelerometers stand behind the gyros."""
+        own = np.asarray(self.rows["state"][:, : self.n])
+        return (
+            own
+            if self.acceleration is None
+            else np.hstack([own, self.acceleration.state])
+        )
 
     @property
     def residual(self) -> Array:
-        """(N, n) bias-free channel minus fused rate along its axis, rad/s, NaN where either is missing."""
-        return np.asarray(self.rows["residual"][:, : self.n])
+        """(N, n) bias-free channel minus fused rate along its axis, rad/s, NaN where either is missing.
+
+        Accelerometers stand behind the gyros, minus the fused specific force, m/s^2.
+        """
+        own = np.asarray(self.rows["residual"][:, : self.n])
+        return (
+            own
+            if self.acceleration is None
+            else np.hstack([own, self.acceleration.residual])
+        )
 
     @property
     def covariance(self) -> Array:
@@ -193,7 +231,7 @@ class Output:
     def __repr__(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
         rated = f", a rate in {np.mean(self.valid):.0%}" if len(self) else ""
-        size = f"{len(self)} samples of {self.n} channels, {seconds:.3f} s"
+        size = f"{len(self)} samples of {len(self.channel_names)} channels, {seconds:.3f} s"
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 
     def _repr_html_(self) -> str:
@@ -252,53 +290,88 @@ class Topic(NamedTuple):
     type: str  # of its messages: ``sensor_msgs/msg/Imu``
 
 
+class Rows(NamedTuple):
+    """What one sample gave: records of `fdi_ros.core.records.OutputRow`."""
+
+    gyros: Any
+    accelerometers: Any = None  # None: there are none
+    natural: float = FORCE.natural  # unit of the latter's figures, m/s^2
+
+
 @dataclass(frozen=True, eq=False)
 class SampleOutput:
     """A message about each sample, on a topic of its own."""
 
     topic: Topic
-    make: Callable[[str, Sequence[str]], Template]
-    """Returns a message to be filled, from the frame_id of the rate and the names of the channels."""
-    fill: Callable[[Template, Any, int, int], None]
-    """Fills the message from an `fdi_ros.core.records.OutputRow`, n, and the shift in ns to subtract from its stamp."""
+    make: Callable[[str, Sequence[str], int], Template]
+    """Returns a message to be filled, from the frame_id of the rate, the names of all channels, and the number of
+    gyros, which come first."""
+    fill: Callable[[Template, Rows, int, int, int], None]
+    """Fills the message from rows, the numbers of gyros and accelerometers, and the shift in ns to subtract from its
+    stamp."""
     needs_rate: bool = False  # whether only samples with a fused rate are published
     on_demand: bool = False  # whether the node skips the output without subscribers
 
 
+def _fill_fused(out: Template, rows: Rows, n: int, m: int, shift: int) -> None:
+    row, other = rows.gyros, rows.accelerometers
+    instant = int(row["instant"]) - shift
+    fill_imu(out.bytes, out.at, instant, row["rate"], row["covariance"])
+    if m and other["valid"]:
+        fill_force(out.bytes, out.at, rows.natural, other["rate"], other["covariance"])
+
+
+def _make_integrity(frame_id: str, names: Sequence[str], n: int) -> Template:
+    labels = integrity_labels(names, n)
+    return ChannelsTemplate(len(labels), labels)
+
+
+def _fill_integrity(out: Template, rows: Rows, n: int, m: int, shift: int) -> None:
+    fill_integrity(out.bytes, out.at, rows.gyros, n, shift)
+    if m:
+        behind = out.at + 8 * (n + 7)
+        fill_half(out.bytes, behind, rows.accelerometers, m, rows.natural)
+
+
 FUSED = SampleOutput(
     Topic("fused", "sensor_msgs/msg/Imu"),
-    lambda frame_id, names: ImuTemplate(frame_id),
-    lambda out, row, n, shift: fill_imu(
-        out.bytes, out.at, int(row["instant"]) - shift, row["rate"], row["covariance"]
-    ),
+    lambda frame_id, names, n: ImuTemplate(frame_id),
+    _fill_fused,
     needs_rate=True,
 )
 INTEGRITY = SampleOutput(
     Topic("~/integrity", "std_msgs/msg/Float64MultiArray"),
-    lambda frame_id, names: ChannelsTemplate(len(names) + 7, integrity_labels(names)),
-    lambda out, row, n, shift: fill_integrity(out.bytes, out.at, row, n, shift),
+    _make_integrity,
+    _fill_integrity,
     on_demand=True,
 )
 OUTPUTS = (FUSED, INTEGRITY)  # of each sample, live and in an output bag
 
 
 class Encoder:
-    """Makes messages of the output of a monitor, from the frame_id of the fused rate and the names of the channels."""
+    """Makes messages of the output of a monitor, from the frame_id of the fused rate and the names of the channels.
 
-    def __init__(self, frame_id: str, names: Sequence[str]) -> None:
-        self.n = len(names)
-        self.templates = {output: output.make(frame_id, names) for output in OUTPUTS}
+    ``gyros``: how many of the channels, the first ones, are gyros.
+    """
 
-    def fill(self, output: SampleOutput, row: Any, shift: int = 0) -> None:
-        """Write the message about one sample, an `fdi_ros.core.records.OutputRow`, in place."""
-        output.fill(self.templates[output], row, self.n, shift)
+    def __init__(self, frame_id: str, names: Sequence[str], gyros: int) -> None:
+        self.n, self.m = gyros, len(names) - gyros
+        self.templates = {
+            output: output.make(frame_id, names, gyros) for output in OUTPUTS
+        }
+
+    def fill(self, output: SampleOutput, rows: Rows, shift: int = 0) -> None:
+        """Write the message about one sample in place."""
+        output.fill(self.templates[output], rows, self.n, self.m, shift)
 
     def encode(
         self, results: Output, shift: int = 0
     ) -> Iterator[tuple[Topic, int, bytes]]:
         """Encode the messages about samples: topic, stamp of the sample, ns, and bytes, stamped less the shift."""
-        for row in results.rows:
+        others = results.acceleration
+        for k, row in enumerate(results.rows):
+            rows = Rows(row, None if others is None else others.rows[k], 1.0)
             for output, template in self.templates.items():
                 if row["valid"] or not output.needs_rate:
-                    self.fill(output, row, shift)
+                    self.fill(output, rows, shift)
                     yield output.topic, int(row["stamp"]), template.bytes.tobytes()

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -27,9 +28,16 @@ from fdi_ros.core.subsets import (
     single_losses,
 )
 from fdi_ros.detectors.base import Detector
-from fdi_ros.errors import ConfigError
+from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.model.geometry import spans_space
+from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.accelerometers import (
+    accelerometer_config,
+    felt_units,
+    lever_arms,
+    possible_names,
+)
 from fdi_ros.monitor.building import (
     GUARD,
     alarm_probability,
@@ -41,7 +49,7 @@ from fdi_ros.monitor.building import (
     suit_detector,
 )
 from fdi_ros.monitor.integrity import Integrity
-from fdi_ros.monitor.output import Event, Output, events_of
+from fdi_ros.monitor.output import Event, Output, events_of, of_accelerometers
 from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.system.text import html_table
 
@@ -49,7 +57,10 @@ EVENTS = 1024  # events that the sample path writes down at once
 
 
 class Pipeline:
-    """Monitor of one vehicle's gyros.
+    """Monitor of one vehicle's gyros, and of its accelerometers where their samples come.
+
+    Both halves are monitors of this class: that of the accelerometers has settings of its own, made from the same file
+    (`fdi_ros.monitor.accelerometers`), and works each sample after the gyros.
 
     Parameters
     ----------
@@ -66,7 +77,14 @@ class Pipeline:
         self.config = config = Config.of(config)
         self.geometry = build_geometry(config)
         self.noise = build_noise(config, self.geometry.n)
-        self.channel_names = self.geometry.channel_names
+        self.quantity = RATE
+        self.accelerometers: Pipeline | None = None
+        """The other half; None: there are no accelerometers, or no sample has come yet that shows which."""
+        self.undecided = config.has_units and config.accelerometers.enabled == "auto"
+        """Whether the first samples are to show which units have accelerometers."""
+        self.felt: tuple[int, ...] = ()
+        """Numbers of the units whose accelerometers are judged."""
+        self._built: dict[tuple[int, ...], Pipeline] = {}
         self.core = build_core(config, self.geometry, self.noise)
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
         self.subsets = prepare_subsets(
@@ -81,6 +99,54 @@ class Pipeline:
         """Detector whose alarms declare: the guard, or another method on the corrected values."""
         self.integrity: Integrity
         self._equip(config, None)
+        if config.has_units and config.accelerometers.enabled == "on":
+            self.sense(range(len(config.topics)))
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of all channels, gyros first."""
+        return tuple(
+            name for half in self.halves for name in half.geometry.channel_names
+        )
+
+    @property
+    def halves(self) -> tuple[Pipeline, ...]:
+        """The monitor of the gyros, and that of the accelerometers if there are any."""
+        return (self,) if self.accelerometers is None else (self, self.accelerometers)
+
+    @property
+    def paths(self) -> tuple[Path, Path]:
+        """What the sample path works on: gyros, then accelerometers; the gyros again where there are none."""
+        return self.path, (self.accelerometers or self).path
+
+    def sense(self, units: Iterable[int]) -> None:
+        """Judge the accelerometers of these units, by their numbers, from now on; of fewer than two none."""
+        chosen, self.undecided = tuple(units), False
+        self.felt = chosen if len(chosen) > 1 else ()
+        self.accelerometers = self.build_accelerometers(chosen) if self.felt else None
+
+    def twin(self) -> Pipeline:
+        """Return another monitor with the same settings of the same channels, which has seen nothing."""
+        other = Pipeline(self.config)
+        if not self.undecided:
+            other.sense(self.felt)
+        return other
+
+    def arranged(self, block: Block) -> Block:
+        """Return a block with the accelerations that are judged; the first one decides which are, if that is open."""
+        if self.undecided and len(block):
+            self.sense(felt_units(block))
+        if self.accelerometers is None:
+            return replace(block, acceleration=None)
+        given, n = block.acceleration, 3 * len(self.felt)
+        if given is None:
+            nothing = np.full((len(block), n), np.nan)
+            given = Block(block.stamp, nothing, np.zeros((len(block), n), dtype=bool))
+        elif given.z.shape[1] == 3 * len(self.config.topics):
+            columns = [3 * unit + axis for unit in self.felt for axis in range(3)]
+            received = None if given.received is None else given.received[:, columns]
+            given = Block(given.stamp, given.z[:, columns], received)
+        return replace(block, acceleration=given)
 
     def __repr__(self) -> str:
         states = ", ".join(
@@ -88,18 +154,19 @@ class Pipeline:
             for one in self.status().channels
             if one.state.name != "OK"
         )
-        about = f"{self.detector.name}, {self.geometry.n} channels, {self.core['samples'][0]} samples"
+        count = f"{len(self.channel_names)} channels"
+        about = f"{self.detector.name}, {count}, {self.core['samples'][0]} samples"
         return f"Pipeline({about}; {states or 'every channel OK'})"
 
     def _repr_html_(self) -> str:
         status = self.status()
-        head = ("channel", "state", "reason", "bias rad/s", "noise, of noise_std")
+        head = ("channel", "state", "reason", "bias", "noise, of noise_std")
         rows = [
             (
                 one.name,
                 one.state.name,
                 one.reason.value,
-                f"{bias:.4g}",
+                f"{bias:.4g} {one.unit}",
                 f"{one.noise:.3g}" if one.noise else "-",
             )
             for one, bias in zip(status.channels, status.bias, strict=True)
@@ -132,7 +199,14 @@ class Pipeline:
             raise ConfigError(
                 f"{', '.join(fixed)} cannot change while the monitor runs"
             )
-        self._equip(config, self.config)
+        for units, other in self._built.items():
+            other.reconfigure(accelerometer_config(config, units))
+        try:
+            self._equip(config, self.config)
+        except FdiError:
+            for units, other in self._built.items():
+                other.reconfigure(accelerometer_config(self.config, units))
+            raise
         self.config = config
         if self.core["samples"][0]:
             update_level(self.core[0], self.subsets)
@@ -140,18 +214,20 @@ class Pipeline:
 
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias, counters and copies stay."""
-        declared = clear_declarations(self.core)
-        for detector in self.detectors:
-            detector.clear(declared)
+        for half in self.halves:
+            declared = clear_declarations(half.core)
+            for detector in half.detectors:
+                detector.clear(declared)
 
     def restart(self) -> None:
         """Forget all samples, as if the monitor had just been built with the settings that it has now."""
-        excluded = self.core["excluded"].copy()
-        self.core[:] = build_core(self.config, self.geometry, self.noise)
-        self.core["excluded"] = excluded
-        suit_detector(self.core, self.config, self.detector)
-        for detector in self.detectors:
-            detector.reset()
+        for half in self.halves:
+            kept = {name: half.core[name].copy() for name in ("excluded", "settings")}
+            half.core[:] = build_core(half.config, half.geometry, half.noise)
+            for name, value in kept.items():
+                half.core[name] = value
+            for detector in half.detectors:
+                detector.reset()
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked and there is no rate."""
@@ -166,9 +242,7 @@ class Pipeline:
             If the block has another number of channels, or stamps that do not increase.
         """
         samples = self._checked(block)
-        nothing = Output(
-            allocate(OutputRow, 0), self.geometry.n, (), self.channel_names
-        )
+        nothing = self._output(2 * (allocate(OutputRow, 0),), [])
         return next(self._parts(samples, False), nothing)
 
     def steps(self, block: Block) -> Iterator[Output]:
@@ -177,18 +251,25 @@ class Pipeline:
 
     def status(self) -> Status:
         """Snapshot after the last sample."""
-        return status_of(
-            self.core[0],
-            self.subsets,
-            self.guard,
-            self.detector,
-            self.integrity,
-            self.config,
+        status, *others = (
+            status_of(
+                half.core[0],
+                half.subsets,
+                half.guard,
+                half.detector,
+                half.integrity,
+                half.config,
+                half.quantity,
+            )
+            for half in self.halves
         )
+        return status.joined(others[0]) if others else status
 
     def prepare(self) -> None:
         """Prepare every loss of one channel or unit, now and after each change of detector: in flight none may wait."""
         self._in_flight = True
+        for other in self._built.values():
+            other.prepare()
         whole = len(self.subsets) - 1
         without_unit = [whole & ~mask_of(unit) for unit in self.geometry.units]
         for left in (whole, *single_losses(whole), *without_unit):
@@ -198,6 +279,10 @@ class Pipeline:
 
     def supply(self) -> None:
         """Prepare what the sample path has asked for; what was learned by the word of a copy of a unit is void."""
+        for half in self.halves:
+            half._supply()
+
+    def _supply(self) -> None:
         core = self.core[0]
         if core["copies"]["found"]:
             core["copies"]["found"] = False
@@ -211,6 +296,25 @@ class Pipeline:
             self.integrity.fill(self.subsets, int(core["wanted"]))
             update_level(core, self.subsets)
 
+    def build_accelerometers(self, numbers: Iterable[int]) -> Pipeline:
+        """Return the monitor of the accelerometers of some units, built once."""
+        units = tuple(numbers)
+        if units not in self._built:
+            other = Pipeline(accelerometer_config(self.config, units))
+            other.quantity = FORCE
+            settings = other.core["settings"][0]
+            settings["first"], settings["natural"] = self.geometry.n, FORCE.natural
+            places = [
+                3 * unit + axis for unit in range(len(units)) for axis in range(3)
+            ]
+            settings["places"][: len(places)] = places
+            arms = lever_arms(self.config, units)
+            settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
+            if self._in_flight:
+                other.prepare()
+            self._built[units] = other
+        return self._built[units]
+
     @property
     def detectors(self) -> tuple[Detector, ...]:
         """The guard, and the method that declares where it is another one."""
@@ -219,10 +323,11 @@ class Pipeline:
 
     def _equip(self, config: Config, before: Config | None) -> None:
         """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""
-        names = self.channel_names
-        if unknown := [name for name in config.excluded_channels if name not in names]:
+        names = self.geometry.channel_names
+        known = possible_names(config, names)
+        if unknown := [name for name in config.excluded_channels if name not in known]:
             raise ConfigError(
-                f"excluded_channels names {unknown[0]!r}, expected some of: {', '.join(names)}"
+                f"excluded_channels names {unknown[0]!r}, expected some of: {', '.join(known)}"
             )
         excluded = np.array([name in config.excluded_channels for name in names])
         if not spans_space(self.geometry.axes[~excluded]):
@@ -274,26 +379,48 @@ class Pipeline:
 
     def _parts(self, samples: NDArray[Any], stop: bool) -> Iterator[Output]:
         """Process samples in one part, or in parts that stop at a sample with events."""
-        rows = allocate(OutputRow, len(samples))
+        halves, paths, size = self.halves, self.paths, len(samples)
+        outs = allocate(OutputRow, size), allocate(OutputRow, size * (len(halves) - 1))
         events: list[Event] = []
         first = row = 0
-        while row < len(rows):
-            row, count, waits = run(self.path, samples, row, rows, self._events, stop)
+        while row < size:
+            row, count, waits = run(
+                paths, len(halves), samples, row, outs, self._events, stop
+            )
+            is_between = bool(self.core["half"][0])  # gyros have worked one sample more
             if count:
                 self._events["row"][:count] -= first
-                events += events_of(self._events[:count])
+                events += events_of(self._events[:count], self.geometry.n)
             if waits:
                 self.supply()
                 # The level of the row before was not known; otherwise this changes nothing.
-                rows["level"][row - 1] = self.core["last"]["level"][0]
-            if (events and stop) or row == len(rows):
-                yield Output(
-                    rows[first:row], self.geometry.n, events, self.channel_names
-                )
+                for half, rows in zip(halves, outs, strict=False):
+                    if not is_between:
+                        rows["level"][row - 1] = half.core["last"]["level"][0]
+            if (events and stop and not is_between) or row == size:
+                yield self._output((outs[0][first:row], outs[1][first:row]), events)
                 first, events = row, []
+
+    def _output(
+        self, rows: tuple[NDArray[Any], NDArray[Any]], events: list[Event]
+    ) -> Output:
+        """Put together what samples gave, rows (N,) of gyros and accelerometers, which leave in their unit."""
+        names, n, acceleration = self.channel_names, self.geometry.n, None
+        if self.accelerometers is not None:
+            for name in ("rate", "residual", "level"):
+                rows[1][name] *= FORCE.natural
+            rows[1]["covariance"] *= FORCE.natural**2
+            own = [
+                of_accelerometers(event, n) for event in events if event.channel >= n
+            ]
+            acceleration = Output(
+                rows[1], self.accelerometers.geometry.n, own, names[n:]
+            )
+        return Output(rows[0], n, events, names, acceleration)
 
     def _checked(self, block: Block) -> NDArray[Any]:
         """Return the samples of a block as the sample path takes them, (N,) `Sample`."""
+        block = self.arranged(block)
         stamp, z, n = np.asarray(block.stamp), np.asarray(block.z), self.geometry.n
         count = len(z)
         if z.shape[1] != n:
@@ -313,4 +440,8 @@ class Pipeline:
         samples = allocate(Sample, count)
         samples["stamp"], samples["z"][:, :n] = stamp, z
         samples["received"][:, :n] = True if block.received is None else block.received
+        if block.acceleration is not None:
+            m = block.acceleration.z.shape[1]
+            samples["force"][:, :m] = block.acceleration.z
+            samples["felt"][:, :m] = block.acceleration.delivered
         return samples

@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.compiling.compiled import Callback, allocate
 from fdi_ros.config.config import Config
-from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.live import MORE, NEVER, process
@@ -26,12 +26,15 @@ from fdi_ros.core.sources import SOURCES, Source, source_of
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Block
+from fdi_ros.model.samples import Array, Block
+from fdi_ros.monitor.accelerometers import felt_units, varies
 from fdi_ros.monitor.output import (
     FUSED,
     INTEGRITY,
+    OUTPUTS,
     Encoder,
     Event,
+    Rows,
     SampleOutput,
     events_of,
 )
@@ -143,23 +146,35 @@ class Receiver:
         self.errors = [""] * len(
             self.source.topics
         )  # why the last malformed message of each topic was refused
-        self._events = allocate(EventRow, n)
-        self.encoder = Encoder(config.body_frame, pipeline.channel_names)
+        self.live["channels"] = n
+        self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
+        if pipeline.undecided:
+            # Built now: no sample is to wait for that.
+            pipeline.build_accelerometers(range(len(self.source.topics)))
+        self._first_force: Array | None = None
+        """(1, m) accelerations of the first sample that had any, m/s^2."""
+        pipeline.prepare()
+        self._equip()
+        self.warm(self.source)
+
+    def _equip(self) -> None:
+        """Make room for events and messages of the channels that there are now."""
+        pipeline = self.pipeline
+        names = pipeline.channel_names
+        self._events = allocate(EventRow, len(names))
+        self.encoder = Encoder(pipeline.config.body_frame, names, pipeline.geometry.n)
         fused, integrity = (
             self.encoder.templates[output] for output in (FUSED, INTEGRITY)
         )
         self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
-        self.live["channels"] = n
-        self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         self._records = (
+            len(pipeline.halves),
             self.alignment.rows,
             self.live,
             self._events,
             fused.bytes,
             integrity.bytes,
         )
-        pipeline.prepare()
-        self.warm(self.source)
 
     def receive(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take in a message of an input topic.
@@ -175,12 +190,31 @@ class Receiver:
 
     def go_on(self) -> int:
         """Work the next sample."""
-        return int(process(self.pipeline.path, *self._records))
+        if self.pipeline.undecided:
+            self._sense()
+        return int(process(self.pipeline.paths, *self._records))
+
+    def _sense(self) -> None:
+        """Judge the accelerometers from the first sample on whose accelerations are not those of the first."""
+        sample = self.live["sample"]
+        if not sample["felt"].any():
+            return
+        if self._first_force is None:
+            self._first_force = sample["force"].copy()
+        if varies(np.vstack([self._first_force, sample["force"]])):
+            units = felt_units(as_block(sample, len(self.source.topics)))
+            self.pipeline.sense(units)
+            self._equip()
 
     def supply(self) -> None:
         """Prepare the constants requested by `SUPPLY`."""
         self.pipeline.supply()
-        self.encoder.fill(INTEGRITY, self.pipeline.core[0]["last"], self.shift)
+        self.encoder.fill(INTEGRITY, self._rows, self.shift)
+
+    @property
+    def _rows(self) -> Rows:
+        """What the last sample gave."""
+        return Rows(*(half.core[0]["last"] for half in self.pipeline.halves))
 
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""
@@ -191,13 +225,14 @@ class Receiver:
         """Return the message of an output about the last sample."""
         if output not in (FUSED, INTEGRITY):
             # Compiled code fills the other two.
-            self.encoder.fill(output, self.pipeline.core[0]["last"], self.shift)
+            self.encoder.fill(output, self._rows, self.shift)
         return self.encoder.templates[output].bytes.tobytes()
 
     @property
     def events(self) -> list[Event]:
         """Changes of state that the last sample brought."""
-        return events_of(self._events[: self.live["events"][0]])
+        count = self.live["events"][0]
+        return events_of(self._events[:count], self.pipeline.geometry.n)
 
     @property
     def shift(self) -> int:
@@ -221,10 +256,14 @@ class Receiver:
     def warm(self, kind: Source | type[Source]) -> None:
         """Load or compile the code for messages of a kind now, on copies, so that the first message need not wait."""
         path = Path(*(one.copy() for one in self.pipeline.path))
-        aside: Any = tuple(one.copy() for one in self._records)
+        halves, *records = self._records
+        aside: Any = tuple(one.copy() for one in records)
         kind.receive(self.alignment.rows.copy(), self.live.copy(), 0, _NOTHING, 0)
-        process(path, *aside)
-        self.encoder.fill(INTEGRITY, path.core[0]["last"])
+        process((path, path), halves, *aside)
+        row, names = path.core[0]["last"], self.pipeline.geometry.channel_names
+        encoder = Encoder("", 2 * names, len(names))
+        for output in OUTPUTS:
+            encoder.fill(output, Rows(row, row))
         self.alignment.is_live(0)
         _ = self.alignment.are_parted
         clear_declarations(path.core)

@@ -72,10 +72,12 @@ class RecentHealth:
         self._concerns: list[Concern] = []
 
     def add(self, status: Status, inputs: Sequence[InputStatus], at: float) -> None:
-        """Read the counts of a monitor at a time, s. Readings begin anew if time goes back."""
+        """Read the counts of a monitor at a time, s. Readings begin anew if time goes back or channels come."""
         reading = _reading(status, inputs, at)
-        if self._readings and not at > self._readings[-1].at:
-            self._readings.clear()
+        if self._readings:
+            before = self._readings[-1]
+            if not at > before.at or len(before.residual) != len(reading.residual):
+                self._readings.clear()
         self._readings.append(reading)
         units = list(self._units(status, inputs))
         self._concerns = concerns_of(list(self._channels(status)), units)
@@ -107,6 +109,7 @@ class RecentHealth:
                 spikes=int(spikes[i]),
                 saturated_s=float(at_end[i]) / status.config.sample_rate,
                 residual_rms_rad_s=rms[i],
+                measured_in=one.unit,
             )
 
     def _residual_rms(self, status: Status) -> list[float | None]:

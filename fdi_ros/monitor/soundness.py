@@ -64,6 +64,8 @@ class ChannelHealth:
     residual_rms_rad_s: float | None = None
     """Root mean square of its difference from the fused rate while it was OK, rad/s.
     None: never OK, or not measured."""
+    measured_in: str = "rad/s"
+    """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
     doubt: str = ""
     """What is wrong with it at the end: ``under suspicion from 16.5 s on``; empty: nothing."""
 
@@ -169,7 +171,11 @@ def concerns_of(
             for one in channels
             if one.spikes >= LEAST_SPIKES
         ),
-        *_noisy(channels),
+        *(
+            concern
+            for unit in dict.fromkeys(one.measured_in for one in channels)
+            for concern in _noisy([one for one in channels if one.measured_in == unit])
+        ),
     ]
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_words
 from fdi_ros.model.noise import assumption_words
+from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import plus_minus
@@ -53,22 +54,23 @@ class ChannelStatus:
     reason: Reason
     since: int  #: Stamp of the sample that brought the state, ns, 0 before the first sample.
     group: tuple[str, ...]  #: AMBIGUOUS: names of the set one of which is faulty.
-    error: float  #: Estimated error when declared or suspected, rad/s.
-    residual: float  #: Of the last sample, rad/s, NaN where missing.
+    error: float  #: Estimated error when declared or suspected, in ``unit``.
+    residual: float  #: Of the last sample, in ``unit``, NaN where missing.
     last_received: int  #: Stamp of the last sample with a value, ns, 0 if none.
     counts: Mapping[str, int]
     """``samples``, with ``missing``, ``non-finite``, ``out of range`` and ``stuck`` among them, and ``spikes``: how
     often a few values were far off and left out of the rate."""
     #: Share of the recent samples in which the channel gave a finite value.
     delivers: float = 1.0
-    drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, rad/s.
-    #: Bias learned at the start, beyond ``bias.fixed``, rad/s.
+    drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, in ``unit``.
+    #: Bias learned at the start, beyond ``bias.fixed``, in ``unit``.
     start_bias: float = 0.0
-    #: Standard deviation of the bias without the part common to all channels, rad/s,
-    #: NaN: not estimated.
+    #: Standard deviation of the bias without the part common to all channels, in
+    #: ``unit``, NaN: not estimated.
     bias_std: float = math.nan
     noise: float = 0.0  #: Recent noise in noise_std, 0 if not measured.
     noisy: bool = False  #: Whether that is much, and more than the others show.
+    unit: str = RATE.unit  #: rad/s of a gyro, m/s^2 of an accelerometer.
 
     @property
     def is_left_out(self) -> bool:
@@ -100,11 +102,12 @@ class ApartStatus:
 
     channels: tuple[str, str]
     who: str  # the two in words
-    size: float  # by how much they differ, rad/s
-    std: float  # standard deviation of the difference, rad/s, NaN if unknown
+    size: float  # by how much they differ, in the unit
+    std: float  # standard deviation of the difference, NaN if unknown
+    unit: str = RATE.unit
 
     def __str__(self) -> str:
-        return f"{self.who.removesuffix(',')}, {plus_minus(self.size, self.std)} rad/s apart"
+        return f"{self.who.removesuffix(',')}, {plus_minus(self.size, self.std)} {self.unit} apart"
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Status:
     stamp: int  #: Of the last sample, ns, 0 before the first.
     samples: int
     detector: str
-    channels: tuple[ChannelStatus, ...]
+    channels: tuple[ChannelStatus, ...]  #: Gyros, then accelerometers.
     statistic: float
     threshold: float
     has_rate: bool  #: Whether the last sample gave a fused rate.
@@ -150,7 +153,7 @@ class Status:
     can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
     bias: tuple[
         float, ...
-    ]  #: Subtracted from each channel, rad/s: the bias of the start, and its drift in flight.
+    ]  #: Subtracted from each channel, in its unit: the bias of the start, and its drift in flight.
     bias_state: str  #: Words: fixed, learned, learning, refused and why, followed from a start in motion.
     note: str  #: Why checking is limited, in words, empty without limits.
     protection_level: tuple[float, float, float] = (math.inf,) * 3
@@ -171,6 +174,36 @@ class Status:
     apart: ApartStatus | None = (
         None  #: Where a set is declared: the pair of its channels that surely differs.
     )
+    acceleration: Status | None = None
+    """The same of the accelerometers alone, in m/s^2 where it is rad/s here; None: there are none."""
+
+    def joined(self, acceleration: Status) -> Status:
+        """Return the status of the gyros, this one, with that of the accelerometers of the same units."""
+        other = {unit.name: unit for unit in acceleration.units}
+        units = (
+            replace(
+                unit,
+                channels=unit.channels + other[unit.name].channels,
+                frozen=max(unit.frozen, other[unit.name].frozen),
+            )
+            if unit.name in other
+            else unit
+            for unit in self.units
+        )
+        notes = dict.fromkeys(filter(None, (self.note, acceleration.note)))
+        return replace(
+            self,
+            channels=self.channels + acceleration.channels,
+            can_detect=self.can_detect + acceleration.can_detect,
+            can_isolate=self.can_isolate + acceleration.can_isolate,
+            bias=self.bias + acceleration.bias,
+            note="; ".join(notes),
+            units=tuple(units),
+            errors=self.errors + acceleration.errors,
+            copies=tuple(dict.fromkeys(self.copies + acceleration.copies)),
+            apart=self.apart or acceleration.apart,
+            acceleration=acceleration,
+        )
 
     def is_far(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
@@ -189,12 +222,14 @@ def status_of(
     detector: Detector,
     integrity: Integrity,
     config: Config,
+    quantity: Quantity = RATE,
 ) -> Status:
-    """Snapshot of a monitor after its last sample.
+    """Snapshot of one half of a monitor after its last sample.
 
     ``subsets`` (2^n,): capability of every set of channels. ``guard``: detector that keeps the estimator. ``detector``:
-    the one that declares.
+    the one that declares. ``quantity``: what the channels measure.
     """
+    natural = quantity.natural
     geometry = detector.geometry
     names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
     begun, state = bool(core["samples"]), core["state"][:n]
@@ -207,14 +242,17 @@ def status_of(
         np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED))
     )
     valid = begun and bool(last["valid"])
-    x, y, z = last["level"].tolist()
+    x, y, z = (natural * last["level"]).tolist()
+    after_loss = NO_LEVEL
+    if valid:
+        after_loss = integrity.after_loss(subsets, int(now["fused"]) & well)
     late, late_std = _delays(guard, begun)
     return Status(
         config=config,
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
         detector=detector.name,
-        channels=tuple(_channel(core, i, names) for i in range(n)),
+        channels=tuple(_channel(core, i, names, quantity) for i in range(n)),
         statistic=float(last["statistic"]) if begun else math.nan,
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
@@ -223,27 +261,33 @@ def status_of(
         can_detect=_named(names, seen),
         can_isolate=_named(names, isolable & seen),
         bias=tuple(
-            (core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n].tolist()
+            (
+                natural
+                * (core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n]
+            ).tolist()
         ),
         bias_state=_format_bias(core["bias"], names, config.bias.turn_on_std),
         note=note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
-        protection_level_after_loss=integrity.after_loss(
-            subsets, int(now["fused"]) & well
-        )
-        if valid
-        else NO_LEVEL,
+        protection_level_after_loss=(
+            natural * after_loss[0],
+            natural * after_loss[1],
+            natural * after_loss[2],
+        ),
         units=_units(core, guard, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
-        errors=_errors(guard, begun),
+        errors=_errors(guard, begun, quantity),
         names_rest_on=rests_on,
         copies=_copies(core, geometry, config),
-        apart=_apart(guard, core),
+        apart=_apart(guard, core, quantity),
     )
 
 
-def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
+def _channel(
+    core: Any, i: int, names: Sequence[str], quantity: Quantity
+) -> ChannelStatus:
+    natural = quantity.natural
     health, state = core["health"], ChannelState(core["state"][i])
     count, begun = health["counts"][:, i], bool(core["samples"])
     return ChannelStatus(
@@ -254,8 +298,8 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         group=tuple(names[k] for k in members(int(core["group"])))
         if state == ChannelState.AMBIGUOUS
         else (),
-        error=float(core["error"][i]),
-        residual=float(core["last"]["residual"][i]) if begun else math.nan,
+        error=natural * float(core["error"][i]),
+        residual=natural * float(core["last"]["residual"][i]) if begun else math.nan,
         last_received=int(health["received_stamp"][i]) if health["samples"][i] else 0,
         counts={
             "samples": int(health["samples"][i]),
@@ -268,11 +312,13 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
             "spikes": int(core["sample"]["estimate"]["spikes"][i]),
         },
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
-        drift=float(core["sample"]["estimate"]["bias"][i]),
-        start_bias=float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
-        bias_std=float(core["remaining"][i]),
+        drift=natural * float(core["sample"]["estimate"]["bias"][i]),
+        start_bias=natural
+        * float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
+        bias_std=natural * float(core["remaining"][i]),
         noise=float(core["now"]["verdict"]["noise"][i]),
         noisy=is_in(i, int(core["now"]["noisy"])),
+        unit=quantity.unit,
     )
 
 
@@ -377,7 +423,9 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     )
 
 
-def _errors(guard: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
+def _errors(
+    guard: Detector, begun: bool, quantity: Quantity
+) -> tuple[ErrorStatus, ...]:
     if not begun:
         return ()
     estimator, layout, names = (
@@ -390,6 +438,11 @@ def _errors(guard: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
         layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"])
     )
     for kind in ERROR_KINDS:
+        is_scaled = kind.unit.startswith(RATE.unit)
+        factor = quantity.natural if is_scaled else 1.0
+        unit = quantity.unit if kind.unit == RATE.unit else kind.unit
+        if is_scaled and kind.unit != RATE.unit:
+            unit = f"{quantity.unit}/s"
         owners = units[1:] if kind.per_unit else names.channel_names
         for owner, places in zip(
             owners, places_of(kind.name, names.n, len(units)), strict=True
@@ -406,16 +459,16 @@ def _errors(guard: Detector, begun: bool) -> tuple[ErrorStatus, ...]:
                     ErrorStatus(
                         owner,
                         kind.name + part,
-                        kind.unit,
-                        value,
-                        std,
-                        float(prior[place]),
+                        unit,
+                        factor * value,
+                        factor * std,
+                        factor * float(prior[place]),
                     )
                 )
     return tuple(found)
 
 
-def _apart(guard: Detector, core: Any) -> ApartStatus | None:
+def _apart(guard: Detector, core: Any, quantity: Quantity) -> ApartStatus | None:
     """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
     geometry, group = guard.geometry, set(members(int(core["group"])))
     case, found, largest = guard.states[0]["case"], None, 0.0
@@ -446,7 +499,13 @@ def _apart(guard: Detector, core: Any) -> ApartStatus | None:
         if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
             names = geometry.channel_names[a], geometry.channel_names[b]
             found, largest = (
-                ApartStatus(names, one_of_words(geometry, (a, b)), size, std),
+                ApartStatus(
+                    names,
+                    one_of_words(geometry, (a, b)),
+                    quantity.natural * size,
+                    quantity.natural * std,
+                    quantity.unit,
+                ),
                 certainty,
             )
     return found

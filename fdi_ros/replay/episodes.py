@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
@@ -136,6 +136,8 @@ class Episode:
     evidence: Evidence
     rate: RateMeanwhile
     words: str = ""  # the whole in one sentence
+    measured_in: str = RADIANS.name
+    """rad/s, or m/s^2 of accelerometers: then sizes and standard deviations are of the specific force."""
     injected: tuple[str, ...] = ()  # injected faults that explain it
 
     @property
@@ -209,7 +211,8 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     if size.course == "proportional":
         # Two digits, and never -1e+02.
         share = float(f"{100 * (size.share_of_rate or 0.0):.2g}")
-        return f"{share:+g} % of the rate, {figure} rms"
+        of = "specific force" if unit == FORCES else "rate"
+        return f"{share:+g} % of the {of}, {figure} rms"
     if size.course == "noisy":
         return f"noise of {figure}"
     if size.course == "varying":
@@ -222,8 +225,22 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     return figure if size.course == "steady" else f"{figure}, {size.course}"
 
 
+class _Measured(Protocol):
+    """Something with figures in a unit."""
+
+    @property
+    def measured_in(self) -> str:
+        """Name of the unit."""
+
+
+def unit_for(one: _Measured, unit: Unit) -> Unit:
+    """Return the unit for figures of an episode or a channel; ``unit``: that of rates."""
+    return unit if one.measured_in == RADIANS.name else FORCES
+
+
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     """Tell of an episode in one sentence, without a full stop."""
+    unit = unit_for(one, unit)
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     about, before = _about(one, unit), _before(one)
     if one.apart is not None:
@@ -310,6 +327,7 @@ def detail_words(
     one: Episode, unit: Unit = RADIANS, scored: bool = False
 ) -> list[tuple[str, str]]:
     """Tell the rest of an episode, each line under its title; scored: faults were injected."""
+    unit = unit_for(one, unit)
     injected = (
         [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
     )
@@ -329,7 +347,8 @@ def detail_words(
             ("evidence", _evidence(one)),
             ("what else explains it", _rivals(one, unit)),
         ]
-    return [*lines, ("fused rate meanwhile", _rate(one, unit)), *injected]
+    what = "rate" if one.measured_in == RADIANS.name else "specific force"
+    return [*lines, (f"fused {what} meanwhile", _rate(one, unit)), *injected]
 
 
 def _growth(one: Candidate, unit: Unit) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import Batch
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.soundness import UnitHealth
 
@@ -34,6 +34,8 @@ LEAST_SLOW = 3
 
 LEAST_RAIL = 4.0
 """Smallest end of a range, rad/s; gyros of 250 deg/s end at 4.36 rad/s."""
+LEAST_FORCE_RAIL = 19.0
+"""The same of an accelerometer, m/s^2: those of 2 g end at 19.6 m/s^2."""
 RAIL_RUN = 5
 """Consecutive samples at the largest value that show the end of a range."""
 
@@ -150,9 +152,9 @@ def with_delivery(unit: UnitHealth, delivery: Delivery) -> UnitHealth:
 class Values:
     """Counts finite values and saturated samples of channels, block after block."""
 
-    def __init__(self, geometry: Geometry) -> None:
-        n = geometry.n
-        self._largest = np.full(n, LEAST_RAIL)
+    def __init__(self, n: int, quantity: Quantity = RATE) -> None:
+        least = LEAST_RAIL if quantity == RATE else LEAST_FORCE_RAIL
+        self._largest = np.full(n, least)
         self._run = np.zeros(n, dtype=np.int64)  # samples in a row at the largest value
         self.samples = 0
         """Samples so far."""

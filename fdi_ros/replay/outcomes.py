@@ -20,6 +20,7 @@ import numpy as np
 from fdi_ros.core.states import ChannelState
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.quantity import RATE
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.episodes import DECLARED
@@ -157,9 +158,8 @@ class StateChange:
     group: tuple[
         str, ...
     ]  # Channels of which one is faulty; the channel itself where it is declared by itself.
-    error: (
-        float | None
-    )  # Estimated error of the channel, rad/s; None: the method gives none.
+    error: float | None  # Estimated error of the channel; None: the method gives none.
+    measured_in: str = RATE.unit  # Unit of the error: rad/s, of an accelerometer m/s^2.
 
     @property
     def declares(self) -> bool:
@@ -299,9 +299,13 @@ class Followed:
 class Evaluation:
     """Scores one monitor on one stream with the faults of an injector, block after block."""
 
-    def __init__(self, injector: Injector, geometry: Geometry) -> None:
+    def __init__(
+        self, injector: Injector, geometry: Geometry, names: Sequence[str] = ()
+    ) -> None:
+        """``geometry``: of the gyros. ``names``: of all channels; empty: of the gyros."""
         self.injector = injector
-        self.names = geometry.channel_names
+        self.names = tuple(names) or geometry.channel_names
+        n = len(self.names)
         pairs = zip(injector.faults, injector.channels, strict=True)
         self.faults = [
             Followed(fault, channels, self.names) for fault, channels in pairs
@@ -312,13 +316,11 @@ class Evaluation:
             np.zeros(3, dtype=np.int64),
         )  # those judged, with a rate, with an alarm
         self._unexplained: list[StateChange] = []
-        self._unchecked = np.zeros(
-            geometry.n
-        )  # samples in which nothing checked the channel
-        self._residuals = np.zeros((2, geometry.n))
+        self._unchecked = np.zeros(n)  # samples in which nothing checked the channel
+        self._residuals = np.zeros((2, n))
         """Of each channel while it is OK: sum of the squared residuals, and their number."""
         self._least_squares = geometry.least_squares
-        self._state = [ChannelState.OK] * geometry.n
+        self._state = [ChannelState.OK] * n
         self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
         self.last = 0  # stamp of the last sample, ns
@@ -339,7 +341,11 @@ class Evaluation:
             int(output.valid.sum()),
             int(output.alarm.sum()),
         )
-        self._unchecked += (_UNCHECKED[output.state] | ~judged[:, None]).sum(axis=0)
+        unchecked = [
+            _UNCHECKED[half.state] | ~np.isfinite(half.threshold)[:, None]
+            for half in output.halves
+        ]
+        self._unchecked += np.hstack(unchecked).sum(axis=0)
         fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
         self._residuals += (
             (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0),
@@ -408,6 +414,7 @@ class Evaluation:
             reason=event.reason.value,
             group=tuple(self.names[i] for i in event.group),
             error=finite(event.error),
+            measured_in=event.unit,
         )
         self.events.append(change)
         if event.after in (ChannelState.OK, ChannelState.UNCHECKED):

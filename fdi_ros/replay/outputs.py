@@ -41,11 +41,16 @@ class CsvFile(Sink):
     """A table of all samples, in a file open for writing text.
 
     The columns: stamp, ns; fused rate and its standard deviation, rad/s; statistic, threshold, alarm; then of every
-    channel what came in, rad/s, its residual, rad/s, and its state. Empty where there is nothing.
+    channel what came in, its residual, and its state; rad/s, of accelerometers m/s^2. Empty where there is nothing.
     """
 
-    def __init__(self, file: TextIO, names: tuple[str, ...]) -> None:
+    def __init__(self, file: TextIO) -> None:
         self._writer = csv.writer(file)
+        self._begun = False
+
+    def _begin(self, names: Sequence[str]) -> None:
+        """Write the head, for channels of these names."""
+        self._begun = True
         head = [
             "stamp",
             "rate_x",
@@ -69,11 +74,14 @@ class CsvFile(Sink):
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Write the next samples."""
+        if not self._begun:
+            self._begin(pipeline.channel_names)
         variance = np.diagonal(output.covariance, axis1=1, axis2=2)
         numbers = np.column_stack(
             [output.rate, np.sqrt(variance), output.statistic, output.threshold]
         )
-        channels = np.stack([block.z, output.residual], axis=2).tolist()
+        values = np.hstack([half.z for half in block.halves])
+        channels = np.stack([values, output.residual], axis=2).tolist()
         states = _STATES[output.state].tolist()
         rows = zip(
             output.stamp.tolist(),
@@ -107,11 +115,12 @@ class OutputBag(Sink):
     stops_at_events = True
     period = 1_000_000_000  # of the regular diagnostics, ns
 
-    def __init__(self, path: Path, config: Config, names: Sequence[str]) -> None:
+    def __init__(self, path: Path, config: Config) -> None:
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # By this it may be replaced later: what anything else has recorded never is.
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
-        self._encoder = Encoder(config.body_frame, names)
+        self._frame = config.body_frame
+        self._encoder: Encoder | None = None  # from the first samples on
         self._source = source_of(config)
         self._before: list[tuple[Newest, dict[str, int]]] = [
             (Newest(), {}) for _ in config.topics
@@ -149,6 +158,9 @@ class OutputBag(Sink):
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Write what the node would have published of these samples."""
+        if self._encoder is None:
+            names, n = pipeline.channel_names, pipeline.geometry.n
+            self._encoder = Encoder(self._frame, names, n)
         for topic, stamp, data in self._encoder.encode(output, self._shift):
             self._writer.write(self._outputs[topic], self._time(stamp), data)
         if output.events:

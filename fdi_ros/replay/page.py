@@ -23,10 +23,11 @@ from fdi_ros.replay.episodes import (
     detail_words,
     episode_words,
     stretch_words,
+    unit_for,
 )
 from fdi_ros.replay.outcomes import Outcome, StateChange
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import AutopilotText, Summary
+from fdi_ros.replay.summary import AutopilotText, ChannelResult, Summary
 from fdi_ros.replay.verdict import verdict_of
 from fdi_ros.replay.words import fault_sections, health_section, notes, sentences
 from fdi_ros.report.layout import (
@@ -98,11 +99,12 @@ class Report(Sink):
         """Take in the next samples."""
         if not len(output):
             return
-        time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         if not self._first_states:
             self._first_states = [
                 ChannelState(state).name for state in output.state[0].tolist()
             ]
+        output = output.halves[0]
+        time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         rates = (
             np.column_stack([output.rate, deviation, output.level, output.residual])
@@ -142,7 +144,8 @@ class Report(Sink):
             **common,
             "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)],
         }
-        states = _timeline(self.names, self._first_states, summary, quiet)
+        names = [one.name for one in summary.monitor.channels]
+        states = _timeline(names, self._first_states, summary, quiet)
         statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
         levels = [
             _line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)
@@ -271,8 +274,10 @@ class Report(Sink):
 def _channel_section(summary: Summary, unit: Unit) -> Section:
     """Lay out the channels as they are at the end."""
 
-    def rate(value: float | None, form: str) -> str:
-        return number(value and value * unit.factor, form)
+    def figure(one: ChannelResult, value: float | None, form: str) -> str:
+        if one.measured_in == RADIANS.name:
+            return number(value and value * unit.factor, form)
+        return number(value, form, f" {one.measured_in}")
 
     columns: Columns = {
         "channel": lambda one: one.name,
@@ -282,10 +287,14 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
         ),
         "reason": lambda one: one.reason or "-",
         "not checked": lambda one: f"{one.unchecked:.1%}",
-        f"residual, {unit.name} rms": lambda one: rate(one.residual_rms_rad_s, ".2g"),
+        f"residual, {unit.name} rms": lambda one: figure(
+            one, one.residual_rms_rad_s, ".2g"
+        ),
         "noise, noise_std": lambda one: number(one.noise, ".2g"),
         "spikes": lambda one: str(one.spikes),
-        f"bias followed, {unit.name}": lambda one: rate(one.bias_followed, "+.2g"),
+        f"bias followed, {unit.name}": lambda one: figure(
+            one, one.bias_followed, "+.2g"
+        ),
     }
     return Section(
         "Channels",
@@ -336,7 +345,9 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
         "one of": lambda event: (
             ", ".join(event.group) if event.state == "AMBIGUOUS" else ""
         ),
-        "error": lambda event: unit.words(event.error, 4) if event.error else "",
+        "error": lambda event: (
+            unit_for(event, unit).words(event.error, 4) if event.error else ""
+        ),
     }
     more = (
         f" {len(events) - MOST_ROWS} more are left out."

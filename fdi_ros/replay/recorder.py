@@ -32,6 +32,7 @@ from fdi_ros.model.geometry import (
     spans_space,
 )
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.episodes import (
@@ -97,15 +98,18 @@ class _Open:
 class Recorder:
     """Tells the story of one monitor on one stream, block after block; memory does not grow with its length."""
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel) -> None:
-        self._geometry = geometry
+    def __init__(
+        self, geometry: Geometry, noise: NoiseModel, quantity: Quantity = RATE
+    ) -> None:
+        """``noise``: in units of the natural size of the quantity."""
+        self._geometry, self._quantity = geometry, quantity
         noise = noise.for_channels(geometry.n)
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._stds: Array = np.array(
             [
-                noise.noise_std,
+                quantity.natural * noise.noise_std,
                 noise.scale_std * norm,
-                noise.bias_std * np.ones(geometry.n),
+                quantity.natural * noise.bias_std * np.ones(geometry.n),
             ]
         )
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
@@ -459,6 +463,7 @@ class Recorder:
             steps=tuple(one.steps),
             candidates=tuple(candidates),
             apart=self._apart(one),
+            measured_in=self._quantity.unit,
             evidence=Evidence(
                 one.reason, finite(one.ratio), one.alarms, one.last_alarm
             ),

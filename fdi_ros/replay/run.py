@@ -30,13 +30,12 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.soundness import UnitHealth
 from fdi_ros.monitor.status import ChannelStatus, Status
-from fdi_ros.replay.episodes import GAP, pieces
+from fdi_ros.replay.episodes import GAP, Story, pieces
 from fdi_ros.replay.health import Deliveries, Values, with_delivery
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
@@ -166,17 +165,22 @@ class Judge(Walk):
     ) -> None:
         super().__init__(pipeline, sinks)
         self.injector = injector
-        self.evaluation = Evaluation(injector, pipeline.geometry)
+        self.evaluation = Evaluation(
+            injector, pipeline.geometry, pipeline.channel_names
+        )
         self._intervals: list[
             tuple[float, int]
         ] = []  # of each piece: the usual one, ns, and how many samples have it
-        self._recorder = Recorder(pipeline.geometry, pipeline.noise)
+        self._recorders = [
+            Recorder(half.geometry, half.noise, half.quantity)
+            for half in pipeline.halves
+        ]
         self._degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
-        self._reference = (
-            Pipeline.from_config(pipeline.config) if injector.faults else None
-        )
-        self._values = Values(pipeline.geometry)
+        self._reference = pipeline.twin() if injector.faults else None
+        self._values = [
+            Values(half.geometry.n, half.quantity) for half in pipeline.halves
+        ]
         self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
         """Stamp of the last value of each channel as it was recorded, ns."""
         self._clean: Array | None = None
@@ -192,16 +196,19 @@ class Judge(Walk):
         if self._reference is not None:
             self._reference.reset()
         self.evaluation.begin_stretch()
-        self._recorder.begin_stretch()
+        for recorder in self._recorders:
+            recorder.begin_stretch()
 
     def feed(self, block: Block) -> None:
         """Pass a piece without a gap through the monitor, with the faults in it."""
+        block = self.pipeline.arranged(block)
         if len(block) > 1:
             self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
         for i in np.flatnonzero(np.isfinite(block.z).any(axis=0)).tolist():
             self._delivered[i] = block.stamp[np.isfinite(block.z[:, i])][-1]
         faulty = self.injector.apply(block)
-        self._values.add(faulty)
+        for values, half in zip(self._values, faulty.halves, strict=True):
+            values.add(half)
         if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
             limit = np.array(self.pipeline.config.health.max_rate)
@@ -218,7 +225,9 @@ class Judge(Walk):
     def add(self, block: Block, output: Output, rows: slice) -> None:
         """Take in what came of some rows of the piece."""
         self.evaluation.add(output, None if self._clean is None else self._clean[rows])
-        self._recorder.add(np.round(self.injector.time(output.stamp), 9), output)
+        time = np.round(self.injector.time(output.stamp), 9)
+        for recorder, half in zip(self._recorders, output.halves, strict=True):
+            recorder.add(time, half)
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
@@ -242,7 +251,7 @@ class Judge(Walk):
             ),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
         )
-        story, episodes = self._recorder.story(end), []
+        story, episodes = _joined([one.story(end) for one in self._recorders]), []
         for one in story.episodes:
             known = [
                 followed.fault
@@ -262,8 +271,15 @@ class Judge(Walk):
         self, end: float, statuses: Sequence[ChannelStatus]
     ) -> Iterator[ChannelResult]:
         """Yield each channel as it was at a time near the end, s."""
-        values, evaluation = self._values, self.evaluation
-        samples = max(1, values.samples)
+        evaluation = self.evaluation
+        samples = max(1, self._values[0].samples)
+        finite_values, saturated = (
+            np.concatenate([getattr(one, name) for one in self._values]).tolist()
+            for name in ("finite", "saturated")
+        )
+        units = [
+            unit for half in self.pipeline.halves for unit in half.geometry.unit_of
+        ]
         for i, status in enumerate(statuses):
             changes = [one for one in evaluation.events if one.channel == status.name]
             before = [one for one in changes if one.at_s <= end]
@@ -276,15 +292,16 @@ class Judge(Walk):
                 )
             elif changes:
                 state, reason = changes[0].before, ""
-            delivered = float(values.finite[i]) / samples
+            delivered = float(finite_values[i]) / samples
             unchecked = float(evaluation.unchecked[i])
             yield ChannelResult(
                 name=status.name,
-                unit=self.pipeline.geometry.unit_of[i],
+                unit=units[i],
+                measured_in=status.unit,
                 checked=min(1.0, (1.0 - unchecked) / delivered) if delivered else 0.0,
                 delivered=delivered,
                 spikes=status.counts["spikes"],
-                saturated_s=float(values.saturated[i]) / (self.rate or math.inf),
+                saturated_s=float(saturated[i]) / (self.rate or math.inf),
                 residual_rms_rad_s=evaluation.residual_rms[i],
                 doubt=_doubt_words(state, since, reason, end),
                 state=state,
@@ -333,6 +350,15 @@ class Judge(Walk):
             return None
         step, count = np.array(sorted(self._intervals)).T
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
+
+
+def _joined(stories: Sequence[Story]) -> Story:
+    """Put together the stories of gyros and accelerometers, with the stretches of the former."""
+    episodes = [one for story in stories for one in story.episodes]
+    episodes.sort(key=lambda one: (one.start_s, one.since_s))
+    return Story(
+        stories[0].stretches, tuple(episodes), sum(story.more for story in stories)
+    )
 
 
 def _doubt_words(state: str, since: float | None, reason: str, end: float) -> str:
@@ -424,15 +450,16 @@ def replay(
     else:
         settings = Config.of(config)
     begun, period = clock(), max((sink.period for sink in sinks), default=0)
-    injector = Injector(
-        tuple(map(_fault, faults)), build_geometry(settings).channel_names
-    )
-    judge = Judge(Pipeline.from_config(settings), injector, sinks)
+    given = tuple(map(_fault, faults))
+    judge: Judge | None = None
     deliveries = Deliveries(len(settings.topics), start)
     taps = [*(sink.tap for sink in sinks), deliveries.tap]
     with Recording(bag) as recording:
         samples = Samples(recording, settings, start, end, taps, period)
         for block in samples.blocks():
+            if judge is None:
+                judge = _judge_of(settings, samples, given, sinks)
+            injector = judge.injector
             injector.start_stamp = samples.origin
             if len(block) and not judge.evaluation.samples:
                 first, learned = (
@@ -455,6 +482,7 @@ def replay(
                     sink.tick(samples, judge.pipeline)
             if progress is not None:
                 progress(samples.progress)
+        assert judge is not None  # no message: that was refused
         if judge.evaluation.samples:
             injector.refuse_between(
                 judge.evaluation.time(judge.evaluation.last),
@@ -498,6 +526,16 @@ def replay(
         autopilot=said,
     )
     return with_unused(summary, unused)
+
+
+def _judge_of(
+    config: Config, samples: Samples, faults: Sequence[Fault], sinks: Sequence[Sink]
+) -> Judge:
+    """Build what judges a recording of which a block was read: its messages show which units have accelerometers."""
+    pipeline = Pipeline(config)
+    if pipeline.undecided:
+        pipeline.sense(samples.felt)
+    return Judge(pipeline, Injector(faults, pipeline.channel_names), sinks)
 
 
 def with_unused(summary: Summary, unused: Sequence[tuple[str, str]]) -> Summary:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import Word, word_of
-from fdi_ros.replay.episodes import MOST_TOLD, Episode, Size
+from fdi_ros.replay.episodes import MOST_TOLD, Episode, Size, unit_for
 from fdi_ros.replay.summary import Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import first_of, listed
@@ -185,6 +185,7 @@ def _when(one: Episode) -> str:
 
 def _size_sentences(one: Episode, unit: Unit) -> list[str]:
     """Return how large the error is, in a sentence."""
+    unit = unit_for(one, unit)
     if one.apart is not None:
         return [f"They are {_size(one.apart.size, unit)} {unit.name} apart."]
     if one.state != "FAULTY":

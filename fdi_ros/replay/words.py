@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
@@ -29,6 +30,7 @@ from fdi_ros.replay.verdict import (
     wrongly_named,
 )
 from fdi_ros.report.layout import (
+    FORCES,
     RADIANS,
     Columns,
     Section,
@@ -237,6 +239,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
             f"{max(one.saturated_s for one in row[1]):.2g} s"
         ),
         f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
+        f"noise, {FORCES.name}": lambda row: number(_noise(row[1], FORCES), ".2g"),
         "delay": lambda row: milliseconds(row[0].delay_s),
         "temperature": lambda row: _temperature_words(row[0].temperature_c),
         "trouble": lambda row: _trouble_words(summary, row[0].name, row[1]),
@@ -245,17 +248,20 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         del columns["temperature"]
     if all(one.delay_s is None for one in units):
         del columns["delay"]
+    if all(one.measured_in != FORCES.name for one in channels):
+        del columns[f"noise, {FORCES.name}"]
     return Section(
         "Health of each unit", "", head_and_rows(columns, rows) if rows else ""
     )
 
 
 def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:
-    """Return the largest difference from the fused rate, rms, in a unit of rate."""
+    """Return the largest difference from the fused value, rms, of the channels measured in a unit."""
     known = [
         one.residual_rms_rad_s * unit.factor
         for one in channels
         if one.residual_rms_rad_s is not None
+        and (one.measured_in == FORCES.name) == (unit == FORCES)
     ]
     return max(known, default=None)
 
@@ -329,6 +335,8 @@ def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
     if fault.size is None:
         return "-"
     option = FAULT_KINDS[fault.kind].options()["size"].unit
+    if ACCELEROMETERS in fault.channel:
+        option = option.replace(RADIANS.name, FORCES.name)
     if not option.startswith(RADIANS.name):
         return f"{fault.size:g} {option}".rstrip()
     return f"{fault.size * unit.factor:g} {unit.named(option)}"

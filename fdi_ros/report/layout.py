@@ -73,6 +73,7 @@ class Unit(NamedTuple):
 
 
 RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
+FORCES = Unit("m/s^2", 1.0)  # of accelerometers, whatever unit rates are printed in
 
 
 def unit_of(degrees: bool) -> Unit:

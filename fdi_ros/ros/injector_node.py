@@ -23,6 +23,7 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.accelerometers import possible_names
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.receiver import warm_codec
@@ -40,7 +41,9 @@ class InjectorNode(CheckedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("injector_node", INJECTOR, subscribes=True, **options)
-        self._names = build_geometry(self.config).channel_names
+        gyros = build_geometry(self.config).channel_names
+        self._n = len(gyros)
+        self._names = possible_names(self.config, gyros)
         self._malformed = self._struck = 0
         suffix = self.values()["suffix"]
         if not suffix:
@@ -120,21 +123,27 @@ class InjectorNode(CheckedNode):
 
     def _strike(self, k: int, data: bytes) -> bytes | None:
         """Return the message with the faults, None if a fault drops the message."""
-        n = len(self._names)
+        n, is_whole = self._n, len(self._names) > self._n
         channels = self._source.channels_of(k, n)
-        measured, values = self._source.parse(data, channels.stop - channels.start)
+        width = channels.stop - channels.start
+        measured, values = self._source.parse(data, 2 * width if is_whole else width)
         stamp = measured if self._source.stamped else self.get_clock().now().nanoseconds
         if self._origin is None:
             self._origin = stamp
-        z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
-        z[0, channels], received[0, channels] = values, True
         self._injectors[k].start_stamp = self._origin
-        out = self._injectors[k].apply(
-            Block(np.array([stamp], dtype=np.int64), z, received)
-        )
+
+        def block(own: Sequence[float], other: Block | None = None) -> Block:
+            z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
+            z[0, channels], received[0, channels] = own, True
+            return Block(np.array([stamp], dtype=np.int64), z, received, other)
+
+        force = block(values[width:]) if is_whole else None
+        out = self._injectors[k].apply(block(values[:width], force))
         after = out.z[0, channels].tolist()
-        lost = out.received is not None and not out.received[0, channels].any()
-        self._struck += lost or after != list(values)
+        if out.acceleration is not None and not np.isnan(values[width:]).all():
+            after += out.acceleration.z[0, channels].tolist()
+        lost = not out.delivered[0, channels].any()
+        self._struck += lost or after != list(values[: len(after)])
         return None if lost else self._source.patch(data, after)
 
     def _on_switch(

@@ -89,6 +89,11 @@ class ChangeLog:
         self._log, self._names, self._clock = log, names, clock
         self._last = [_Line() for _ in names]
 
+    def grow(self, names: Sequence[str]) -> None:
+        """Take channels behind those that there were."""
+        self._last += [_Line() for _ in names[len(self._names) :]]
+        self._names = names
+
     def add(
         self, events: Sequence[Event], shift: int, pair: ApartStatus | None
     ) -> None:
@@ -346,6 +351,7 @@ class Running:
 
     def _report_events(self, events: Sequence[Event]) -> None:
         """Log and report changes of state, up to a limit."""
+        self._learn_channels()
         in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
         pair = self.receiver.pipeline.status().apart if in_sets else None
         for event in events:
@@ -357,6 +363,14 @@ class Running:
         if self._at_once > 0:
             self._at_once -= 1
             self._report()
+
+    def _learn_channels(self) -> None:
+        """Take in the accelerometers, which the first samples show."""
+        names = self.receiver.pipeline.channel_names
+        if len(names) > len(self._changed):
+            self._changed += [(0, 0)] * (len(names) - len(self._changed))
+            self._changes.grow(names)
+            self._node.log.info("accelerometers are judged, too")
 
     # Supervision ----------------------------------------------------------------------
     # ----------------------------
@@ -487,6 +501,7 @@ class Running:
 
     def _report(self) -> None:
         """Publish the diagnostics."""
+        self._learn_channels()
         clock, now = self._node.get_clock().now().nanoseconds, self._now()
         prefix = self._node.prefix
         if not self._node.inputs.subscriptions:

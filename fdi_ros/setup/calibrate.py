@@ -342,7 +342,8 @@ def _watch(
 ) -> tuple[tuple[Span, ...], Spectrum]:
     """Return the declarations of the monitor with these settings, and the spectrum."""
     # Declarations then end with their cause.
-    pipeline = Pipeline.from_config(config.replaced({"decision.latch": False}))
+    changes = {"decision.latch": False, "accelerometers.enabled": "off"}
+    pipeline = Pipeline(config.replaced(changes))
     watched = _Watched(pipeline.channel_names, config.sample_rate, active)
     Walk(pipeline, [watched]).take(block)
     stamp, state = watched.columns

@@ -58,11 +58,19 @@ def write_config(path, parameters=PARAMETERS):
     return path
 
 
-def imu(stamp, rate, frame="imu", order="<"):
+def imu(stamp, rate, frame="imu", order="<", force=None):
+    """A serialised Imu; without a specific force it says that it measures none."""
+    absent = -1.0 if force is None else 0.0
     name = frame.encode() + b"\0"
     out = struct.pack(order + "iII", *divmod(stamp, 10**9), len(name)) + name
     out += bytes(-len(out) % 8) + struct.pack(
-        order + "37d", *range(13), *rate, *range(21)
+        order + "37d",
+        *range(13),
+        *rate,
+        *range(9),
+        *(force or (0.0, 0.0, 0.0)),
+        absent,
+        *range(8),
     )
     return bytes([0, order == "<", 0, 0]) + out
 

@@ -38,7 +38,7 @@ def written(tmp_path_factory, root, flight):
         (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),),
     )
     keep = Keep()
-    with OutputBag(path, config, config.channel_names) as bag:
+    with OutputBag(path, config) as bag:
         summary = replay(*request, sinks=[bag, keep])
     output = keep.output
     integrity = np.column_stack(

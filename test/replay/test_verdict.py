@@ -131,7 +131,7 @@ def test_the_end_of_a_range_is_counted_however_blocks_are_cut(cut):
     body = 0.7 * np.sin(time[:, None] * [1.0, 1.3, 0.4])
     z = np.tile(body, 3) + random.normal(0.0, 0.003, (5000, 9))
     z[1000:1200, 0] = 8.0
-    values = Values(TRIADS)
+    values = Values(TRIADS.n)
     stamp = (time * 1e9).astype(np.int64)
     for first in range(0, 5000, cut):
         values.add(Block(stamp[first : first + cut], z[first : first + cut]))

@@ -1,0 +1,25 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The two quantities that the channels of a monitor measure."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Quantity(NamedTuple):
+    """What a group of channels measures, and how large it is beside a body rate.
+
+    Constants of the monitor are in rad/s. Values of another quantity are divided by its
+    natural size as they enter and multiplied by it as they leave.
+    """
+
+    name: str  #: as in ``a gyro``
+    unit: str
+    natural: float  #: stands for 1 rad/s, in the unit
+
+
+RATE = Quantity("gyro", "rad/s", 1.0)
+#: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
+FORCE = Quantity("accelerometer", "m/s^2", 150.0)

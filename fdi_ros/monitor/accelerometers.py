@@ -1,0 +1,119 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The settings of the accelerometers as those of a monitor of its own.
+
+A specific force is divided by its natural size as it enters, and so are the settings of
+its errors here. Everything else (mounts, topics, detector, decision, integrity) is that
+of the gyros.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.config.config import Config
+from fdi_ros.config.settings import Value
+from fdi_ros.model.quantity import FORCE
+from fdi_ros.model.samples import Array, Block
+
+#: specific force and its change for which the level after one more loss is foretold,
+#: m/s^2 and m/s^3
+FORETOLD_FORCE, FORETOLD_CHANGE = 20.0, 200.0
+#: not used: accelerometers are never at rest
+NO_AVERAGE: dict[str, Value] = {"bias.startup_bias_duration": 0.0, "bias.fixed": ()}
+
+
+def accelerometer_names(config: Config, units: Sequence[int]) -> tuple[str, ...]:
+    """Names of the accelerometers of some units: ``imu_1.accel_x``."""
+    names = config.imu_names
+    return tuple(f"{names[unit]}.accel_{axis}" for unit in units for axis in "xyz")
+
+
+def possible_names(config: Config, gyros: Sequence[str]) -> tuple[str, ...]:
+    """Names of the gyros and of all accelerometers that the settings allow."""
+    if not config.has_units or config.accelerometers.enabled == "off":
+        return tuple(gyros)
+    return (*gyros, *accelerometer_names(config, range(len(config.topics))))
+
+
+def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
+    """Return the settings of the accelerometers of some units, numbers from 0, in units of `FORCE.natural`."""
+    own, imus = config.accelerometers, config.imus
+    channels = [3 * unit + axis for unit in units for axis in range(3)]
+
+    def of_channels(values: Sequence[Any]) -> tuple[Any, ...]:
+        """Pick the values of the channels, where there is one for each."""
+        several = len(values) == 3 * len(imus.topics)
+        return tuple(values[i] for i in channels) if several else tuple(values)
+
+    def of_units(values: Sequence[Any], each: int = 1) -> tuple[Any, ...]:
+        """Pick the values of the units, where there are any."""
+        if not values:
+            return ()
+        return tuple(x for u in units for x in values[each * u : each * (u + 1)])
+
+    def scaled(values: Sequence[float]) -> tuple[float, ...]:
+        return tuple(value / FORCE.natural for value in of_channels(values))
+
+    names = accelerometer_names(config, units)
+    changes: dict[str, Value] = {
+        "excluded_channels": tuple(
+            name for name in config.excluded_channels if name in names
+        ),
+        "channels.names": names,
+        "imus.topics": of_units(imus.topics),
+        "imus.names": of_units(config.imu_names),
+        "imus.mounts": of_units(imus.mounts, 9),
+        "imus.delays": of_units(imus.delays),
+        "geometry.axes": of_units(config.geometry.axes, 9),
+        "noise.noise_std": scaled(own.noise_std),
+        "noise.scale_std": of_channels(own.scale_std),
+        "noise.bias_walk": scaled(own.bias_walk),
+        "noise.timing_std": of_channels(config.noise.timing_std),
+        "noise.bound": (),
+        "bias.turn_on_std": own.turn_on_std / FORCE.natural,
+        "bias.max_drift": own.max_drift / FORCE.natural,
+        "health.max_rate": scaled(own.max_acceleration),
+        "integrity.fault_rate": of_channels(config.integrity.fault_rate),
+        "integrity.max_rate": FORETOLD_FORCE / FORCE.natural,
+        "integrity.max_acceleration": FORETOLD_CHANGE / FORCE.natural,
+        "accelerometers.enabled": "off",
+        **NO_AVERAGE,
+    }
+    return config.replaced(changes)
+
+
+def lever_arms(config: Config, units: Sequence[int]) -> Array:
+    """Position of each accelerometer of some units from the first unit, (m, 3) m."""
+    count = len(config.imus.topics)
+    positions = config.accelerometers.positions or (0.0,) * 3 * count
+    return np.repeat(np.reshape(positions, (count, 3))[list(units)], 3, axis=0)
+
+
+def felt_units(block: Block) -> tuple[int, ...]:
+    """Return the units whose accelerometers are to be judged: all but those that give rates without accelerations.
+
+    A unit that has given nothing yet is among them. None are, if no unit gives
+    accelerations, or they are the same in all of several samples: some drivers and
+    simulations fill in a constant.
+    """
+    force = block.acceleration
+    if force is None or (len(block) > 1 and not varies(force.z)):
+        return ()
+    felt, heard = _delivering(force), _delivering(block)
+    units = range(block.z.shape[1] // 3)
+    return tuple(unit for unit in units if unit in felt or unit not in heard)
+
+
+def varies(values: Array) -> bool:
+    """Whether any column of values (k, m) has two that differ; NaN are left out."""
+    return any(len(np.unique(one[~np.isnan(one)])) > 1 for one in values.T)
+
+
+def _delivering(block: Block) -> set[int]:
+    """Numbers of the units that delivered a value."""
+    return {int(i) // 3 for i in np.flatnonzero(block.delivered.any(axis=0))}
