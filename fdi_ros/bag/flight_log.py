@@ -16,6 +16,7 @@ are kept.
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -61,6 +62,8 @@ _TOGETHER = 1 << 10
 _MOST_COMPARED = 16
 #: messages that are named of a log without IMUs
 _MOST_NAMES = 6
+#: board and its serial number, as ArduPilot sends both at its start
+_BOARD = re.compile(r"[\w-]+ ([0-9A-F]{8} [0-9A-F]{8} [0-9A-F]{8})")
 #: texts of a log that are kept: the first ones
 _MOST_TEXTS = 1000
 
@@ -250,6 +253,7 @@ class FlightLog(BagFile):
         self.start_utc: int | None = (
             None  # UTC of the start of the autopilot, us since 1970, or None
         )
+        self.hardware_id = ""
         self.said: list[LogText] = []  # texts of the autopilot up to here, stamps in us
 
     @abstractmethod
@@ -258,6 +262,9 @@ class FlightLog(BagFile):
 
     def add_text(self, stamp: int, kind: str, text: str) -> None:
         """Take a text of the autopilot at a time, us."""
+        board = _BOARD.fullmatch(text.strip())
+        if board and not self.hardware_id:
+            self.hardware_id = board[1]
         if len(self.said) < _MOST_TEXTS and (line := " ".join(text.split())):
             self.said.append(LogText(stamp, kind, line))
 

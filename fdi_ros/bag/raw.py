@@ -164,6 +164,10 @@ class BagFile(ABC):
     #: time of the first message, ns, or `NO_HORIZON`
     start_time: int
     texts: tuple[LogText, ...] = ()
+    #: serial number of the board of the autopilot, empty if the file has none
+    hardware_id: str = ""
+    #: MAVLink system of the autopilot, None if the file has none
+    system: int | None = None
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
         self.path, self._damage, self._left = path, damage, most

@@ -136,6 +136,16 @@ class Recording:
         """Texts of the autopilot in a flight log, in order, with times of recording, ns."""
         return tuple(sorted(text for file in self._files for text in file.texts))
 
+    @property
+    def hardware_id(self) -> str:
+        """Serial number of the board of the autopilot, empty if no file has one."""
+        return next((file.hardware_id for file in self._files if file.hardware_id), "")
+
+    @property
+    def system(self) -> int | None:
+        """MAVLink system of the autopilot, None if no file has one."""
+        return next((file.system for file in self._files if file.system), None)
+
     def require(self, names: Sequence[str], type_name: str) -> None:
         """Check that topics exist with this type and CDR encoding (`BagError`)."""
         there = {topic.name: topic for topic in self.topics}

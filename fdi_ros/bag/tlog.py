@@ -43,7 +43,7 @@ from fdi_ros.system.files import (
     TLOG_BYTES,
 )
 
-_HEARTBEAT, _STATUSTEXT = 0, 253
+_HEARTBEAT, _AUTOPILOT_VERSION, _STATUSTEXT = 0, 148, 253
 _AUTOPILOT_COMPONENT = 1
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
@@ -93,15 +93,18 @@ class Tlog(LibraryLog):
         if (chosen := self._autopilot(data)) is None:
             return {}
         system, autopilot = chosen
-        for at, end, message in self._messages(data, (*MESSAGES, _STATUSTEXT)):
+        self.system = system
+        for at, end, message in self._messages(
+            data, (*MESSAGES, _STATUSTEXT, _AUTOPILOT_VERSION)
+        ):
             if message.get_srcSystem() != system:
                 continue
             came, number = (
                 int.from_bytes(data[at : at + _TIME], "big"),
                 message.get_msgId(),
             )
-            if number == _STATUSTEXT:
-                texts.append((came, str(message.text)))
+            if number not in MESSAGES:
+                self._take_words(number, message, came, texts)
                 continue
             kind = MESSAGES[number].kind
             if not understood(kind, autopilot):
@@ -130,6 +133,16 @@ class Tlog(LibraryLog):
             source: {name: table[name] for name in _COLUMNS.names or ()}
             for source, table in tables.items()
         }
+
+    def _take_words(
+        self, number: int, message: Any, came: int, texts: list[tuple[int, str]]
+    ) -> None:
+        """Take a text, or the serial number of the board."""
+        if number == _STATUSTEXT:
+            texts.append((came, str(message.text)))
+            return
+        serial = bytes(message.uid2).hex()
+        self.hardware_id = serial.strip("0") and serial
 
     def _autopilot(self, data: bytes) -> tuple[int, int] | None:
         """Return system and MAV_AUTOPILOT of the autopilot to read, or None."""

@@ -67,6 +67,8 @@ _WRONG = (
     ValueError,
 )
 """Exceptions of pyulog for a damaged file."""
+#: characters of a serial number that are read
+_LONGEST_ID = 64
 #: us over which PX4 takes the means of vehicle_imu_status
 _MEAN_TIME = 100_000
 _COUNTED = ("gyro_error_count", "gyro_clipping")
@@ -136,6 +138,7 @@ class Ulog(LibraryLog):
             self.note(
                 f"the logger dropped out {times}, for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
             )
+        self.hardware_id = str(log.msg_info_dict.get("sys_uuid", ""))[:_LONGEST_ID]
         for text in log.logged_messages:
             self.add_text(int(text.timestamp), text.log_level_str(), text.message)
         parts: defaultdict[Source, list[Columns]] = defaultdict(list)

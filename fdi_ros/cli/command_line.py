@@ -342,6 +342,10 @@ VERBS = {
             "--output": takes_path(
                 "folder for the tables and the page", metavar="DIR", required=True
             ),
+            "--reports": takes(
+                "write the page of each replay too, linked from the page of the fleet",
+                action="store_true",
+            ),
             "--calibrate": takes(
                 "each: calibrate each recording on itself, where it allows that; default none",
                 choices=("none", "each"),

@@ -342,11 +342,14 @@ def run_fleet(arguments: Namespace) -> int:
         {"config": parameters, "calibrate": arguments.calibrate},
         arguments.force,
     )
+    reports = folder / "reports" if arguments.reports else None
+    if reports:
+        reports.mkdir(exist_ok=True)
     compile_for_workers(arguments)
     try:
         with progress(sys.stderr, arguments.quiet, "flights") as show:
             given = parameters, arguments.calibrate == "each", tables
-            judge_all(paths, *given, workers, arguments.scheduler, show)
+            judge_all(paths, *given, workers, arguments.scheduler, show, reports)
     except KeyboardInterrupt:
         print(
             "fdi: stopped; what was judged is kept, the same command goes on from there",

@@ -28,10 +28,10 @@ from fdi_ros.bag.raw import (
     find_files,
 )
 from fdi_ros.bag.reader import FORMATS
-from fdi_ros.bag.samples import read_block
+from fdi_ros.bag.samples import Samples, read_block
 from fdi_ros.config.config import Config, parameter_file, parameters_of
 from fdi_ros.errors import BagError, FdiError
-from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
+from fdi_ros.fleet.tables import Flight, FlightEpisode, Row, Tables
 from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.inspection.starting_config import starting_config_of
 from fdi_ros.model.samples import Block
@@ -39,12 +39,13 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
-from fdi_ros.replay.run import Sink, replay
+from fdi_ros.replay.page import Report
+from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary
 from fdi_ros.replay.words import sample_rate_notes
 from fdi_ros.report.layout import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
-from fdi_ros.system.files import open_regular
+from fdi_ros.system.files import open_regular, write_text
 from fdi_ros.system.jobs import run_jobs
 from fdi_ros.system.text import date_of, shown, storable
 
@@ -125,6 +126,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
 # Judged ---------------------------------------------------------------------------------------------------------------
 
 
+DEFAULT_SYSTEM = 1  # MAVLink system of an autopilot that nobody gave another number
 CALIBRATED = 1_000_000  # samples that a calibration takes at most: the first ones of a long flight
 
 
@@ -140,12 +142,31 @@ def judge_all(
     workers: int,
     cluster: str | None,
     show: Callable[[float], object],
+    reports: Path | None = None,
 ) -> None:
     """Judge the recordings that are not in the tables as they are now, and write the tables.
 
-    ``parameters``: text of a parameter file; empty: of each recording what ``fdi inspect`` writes for it.
-    ``calibrated``: each recording is calibrated on itself. ``workers`` and ``cluster`` as of `run_jobs`. ``show`` is
-    called with the share done. `FdiError` if nothing can be written, or the cluster is lost.
+    Parameters
+    ----------
+    paths
+        The recordings.
+    parameters
+        Text of a parameter file; empty: what ``fdi inspect`` writes for each recording.
+    calibrated
+        Whether each recording is calibrated on itself.
+    tables
+        The tables, which take the rows.
+    workers, cluster
+        As of `run_jobs`.
+    show
+        Called with the share done.
+    reports
+        Folder for a page of each recording; None: no pages.
+
+    Raises
+    ------
+    FdiError
+        If nothing can be written, or the cluster is lost.
     """
     jobs = []
     for path in paths:
@@ -155,9 +176,9 @@ def judge_all(
         )
         row = tables.flights.get(flight.path)
         # What could not be judged is tried again: it may be mended.
-        if row is not None and row["digest"] == flight.digest and not row["error"]:
+        if row is not None and _is_done(row, flight.digest, reports):
             continue
-        jobs.append((path, flight, parameters, calibrated))
+        jobs.append((path, flight, parameters, calibrated, reports))
     there = len(paths) - len(jobs)
     try:
         done = run_jobs(
@@ -174,6 +195,13 @@ def judge_all(
         tables.write()
 
 
+def _is_done(row: Row, digest: str, reports: Path | None) -> bool:
+    """Whether a recording was judged as it is now, and its page is there if pages are asked for."""
+    if row["digest"] != digest or row["error"]:
+        return False
+    return reports is None or (reports.parent / row["report"]).is_file()
+
+
 def digest_of(path: Path) -> str:
     """Tell a recording as it is now from itself after a change, without reading it."""
     stats: list[tuple[str, int, int]] = []
@@ -187,10 +215,19 @@ def digest_of(path: Path) -> str:
     ]
 
 
-def judge(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
-    """Judge one recording, of which this much of its row is known; what is wrong with it is said there."""
+def judge(
+    path: Path,
+    flight: Flight,
+    parameters: str,
+    calibrated: bool,
+    reports: Path | None = None,
+) -> Judged:
+    """Judge one recording, and write its page into a folder of reports.
+
+    ``flight``: what of its row is known before. An error goes into the row.
+    """
     try:
-        return _judged(path, flight, parameters, calibrated)
+        return _judged(path, flight, parameters, calibrated, reports)
     except FdiError as error:
         return _failed(flight, str(error))
     except (
@@ -204,15 +241,18 @@ def _failed(flight: Flight, error: str) -> Judged:
     return replace(flight, error=words, why=(f"could not be judged: {words}",)), (), ""
 
 
-def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
-    text, flight, looks = (
-        parameters,
-        replace(flight, measured=bool(parameters)),
-        set[str](),
-    )
+def _judged(
+    path: Path,
+    flight: Flight,
+    parameters: str,
+    calibrated: bool,
+    reports: Path | None,
+) -> Judged:
+    text, flight = parameters, replace(flight, measured=bool(parameters))
+    unused: tuple[tuple[str, str], ...] = ()
     if not parameters:
         start = starting_config_of(path, "no config")
-        text, looks = start.text, {start.look} - {""}
+        text, unused = start.text, start.unused
     if calibrated:
         try:
             text, flight = (
@@ -223,21 +263,28 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
     seen = _Seen(config)
-    summary = replay(path, config, sinks=[seen])
+    page = Report(build_geometry(config), config.sample_rate) if reports else None
+    sinks = [seen, page] if page else [seen]
+    summary = with_unused(replay(path, config, sinks=sinks), unused)
+    if seen.hardware_id:
+        flight = replace(flight, vehicle=seen.hardware_id)
+    elif seen.system is not None and seen.system != DEFAULT_SYSTEM:
+        flight = replace(
+            flight, vehicle=f"{flight.vehicle}, MAVLink system {seen.system}"
+        )
+    if reports and page:
+        name = f"{storable(path.stem)}-{hashlib.sha256(flight.path.encode()).hexdigest()[:8]}.html"
+        about = {"recording": flight.path, "vehicle": flight.vehicle}
+        write_text(reports / name, page.html(summary, about))
+        flight = replace(flight, report=storable(f"{reports.name}/{name}"))
     origin = summary.stream.origin_ns
     if not summary.scores.samples or origin is None:
         raise BagError(
             "its topics have no time in common: there is no sample of all channels"
         )
-    looks |= {
-        f"{second} gives the values of {first}: one sensor"
-        for first, second in seen.copies
-    }
     noise = tuple(seen.segments.noise().quiet.tolist())
     date = _date(origin + round(summary.scores.start_s * 1e9))
-    row = _row(
-        replace(flight, date=date, noise=noise, why=tuple(sorted(looks))), summary
-    )
+    row = _row(replace(flight, date=date, noise=noise), summary)
     return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
 
@@ -255,20 +302,26 @@ def _calibrated(path: Path, parameters: str) -> str:
 
 
 class _Seen(Sink):
-    """What a summary does not have: the noise of the channels, and units that are copies."""
+    """Collects what a summary does not have: noise of the channels, and identity of the vehicle."""
 
     def __init__(self, config: Config) -> None:
         self._rate, self.segments = (
             config.sample_rate,
             NoiseSegments(build_geometry(config).n),
         )
-        self.copies: set[tuple[str, str]] = set()
-        """Units, with their topics, of which the second gives the values of the first."""
+        self.hardware_id = ""
+        """Serial number of the board of the autopilot, empty if the log has none."""
+        self.system: int | None = None
+        """MAVLink system of the autopilot, None if the log has none."""
+
+    def begin(self, samples: Samples) -> None:
+        """Note which vehicle recorded it."""
+        self.hardware_id = storable(shown(samples.recording.hardware_id))
+        self.system = samples.recording.system
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         whole = np.isfinite(block.z).all(axis=1)
         self.segments.add(block.z[whole], block.stamp[whole], self._rate)
-        self.copies |= {*pipeline.status().copies}
 
 
 def _row(known: Flight, summary: Summary) -> Flight:
@@ -277,7 +330,11 @@ def _row(known: Flight, summary: Summary) -> Flight:
     # What hides for a while, and comes back as it was, is declared once.
     steps = [step for one in declared for step in one.steps]
     found = summary.verdict
-    why = [found.sentence] if found.severity is not Severity.GOOD else []
+    why: list[str] = []
+    if found.severity is not Severity.GOOD:
+        # A verdict lists the first concerns only, and none beside a fault.
+        rest = [str(one) for one in summary.concerns if str(one) not in found.sentence]
+        why = [found.sentence, *(f"{words}." for words in rest)]
     return replace(
         known,
         why=(*known.why, *why, *sample_rate_notes(stream.sample_rate)),

@@ -27,6 +27,7 @@ from fdi_ros import __version__
 from fdi_ros.errors import BagError
 from fdi_ros.report.layout import (
     Column,
+    Link,
     Section,
     Severity,
     Verdict,
@@ -37,12 +38,12 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import open_regular, plain, whole, write_text
-from fdi_ros.system.text import shown, storable
+from fdi_ros.system.text import LINE, shown, storable
 
 Row = Mapping[
     str, Any
 ]  # values of a row by the names of the columns; None where nothing can be said.
-VERSION = 3  # of the columns: raised when one changes its name, type or meaning
+VERSION = 4  # of the columns: raised when one changes its name, type or meaning
 WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
 """The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
 
@@ -56,7 +57,10 @@ class Flight:
     """One recording as it was judged."""
 
     path: str = _column("where the recording lies, whole path")
-    vehicle: str = _column("folder in which it lies, whole path")
+    vehicle: str = _column(
+        "serial number of the autopilot's board where the log has one; else the folder in"
+        " which it lies, whole path, with the MAVLink system unless that is 1"
+    )
     digest: str = _column(
         "names, sizes and times of its files, hashed: with another one it is judged again"
     )
@@ -65,6 +69,10 @@ class Flight:
         "why a person should look at it; empty: there is no need", default=()
     )
     config: str = _column("parameter file it was judged with", default="")
+    report: str = _column(
+        "page of its replay, below the folder of the tables; empty: not written",
+        default="",
+    )
     calibration: str = _column(
         "'on itself', or why it could not be calibrated; empty: not asked", default=""
     )
@@ -108,7 +116,7 @@ class FlightEpisode:
     """One episode of one flight: a fault as the monitor declared it, or channels that gave nothing."""
 
     path: str = _column("where the recording lies, whole path")
-    vehicle: str = _column("folder in which it lies, whole path")
+    vehicle: str = _column("as of its flight")
     date: str | None = _column("of its start, UTC; null: the flight has no date")
     state: str = _column("what it came to: FAULTY, AMBIGUOUS or STALE")
     declares: bool = _column(
@@ -273,10 +281,7 @@ class Tables:
 
 
 MOST_ROWS = 2000  # flights in a table of the page; flights.parquet has all
-LOOKS, WHY = (
-    10,
-    400,
-)  # flights that need a person in a terminal, and characters of what is said of each
+LOOKS = 10  # flights that need a person that a terminal shows
 
 
 class Fleet:
@@ -302,6 +307,7 @@ class Fleet:
             "vehicles": len({row["vehicle"] for row in self.flights}),
             "watched": sum(row["watched"] for row in self.judged),
             "episodes": sum(row["episodes"] for row in self.judged),
+            "damaged": sum(bool(row["damage"]) for row in self.judged),
             "not_measured": sum(not row["measured"] for row in self.judged),
             "need_a_person": figures_of(columns_of(self.looks)),
         }
@@ -337,16 +343,19 @@ class Fleet:
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
             f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared."
         )
+        damaged = f"{_count(own['damaged'], 'recording')} could not be read whole."
         assumed = (
             f"Of {_count(own['not_measured'], 'flight')} the mounts and axes are what fdi inspect assumes, not"
             " measured: what is declared there may be wrong (--config, --calibrate)."
         )
-        return [self.verdict.words, counts, *([assumed] if own["not_measured"] else [])]
+        more = [damaged] if own["damaged"] else []
+        more += [assumed] if own["not_measured"] else []
+        return [self.verdict.words, counts, *more]
 
     def text(self) -> str:
         """Return the sentences, and the first flights that need a person, for a terminal."""
         looks = [
-            f"{shown(row['path'])}: {shown('; '.join(row['why']), WHY)}"
+            f"{shown(row['path'])}: {shown(' '.join(row['why']), LINE)}"
             for row in self.looks[:LOOKS]
         ]
         more = (
@@ -394,9 +403,14 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
         "" if row["error"] else shlex.join(command)
         for row, command in zip(flights, words, strict=True)
     ]
+    reports = {row["path"]: row["report"] for row in flights}
     return [
-        column("path", "flight", lambda path: shown(path.rpartition("/")[2])),
-        column("why", "why", lambda why: shown("; ".join(why), WHY) or "-"),
+        column(
+            "path",
+            "flight",
+            lambda path: Link(shown(path.rpartition("/")[2]), reports[path]),
+        ),
+        column("why", "why", lambda why: shown(" ".join(why), LINE) or "-"),
         column(
             "date",
             "date, UTC",
@@ -417,7 +431,7 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
         column(
             "damage",
             "damage",
-            lambda damage: shown("; ".join(damage or ()), WHY) or "-",
+            lambda damage: shown("; ".join(damage or ()), LINE) or "-",
         ),
         Column("command", commands, ("to see it",), str),
     ]

@@ -29,6 +29,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import resources
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,11 +274,24 @@ def escape(text: str) -> str:
     return html.escape(visible(text))
 
 
+class Link(str):
+    """A text that leads to another page; `page` is its path from this one, empty: none."""
+
+    page: str
+
+    def __new__(cls, text: str, page: str) -> Link:
+        """Return a text with the path of a page."""
+        link = super().__new__(cls, text)
+        link.page = page
+        return link
+
+
 def _cell(text: str, tag: str = "td") -> str:
     # Figures and names are not broken over lines; sentences are.
-    return (
-        f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
-    )
+    content = escape(text)
+    if isinstance(text, Link) and text.page:
+        content = f'<a href="{html.escape(quote(text.page))}">{content}</a>'
+    return f"<{tag}{' class=long' if len(text) > LONG else ''}>{content}</{tag[:2]}>"
 
 
 def html_of(content: Content) -> str:

@@ -185,7 +185,7 @@ def test_tables_say_what_became_of_each_flight_and_what_their_columns_mean(judge
     assert np.allclose([np.mean(row["noise"]) for row in flights[:2]], 0.002, rtol=0.2)
     for name in ("flights", "episodes"):
         schema = parquet.read_schema(judged / f"{name}.parquet")
-        assert schema.metadata[b"columns"] == b"3"
+        assert schema.metadata[b"columns"] == b"4"
         assert all(one.metadata[b"meaning"] for one in schema)
 
 
@@ -204,8 +204,9 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     assert said[1].startswith(
         "2 vehicles; 1 flight could not be judged; 1 fault declared, in 1 flight; 0.01 hours"
     )
-    assert f"{fleet}/kite/c.mcap: FAULTY: imu_2.y from 5." in said[2]
-    assert said[3].startswith(f"{fleet}/kite/e.mcap: could not be judged: ")
+    assert said[2] == "1 recording could not be read whole."
+    assert f"{fleet}/kite/c.mcap: FAULTY: imu_2.y from 5." in said[3]
+    assert said[4].startswith(f"{fleet}/kite/e.mcap: could not be judged: ")
     figures = json.loads((tmp_path / "all.json").read_text())
     assert [one["path"][-6:] for one in figures["need_a_person"]] == [
         "c.mcap",
@@ -233,6 +234,44 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
 
 
+def test_a_flight_is_said_to_be_what_its_replay_says_and_leads_to_its_page(
+    fleet, tmp_path, fdi
+):
+    out = run(
+        tmp_path / "o", fleet / "kite", "--config", fleet / "config.yaml", "--reports"
+    )
+    page = (out / "fleet.html").read_text()
+    for row in rows(out)[:2]:
+        told = tmp_path / "told.json"
+        given = ("--config", fleet / "config.yaml", "--json", told, "--force")
+        fdi("replay", row["path"], *given)
+        verdict = json.loads(told.read_text())["verdict"]
+        assert row["why"][:1] == (
+            [] if verdict["word"] == "HEALTHY" else [verdict["words"]]
+        )
+        assert f'<a href="{row["report"]}">' in page
+        assert Path(row["path"]).name in (out / row["report"]).read_text()
+    assert rows(out)[2]["report"] == ""
+    # Pages are written later, too, of what was judged before.
+    (out / rows(out)[0]["report"]).unlink()
+    run(out, fleet / "kite", "--config", fleet / "config.yaml", "--reports")
+    assert (out / rows(out)[0]["report"]).is_file()
+
+
+def test_a_vehicle_is_what_its_log_names_or_else_its_folder(root, tmp_path):
+    shutil.copy(root / "bags" / "copter_crash.tlog", tmp_path / "one.tlog")
+    board = "003A0029 3137510C 35333731"
+    said = logs.records(
+        logs.MESSAGES["MSG"], TimeUS=2_000_000, Message=f"CubeOrange {board}"
+    )
+    for name, extra in (("two.bin", said), ("three.bin", b"")):
+        logs.write_dataflash(tmp_path / name, logs.units(), extra=extra)
+    judged = rows(run(tmp_path / "o", tmp_path))
+    found = {Path(row["path"]).name: row["vehicle"] for row in judged}
+    assert found["two.bin"] == board
+    assert found["three.bin"] == found["one.tlog"] == str(tmp_path)
+
+
 def test_one_sensor_on_two_topics_needs_a_look(tmp_path):
     z = flight(900)[1]
     stamp, topics = START + STEP * np.arange(900), (*TOPICS, "/third")
@@ -243,7 +282,8 @@ def test_one_sensor_on_two_topics_needs_a_look(tmp_path):
     for parameters in ("", json.dumps({"/**": {"ros__parameters": given}})):
         row = judge.judge(three, Flight(str(three), "", ""), parameters, False)[0]
         assert re.search(
-            r"/third(\)| is left out: it)? gives the values of .*/imu_1/data_raw",
+            r"/third is left out: it gives the values of .*/imu_1/data_raw"
+            r"|imu_3 repeats the values of imu_1 .*/imu_1/data_raw",
             " ".join(row.why),
         ), row
     two = write_mcap(
