@@ -351,6 +351,7 @@ def judge(
         forget_evidence(params, state)
         forget_motion(kf, params.sensors.n)
         verdict.statistic = 0.0
+        sample.estimate.checked = 0
         return
     if sample.repeated:
         verdict.statistic = min(

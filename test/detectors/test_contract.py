@@ -253,6 +253,8 @@ def test_more_sets_of_channels_than_are_kept():
 @each_variant
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_fault_of_50_sigma_is_named_on_every_isolable_channel(name, options, sign):
+    """Its size is exact without noise; `sequential` allows for errors of scale beside it, which takes 4e-6 off."""
+    rel = 1e-5 if name == "sequential" else 1e-9
     geometry = usual_geometry(name)
     assert geometry.isolable.all()
     for channel in range(geometry.n):
@@ -263,7 +265,7 @@ def test_fault_of_50_sigma_is_named_on_every_isolable_channel(name, options, sig
         assert verdict.alarm[-1]
         assert verdict.isolated[-1]
         assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]
-        assert verdict.error[-1, channel] == pytest.approx(sign * 50 * SIGMA, rel=1e-3)
+        assert verdict.error[-1, channel] == pytest.approx(sign * 50 * SIGMA, rel=rel)
 
 
 @each_variant
