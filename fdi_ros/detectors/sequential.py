@@ -429,6 +429,9 @@ class Sequential(Detector):
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
     delay_std
         How late the stamps of one unit may be against another's, standard deviation, s.
+    gain_odds
+        Prior odds of a wrong gain of a unit, against those of gyros. Gravity lets the gain of
+        an accelerometer always show, as an error of the vertical one.
     """
 
     name = "sequential"
@@ -448,6 +451,7 @@ class Sequential(Detector):
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
         delay_std: float = 0.001,
+        gain_odds: float = 1.0,
     ) -> None:
         if not 0.5 < confidence < 1:
             raise ConfigError(
@@ -467,6 +471,7 @@ class Sequential(Detector):
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
                 "delay_std": delay_std,
+                "gain_odds": gain_odds,
             },
         )
         params, n, noise = self.constants[0], geometry.n, self.noise
@@ -499,6 +504,7 @@ class Sequential(Detector):
             np.maximum(noise.timing_std, LEAST_TIMING),
             BENT,
         )
+        params["gain_odds"] = math.log(gain_odds)
         params["rest_std"] = REST_STD
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)

@@ -112,6 +112,7 @@ class Constants:
     nonlinearity: (
         Real  # standard deviation of errors not linear in the rate, share of the rate
     )
+    gain_odds: Real  # logarithm of the odds that a unit's gain is wrong, against gyros
     rest_std: Real  # of the rate at rest, rad/s
     determines: Sets  # sets of channels that give a rate
     spans: Sets  # of the sets that give a rate, those with redundancy

@@ -18,8 +18,11 @@ class Quantity(NamedTuple):
     name: str  #: as in ``a gyro``
     unit: str
     natural: float  #: stands for 1 rad/s, in the unit
+    gain_odds: float
+    """Prior odds that the gain of a unit changes, against those of a gyro. Gravity makes any
+    change of the gain of accelerometers look like an error of the vertical one."""
 
 
-RATE = Quantity("gyro", "rad/s", 1.0)
+RATE = Quantity("gyro", "rad/s", 1.0, 1.0)
 #: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
-FORCE = Quantity("accelerometer", "m/s^2", 150.0)
+FORCE = Quantity("accelerometer", "m/s^2", 150.0, 0.01)

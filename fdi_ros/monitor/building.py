@@ -26,7 +26,7 @@ from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import MAX_RUN_LENGTH, FalseAlarmRate, NoiseModel, normal_isf
-from fdi_ros.model.quantity import RATE
+from fdi_ros.model.quantity import RATE, Quantity
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
@@ -113,14 +113,16 @@ GUARD = "sequential"
 """Name of the detector that keeps the estimator of the errors of the sensors, whichever method declares."""
 
 
-def build_guard(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
-    """Detector that keeps the estimator."""
+def build_guard(
+    config: Config, geometry: Geometry, noise: NoiseModel, quantity: Quantity = RATE
+) -> Detector:
+    """Detector that keeps the estimator, for channels that measure a quantity."""
     detector = config.detector
     if detector.name != GUARD and detector.false_alarm_probability > 0:
         # Another method may be asked for rarer alarms than any run length states.
         rarest = max(detector.false_alarm_probability, 1.0 / MAX_RUN_LENGTH)
         config = config.replaced({"detector.false_alarm_probability": rarest})
-    return _build(GUARD, config, geometry, noise)
+    return _build(GUARD, config, geometry, noise, quantity)
 
 
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
@@ -137,7 +139,11 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
 
 
 def _build(
-    name: str, config: Config, geometry: Geometry, noise: NoiseModel
+    name: str,
+    config: Config,
+    geometry: Geometry,
+    noise: NoiseModel,
+    quantity: Quantity = RATE,
 ) -> Detector:
     """Build a detector by name, with the options that it takes."""
     settings = config.detector
@@ -147,7 +153,11 @@ def _build(
         option: getattr(settings, option) for option in accepted if option in known
     }
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
-    errors = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
+    errors = {
+        "bias_walk": config.noise.bias_walk,
+        "delay_std": delay_std,
+        "gain_odds": quantity.gain_odds,
+    }
     options |= {option: value for option, value in errors.items() if option in accepted}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     if options.get("tolerance") != "paper":

@@ -30,7 +30,7 @@ from fdi_ros.core.subsets import (
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.model.geometry import spans_space
-from fdi_ros.model.quantity import FORCE, RATE
+from fdi_ros.model.quantity import FORCE, RATE, Quantity
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.accelerometers import (
     accelerometer_config,
@@ -66,6 +66,8 @@ class Pipeline:
     ----------
     config
         All settings, or a parameter file.
+    quantity
+        What the channels measure; `FORCE` for the other half.
 
     Raises
     ------
@@ -73,11 +75,13 @@ class Pipeline:
         If there is no such file, or the settings do not fit each other.
     """
 
-    def __init__(self, config: Config | str | PathLike[str]) -> None:
+    def __init__(
+        self, config: Config | str | PathLike[str], quantity: Quantity = RATE
+    ) -> None:
         self.config = config = Config.of(config)
         self.geometry = build_geometry(config)
         self.noise = build_noise(config, self.geometry.n)
-        self.quantity = RATE
+        self.quantity = quantity
         self.accelerometers: Pipeline | None = None
         """The other half; None: there are no accelerometers, or no sample has come yet that shows which."""
         self.undecided = config.has_units and config.accelerometers.enabled == "auto"
@@ -300,8 +304,7 @@ class Pipeline:
         """Return the monitor of the accelerometers of some units, built once."""
         units = tuple(numbers)
         if units not in self._built:
-            other = Pipeline(accelerometer_config(self.config, units))
-            other.quantity = FORCE
+            other = Pipeline(accelerometer_config(self.config, units), FORCE)
             settings = other.core["settings"][0]
             settings["first"], settings["natural"] = self.geometry.n, FORCE.natural
             places = [
@@ -343,7 +346,9 @@ class Pipeline:
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
             with reported(f"the sample path and {config.detector.name}"):
-                guard = build_guard(config, self.geometry, self.noise)
+                guard = build_guard(
+                    config, self.geometry, self.noise, self.quantity
+                )
                 own = config.detector.name == GUARD
                 detector = (
                     guard if own else build_detector(config, self.geometry, self.noise)
