@@ -346,9 +346,7 @@ class Pipeline:
         # All that can be refused comes first: then nothing is changed.
         if before is None or config.detector != before.detector:
             with reported(f"the sample path and {config.detector.name}"):
-                guard = build_guard(
-                    config, self.geometry, self.noise, self.quantity
-                )
+                guard = build_guard(config, self.geometry, self.noise, self.quantity)
                 own = config.detector.name == GUARD
                 detector = (
                     guard if own else build_detector(config, self.geometry, self.noise)

@@ -25,7 +25,12 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.config.settings import MAVLINK
-from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
+from fdi_ros.core.messages import (
+    ENCAPSULATION,
+    LAST_STAMP,
+    ImuTemplate,
+    as_batch,
+)
 from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
@@ -302,14 +307,16 @@ class AutopilotNode(CheckedNode):
         self._called = True
         assert self._failover is not None
         now, count = time.monotonic_ns(), len(self.config.channel_names)
-        _, values = ChannelsSource.parse(data, count + 7)
+        # Behind the gyros and the stamp stand the accelerometers, which are left alone.
+        announced = ChannelsSource.announced(*as_batch(data))
+        _, values = ChannelsSource.parse(data, max(announced, count + 7))
         # A second publisher is a stranger, a second monitor, or gives it rates that are not this autopilot's.
         self._failover.is_alone = all(
             self.count_publishers(topic) == 1 for topic in self._sole
         )
         self._failover.evidence.hear(values[2 : 2 + count], now)
-        # The last two values are the stamp of the sample: whole seconds, nanoseconds.
-        self._failover.age = time.time() - (values[-2] + values[-1] / 1e9)
+        seconds, nanoseconds = values[count + 5 : count + 7]  # stamp of the sample
+        self._failover.age = time.time() - (seconds + nanoseconds / 1e9)
         self._failover.turn(now)
 
     def _on_restore(
