@@ -40,7 +40,6 @@ An IMU that somebody else has set is left alone until the vehicle is disarmed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -249,7 +248,7 @@ def decide(
     state: PolicyState, view: View, now: int, settings: PolicySettings
 ) -> Decision:
     """Return orders, conditions to announce and the next state at time now, ns."""
-    memories = tuple(copy(memory) for memory in state.memories)
+    memories = tuple(Memory(**vars(memory)) for memory in state.memories)
     for memory, imu in zip(memories, view.imus, strict=True):
         if view.boots != state.boots:
             # Parameters outlive a boot. The next report shows how it began.
