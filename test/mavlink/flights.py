@@ -253,14 +253,18 @@ class Flight:
         return self.done
 
 
+def violation(number: int, done: Counter[str]) -> str:
+    """Fly one flight, add what was done, and return what was violated; empty: nothing."""
+    try:
+        done.update(Flight(number).fly())
+    except AssertionError as error:
+        return f"flight {number}: {error}"
+    return ""
+
+
 if __name__ == "__main__":
     first, last = map(int, ["0", *sys.argv[1:]][-2:])
     total = Counter[str]()
-    for number in range(first, last):
-        try:
-            total += Flight(number).fly()
-        except AssertionError as error:
-            print(f"flight {number}: {error}", flush=True)
-            total["violations"] += 1
-    print(f"flights {first} to {last - 1}:", dict(total))
-    sys.exit(total["violations"] > 0)
+    found = [text for k in range(first, last) if (text := violation(k, total))]
+    print(f"flights {first} to {last - 1}:", dict(total), *found, sep="\n")
+    sys.exit(bool(found))
