@@ -1,19 +1,21 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What MAVLink says of IMUs: the messages that carry gyros, how they are asked for, by which clock they are stamped.
+"""MAVLink messages with gyros: their layout, their requests, and the clock of their stamps.
 
-The messages are one description for live and logs, by the common dialect and by what the senders do (PX4
-``src/modules/mavlink/streams``, ArduPilot ``GCS_Common.cpp``):
+Live links and logs share one description, from the common dialect and from the senders
+(PX4 ``src/modules/mavlink/streams``, ArduPilot ``GCS_Common.cpp``):
 
-- SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG,
-  cut off towards zero, with the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
-- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds: its streams for ground
-  stations have it in place of SCALED_IMU (RAW_SENS: RAW_IMU, SCALED_IMU2, SCALED_IMU3). PX4 does not send it.
-- HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has chosen for itself, which may change in
-  flight; PX4 subtracts the bias that its estimator has found. So one of it beside SCALED_IMU is no further sensor.
+- SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot. Whole mrad/s and
+  mG, truncated towards zero, with the autopilot's milliseconds. Rates beyond 32.767 rad/s
+  overflow.
+- RAW_IMU: "raw counts" by the standard. ArduPilot sends IMU 1 in mrad/s with microseconds,
+  by default in place of SCALED_IMU (stream RAW_SENS). PX4 does not send RAW_IMU.
+- HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has selected,
+  which may change in flight. PX4 subtracts its estimated bias. Beside SCALED_IMU this
+  message is no further sensor.
 
-A message that carries only a magnetometer has zeros for gyro and accelerometer: it is of no IMU.
+A message with a magnetometer alone has zeros for gyro and accelerometer, and no IMU.
 """
 
 from __future__ import annotations
@@ -26,33 +28,33 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-NS, MS = 1_000_000_000, 1_000_000  # a second and a millisecond, ns
+NS, MS = 1_000_000_000, 1_000_000  #: A second and a millisecond, ns.
 
 Vector = tuple[float, float, float]
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-GYRO_UPDATED = (
-    0b111000  # bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new
-)
+GYRO_UPDATED = 0b111000  #: Bits of ``fields_updated`` of HIGHRES_IMU for a new gyro.
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT of a HEARTBEAT
-NO_AUTOPILOT = 8  # the same of a component that is none
+NO_AUTOPILOT = 8  #: MAV_AUTOPILOT of other components.
 MOST_UNITS = 4
 
 
 class ImuMessage(NamedTuple):
-    """One kind of message."""
+    """Layout of one message."""
 
     name: str
     number: int
-    kind: str  # messages of one kind tell several units of one sort apart
-    size: int  # bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away.
-    head: struct.Struct  # time, acceleration and rate, three each, with which it begins
-    microseconds: int  # in one unit of the time
-    gyro: float  # rad/s in one unit of the rate
-    acceleration: float  # m/s^2 in one unit of the acceleration
-    unit: int = -1  # of which IMU, from 0; -1: it says itself
-    unit_at: int = -1  # where it does, bytes
-    updated_at: int = -1  # where it says which fields are new, bytes; -1: nowhere
+    kind: str  #: Messages of one kind bring several units of one sort.
+    size: (
+        int  #: Bytes of the payload with extensions. MAVLink 2 drops zeros at the end.
+    )
+    head: struct.Struct  #: First fields: time, acceleration and rate, three each.
+    microseconds: int  #: Microseconds in one unit of time.
+    gyro: float  #: rad/s in one unit of rate.
+    acceleration: float  #: m/s^2 in one unit of acceleration.
+    unit: int = -1  #: IMU, from 0. -1: given in the message.
+    unit_at: int = -1  #: Offset of the IMU in the payload, bytes.
+    updated_at: int = -1  #: Offset of ``fields_updated``, bytes. -1: none.
 
 
 _MILLI = (1e-3, 1e-3 * STANDARD_GRAVITY)
@@ -79,17 +81,14 @@ MESSAGES: dict[int, ImuMessage] = {
             updated_at=60,
         ),
     )
-}  # by message id
+}  #: By message id.
 RESOLUTION = {
     "HIGHRES_IMU": "single precision, 1 us",
     "RAW_IMU": "1 mrad/s, 1 us",
     "SCALED_IMU": "1 mrad/s, 1 ms",
 }
-"""Kinds of messages, the finest first, with the resolution of rate and time."""
-SCALED, RAW = (
-    26,
-    27,
-)  # messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it
+"""Resolution of rate and time of each kind of messages, the finest first."""
+SCALED, RAW = 26, 27  #: SCALED_IMU of IMU 1, and RAW_IMU, which may replace SCALED_IMU.
 
 
 def numbers(kind: str) -> tuple[int, ...]:
@@ -102,14 +101,14 @@ def numbers(kind: str) -> tuple[int, ...]:
 class ImuSample(NamedTuple):
     """One sample of one IMU, in the body frame of REP-103: x to the front, y to the left, z up."""
 
-    unit: int  # from 0
-    stamp: int  # ns, as read on the clock of the autopilot
-    rate: Vector  # rad/s
-    acceleration: Vector  # m/s^2
+    unit: int  #: From 0.
+    stamp: int  #: Time on the autopilot's clock, ns.
+    rate: Vector  #: rad/s
+    acceleration: Vector  #: m/s^2
 
 
 def read(number: int, payload: bytes) -> ImuSample | None:
-    """Read the payload, as it came, of one of `MESSAGES`; None: it holds no new sample of a gyro."""
+    """Return the sample in a payload of one of `MESSAGES`, or None without a new gyro sample."""
     message = MESSAGES[number]
     data = payload.ljust(message.size, b"\0")
     time, *values = message.head.unpack_from(data)
@@ -131,21 +130,19 @@ def read(number: int, payload: bytes) -> ImuSample | None:
 
 
 def understood(kind: str, autopilot: int) -> bool:
-    """Whether the messages of a kind are in known units, coming from such an autopilot (MAV_AUTOPILOT)."""
+    """Return whether an autopilot (MAV_AUTOPILOT) sends a kind of messages in known units."""
     return kind != "RAW_IMU" or autopilot == ARDUPILOT
 
 
-# How they are asked for ----------------------------------------------------------------------------------------------
+# Requests ----------------------------------------------------------------------------------------------
 
 
 DEFAULT_INTERVAL = 0
-PATIENCE = NS  # so long an acknowledgement is waited for, ns
+PATIENCE = NS  #: An acknowledgement may take this time, ns.
 TRIES = 3
-AGAIN, AGAIN_REFUSED = (
-    10 * NS,
-    60 * NS,
-)  # what comes too slowly, and what was refused, is asked for again after, ns
-ENOUGH = 0.8  # of the rate asked for
+AGAIN = 10 * NS  #: Time after which a slow message is requested again, ns.
+AGAIN_REFUSED = 60 * NS  #: Time after which a refused message is requested again, ns.
+ENOUGH = 0.8  #: Share of the requested rate that is enough.
 RESULTS = (
     "accepted",
     "refused for now",
@@ -154,48 +151,47 @@ RESULTS = (
     "failed",
     "in progress",
     "cancelled",
-)  # MAV_RESULT
+)  #: MAV_RESULT
 _HOPEFUL = ("not asked yet", RESULTS[5])
 
 
 @dataclass
 class _Wanted:
-    interval: int  # us; `DEFAULT_INTERVAL`: the autopilot's own
-    answer: str = _HOPEFUL[0]  # what the autopilot says to it
-    asked: int = 0  # when it was last asked for, ns
+    interval: int  # us, or `DEFAULT_INTERVAL`
+    answer: str = _HOPEFUL[0]  # of the autopilot
+    asked: int = 0  # time of the last request, ns
     tries: int = 0
 
 
 class Streams:
-    """What one autopilot is asked for: messages at an interval, one request at a time, repeated within bounds.
+    """Requests of messages at an interval: one at a time, repeated within bounds.
 
-    The acknowledgement of MAV_CMD_SET_MESSAGE_INTERVAL does not say which message it is about, so the next request
-    waits for it. Autopilots forget intervals when they start anew, and other programs on the link may set them: what
-    comes too slowly is asked for again now and then.
+    The acknowledgement of MAV_CMD_SET_MESSAGE_INTERVAL does not name the message, so the
+    next request waits for the answer. Autopilots forget intervals at a start, and other
+    programs on the link may set them: slow messages are requested again.
     """
 
     def __init__(self) -> None:
         self._wanted: dict[int, _Wanted] = {}
-        self._queue: list[
-            int
-        ] = []  # messages to be asked for, in this order; the first may be under way
+        # Messages to be requested, in order. The first may be under way.
+        self._queue: list[int] = []
 
     def want(self, messages: Iterable[int], interval: int) -> None:
-        """Ask for messages, by id, at an interval in us, unless they are wanted so."""
+        """Request messages, by id, at an interval, us. The same request again does nothing."""
         for number in messages:
             if number not in self._wanted or self._wanted[number].interval != interval:
                 self._wanted[number] = _Wanted(interval)
                 self._enqueue(number)
 
     def refused(self, number: int) -> bool:
-        """Whether a message was asked for in vain."""
+        """Return whether the request of a message failed."""
         return number in self._wanted and self._wanted[number].answer not in (
             *_HOPEFUL,
             RESULTS[0],
         )
 
     def ask_again(self) -> None:
-        """Ask for all anew: the autopilot has."""
+        """Request all again: the autopilot has started anew."""
         for number, wanted in self._wanted.items():
             if wanted.interval != DEFAULT_INTERVAL:
                 self._enqueue(number)
@@ -206,7 +202,7 @@ class Streams:
             self._queue.append(number)
 
     def due(self, now: int) -> tuple[int, int] | None:
-        """Return message id and interval, us, of a request to be sent now; None: there is none."""
+        """Return message id and interval, us, of a request to be sent now, or None."""
         while self._queue:
             wanted = self._wanted[self._queue[0]]
             if wanted.tries and now < wanted.asked + PATIENCE:
@@ -228,7 +224,7 @@ class Streams:
                 del self._queue[0]
 
     def check(self, number: int, rate: float, now: int) -> None:
-        """Ask again for a message if it comes too slowly, so many a second."""
+        """Request a message again if its rate, Hz, is too low."""
         wanted = self._wanted.get(number)
         if wanted is None or wanted.interval <= 0 or number in self._queue:
             return
@@ -237,58 +233,54 @@ class Streams:
             self._enqueue(number)
 
     def answer_to(self, number: int | None) -> str:
-        """Return what the autopilot says to the request of a message."""
+        """Return the answer to the request of a message."""
         return (
             self._wanted[number].answer if number in self._wanted else "not asked for"
         )
 
 
-# By which clock ------------------------------------------------------------------------------------------------------
+# Clocks ------------------------------------------------------------------------------------------------------
 
 
-DRIFT = 1e-4  # clocks drift from one another by less: 100 ppm
+DRIFT = 1e-4  #: Largest drift between two clocks.
 SLEW = (
-    1e-3  # so fast the offset in use follows a better one, so that stamps do not step
+    1e-3  #: Rate at which the offset in use follows a better one. Stamps do not step.
 )
-STEP = 20 * MS  # a better offset further away than this is taken at once, ns
-GRAIN = MS  # step of the times in answers, at most, ns
-LONGEST = NS  # round trips that take longer say nothing, ns
-SURE = 3  # times or answers in a row that contradict what was known before they are believed: a single one may be wrong
-_KEPT = 64  # round trips, and requests under way, at most
-FIRST_FOR, FIRST_EVERY, THEN_EVERY = (
-    20,
-    NS // 10,
-    NS // 2,
-)  # so many requests at an interval, then at another, ns
+STEP = 20 * MS  #: A better offset further away is taken at once, ns.
+GRAIN = MS  #: Largest step of the times in answers, ns.
+LONGEST = NS  #: Longer round trips are ignored, ns.
+SURE = 3  #: Contradicting times or answers in a row that are believed.
+_KEPT = 64  # largest number of round trips, and of requests under way
+FIRST_FOR = 20  #: Number of first requests,
+FIRST_EVERY = NS // 10  #: their interval, ns,
+THEN_EVERY = NS // 2  #: and that later, ns.
 
 
 class TimeSync:
-    """Finds the offset of a remote clock: its time less the time here, ns.
+    """Finds the offset of a remote clock: remote time less local time, ns.
 
-    A request carries the time here, the answer repeats it beside the time there (Time Synchronization Protocol v2 of
-    the MAVLink guide). Nothing says how a round trip divides into its two ways, so half of it is a bound on the error:
-    the offset is that of the shortest round trip of late, and its error half of that and what the clocks may drift
-    meanwhile. Requests of the autopilot itself are not answered: it would take this computer's clock for the one to
-    follow.
+    A request carries the local time. The answer repeats this time beside the remote time
+    (Time Synchronization Protocol v2 of the MAVLink guide). The two ways of a round trip
+    may differ, so half the trip bounds the error. The offset comes from the shortest
+    recent trip, its error adds the drift since. The autopilot's own requests are not
+    answered: the autopilot would follow this computer's clock.
     """
 
     def __init__(self) -> None:
         self._sent: deque[int] = deque(maxlen=_KEPT)
-        self._trips: deque[tuple[int, int, int]] = deque(
-            maxlen=_KEPT
-        )  # when it ended, offset, half the round trip; ns
+        # End, offset, and half the length of round trips, ns.
+        self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)
         self._best: tuple[int, int, int] | None = None
-        self._odd = 0  # answers in a row that contradict those before
+        self._odd = 0  # contradicting answers in a row
         self._requests = self._next = 0
         self._used: float | None = None
         self._used_at = 0
-        self._arrival: float | None = (
-            None  # highest difference of a stamp from its arrival, ns: offset less latency
-        )
+        # Largest stamp less arrival, ns: offset less latency.
+        self._arrival: float | None = None
         self._arrival_at = 0
 
     def request(self, now: int) -> int | None:
-        """Return the time to be sent in a request, if one is due, ns."""
+        """Return the time for a request that is due now, ns, or None."""
         if now < self._next:
             return None
         self._requests += 1
@@ -297,7 +289,7 @@ class TimeSync:
         return now
 
     def answer(self, sent: int, remote: int, now: int) -> bool:
-        """Take an answer: the time that it repeats, the time there, and now, ns; return whether it is believed."""
+        """Take an answer to a request sent at local time sent; return whether it is believed."""
         if sent not in self._sent or not 0 < remote < 1 << 62:
             return False
         self._sent.remove(sent)
@@ -312,18 +304,18 @@ class TimeSync:
         self._odd = self._odd + 1 if any(far) else 0
         if 0 < self._odd < SURE:
             return False
-        # What so many in a row contradict is of before a step: of a simulation that stood still, or has another pace.
+        # Trips that several answers contradict are older than a step of the clock.
         self._trips = deque(
             (one for one, out in zip(self._trips, far, strict=True) if not out),
             maxlen=_KEPT,
         )
         self._trips.append((now, offset, half))
-        # Which one has the least error does not depend on the time that passes for all of them.
+        # The least error: all errors grow alike with time.
         self._best = min(self._trips, key=lambda trip: trip[2] - DRIFT * trip[0])
         return True
 
     def arrived(self, remote: int, now: int) -> None:
-        """Take the time of a message that has just arrived, ns: without answers it is all there is."""
+        """Take the time in a message that has just arrived, ns, for use without answers."""
         known = (
             -math.inf
             if self._arrival is None
@@ -333,11 +325,11 @@ class TimeSync:
 
     @property
     def synchronised(self) -> bool:
-        """Whether there was an answer."""
+        """Return whether an answer has come."""
         return self._best is not None
 
     def error(self, now: int) -> float | None:
-        """Bound on the error of the offset, ns; None: nothing is known."""
+        """Return a bound on the error of the offset, ns, or None if unknown."""
         return (
             None
             if self._best is None
@@ -345,7 +337,7 @@ class TimeSync:
         )
 
     def offset(self, now: int) -> int | None:
-        """Return the offset to be used, ns; None: nothing was heard yet."""
+        """Return the offset to be used, ns, or None before the first message."""
         wanted = self._arrival if self._best is None else float(self._best[1])
         if wanted is None:
             return None
@@ -361,40 +353,40 @@ def system_ahead(
     monotonic: Callable[[], int] = time.monotonic_ns,
     system: Callable[[], int] = time.time_ns,
 ) -> int:
-    """Return what the time of the system is ahead of the monotonic clock, ns, measured between interruptions."""
+    """Return system time less monotonic time, ns."""
     tries = [(monotonic(), system(), monotonic()) for _ in range(5)]
-    # Of several readings the one during which the least time has passed.
+    # An interruption lengthens a reading: use the shortest.
     before, there, after = min(tries, key=lambda one: one[2] - one[0])
     return there - (before + after) // 2
 
 
 class BootClock:
-    """Times of an autopilot, made whole where 32 bits of milliseconds run over (49.7 days), and looked at for steps."""
+    """Unwraps an autopilot's times, 32 bits of milliseconds (49.7 days), and finds steps."""
 
+    #: Times further back, or further ahead than the time that has passed here, are a step,
+    #: ns: a start of the autopilot, or of its clock.
     BACK, AHEAD = NS, 2 * NS
-    """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or
-    its clock was set."""
     _OVER = (1 << 32) * MS
 
     def __init__(self) -> None:
         self.reset()
-        self.restarts = 0  # steps found
+        self.restarts = 0  #: Steps found.
 
     def reset(self) -> None:
         """Begin anew with the next time."""
         self._latest: int | None = None
-        self._lead = 0  # by how much the times were ahead of those here at most, ns: with the least delay
+        self._lead = 0  # largest time less time here, ns: with the least delay
         self._odd = 0
 
     def unwrap(
         self, time: int, now: int, milliseconds: bool, about: int | None = None
     ) -> int | None:
-        """Return a time that came at the time now here, about so much there, made whole, ns; None: not to be used."""
+        """Return a time that arrived now, unwrapped to be near about, ns. None: impossible."""
         if not 0 <= time < 1 << 61:
             return None
         reference = self._latest if about is None else about
         if milliseconds and reference is not None:
-            # As many whole runs as bring it nearest.
+            # The number of overflows that brings the time nearest.
             time += (
                 max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
             )

@@ -1,14 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The conversation with one autopilot: bytes in, samples of its gyros out; requests and reports to be sent.
+"""Conversation with one autopilot: takes bytes, returns gyro samples, sends requests and reports.
 
-No input, no clock and no ROS of its own: it is given bytes and the time, so a test can be any autopilot. What comes
-from elsewhere is bounded and refused before it is believed: other systems, other addresses than the one in use, wrong
-signatures, times that cannot be.
+The module has no input, clock or ROS of its own. The caller gives bytes and time, so a
+test can be any autopilot. Data from elsewhere are bounded and checked: other systems,
+other addresses than the one in use, wrong signatures, impossible times.
 
-Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC, MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT,
-NAMED_VALUE_FLOAT; and, where `fdi_ros.mavlink.failover` asks for it, PARAM_REQUEST_READ and PARAM_SET.
+Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC,
+MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT, NAMED_VALUE_FLOAT. `fdi_ros.mavlink.failover`
+adds PARAM_REQUEST_READ and PARAM_SET.
 """
 
 from __future__ import annotations
@@ -44,65 +45,51 @@ from fdi_ros.system import require
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 AUTOPILOT_COMPONENT = 1
-GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = (
-    6,
-    18,
-    4,
-    128,
-)  # MAV_TYPE, MAV_STATE, a MAV_MODE_FLAG
-REAL32 = 9  # MAV_PARAM_TYPE; ArduPilot takes any, and knows its own.
-LOST = 3 * NS  # an autopilot that says nothing for so long is lost, ns
-UNSYNCHRONISED = (
-    2 * NS
-)  # so long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns
-CHOICE = 3 * NS  # so long kinds of messages are looked at before one is chosen, ns
-OLDEST, NEWEST = (
-    10 * NS,
-    NS,
-)  # samples older than this when they come, or so far in the future, are refused, ns
-STAND_IN = (
-    2 * NS
-)  # without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns
-WINDOW = 2 * NS  # time over which rates are measured, ns
-MOST_LATE = 8  # messages late in a row after which the count has begun anew
-_PEERS = 8  # addresses whose bytes are put together, at most
+GROUND_STATION, ONBOARD_CONTROLLER = 6, 18  #: MAV_TYPE
+ACTIVE = 4  #: MAV_STATE
+ARMED = 128  #: MAV_MODE_FLAG
+REAL32 = 9  #: MAV_PARAM_TYPE. ArduPilot accepts any type.
+LOST = 3 * NS  #: An autopilot is lost after this time without a message, ns.
+UNSYNCHRONISED = 2 * NS  #: Without TIMESYNC for this time, arrival stamps samples, ns.
+CHOICE = 3 * NS  #: Kinds of messages are compared for this time before the choice, ns.
+OLDEST = 10 * NS  #: Older samples are refused, ns.
+NEWEST = NS  #: Samples further in the future are refused, ns.
+STAND_IN = 2 * NS  #: After this time without SCALED_IMU, RAW_IMU replaces it, ns.
+WINDOW = 2 * NS  #: Rates are measured over this time, ns.
+MOST_LATE = 8  #: After this number of late messages in a row the count begins anew.
+_PEERS = 8  # largest number of addresses with a parser
 _LEFT = (
     1 << 12
-)  # bytes that pymavlink's parser may carry on; it frees them only when it has used the very last
-LARGEST = 3.4e38  # of a float that a message holds
+)  # bytes after which a parser's buffer is cut: pymavlink cuts an empty one only
+LARGEST = 3.4e38  #: Largest float in a message.
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """What an autopilot is asked for."""
+    """Requests to an autopilot."""
 
-    system: int = 0  # system id; 0: that of the first autopilot that is heard and gives gyros, until it is lost
-    component: int = 191  # own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER
-    kind: str = (
-        ""  # kind of messages to be used; empty: the one that shows the most units
-    )
-    rate: float = 50.0  # Hz
-    key: bytes = (
-        b""  # for signing; empty: nothing is signed, and signatures are not looked at
-    )
+    system: int = 0  #: System id. 0: of the first autopilot that sends gyros.
+    component: int = 191  #: Own component id. 191: MAV_COMP_ID_ONBOARD_COMPUTER.
+    kind: str = ""  #: Kind of messages. Empty: the one with the most units.
+    rate: float = 50.0  #: Hz
+    key: bytes = b""  #: Signing key. Empty: signatures are neither made nor checked.
 
 
 @dataclass
 class UnitTrack:
-    """What was seen of one IMU."""
+    """State of one IMU."""
 
     received: int = 0
-    repeated: int = 0  # samples at a time that was there already, or is past
-    impossible: int = 0  # samples at times that cannot be
-    last: int = 0  # when the last sample came, ns
-    time: int = -1  # time of the last sample on the autopilot's clock, ns
-    stamp: int = -1  # of the last sample given out, ns: later ones have later stamps, also with a better offset
-    arrivals: deque[int] = field(
-        default_factory=lambda: deque(maxlen=1024)
-    )  # when samples came, ns
+    repeated: int = 0  #: Samples at or before the time of the last one.
+    impossible: int = 0  #: Samples at impossible times.
+    last: int = 0  #: Arrival of the last sample, ns.
+    time: int = -1  #: Time of the last sample on the autopilot's clock, ns.
+    stamp: int = -1  #: Stamp of the last sample that was returned, ns.
+    #: Arrivals of samples, ns.
+    arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
 
     def rate(self, now: int) -> float:
-        """Return the samples a second of late."""
+        """Return the present rate, Hz."""
         while self.arrivals and self.arrivals[0] < now - WINDOW:
             self.arrivals.popleft()
         count = len(self.arrivals)
@@ -112,7 +99,7 @@ class UnitTrack:
 
 
 def dialect() -> Any:
-    """Return pymavlink's ArduPilot dialect of MAVLink 2, which includes the common one; `FdiError` if it is missing."""
+    """Return pymavlink's ArduPilot dialect of MAVLink 2. Raises `FdiError` without pymavlink."""
     require("MAVLink", ("pymavlink",))
     from pymavlink.dialects.v20 import ardupilotmega
 
@@ -120,9 +107,16 @@ def dialect() -> Any:
 
 
 class Vehicle:
-    """One autopilot as it is heard; `FdiError` if pymavlink is not installed.
+    """One autopilot. Raises `FdiError` if pymavlink is not installed.
 
-    ``send`` takes the bytes of a message and where they go to. ``seconds``: Unix time, s, for signatures.
+    Parameters
+    ----------
+    settings
+        Requests.
+    send
+        Takes the bytes of a message and their destination.
+    seconds
+        Unix time, s, for signatures.
     """
 
     def __init__(
@@ -132,41 +126,33 @@ class Vehicle:
         seconds: Callable[[], float],
     ) -> None:
         self.settings = settings
-        self.system = (
-            settings.system or None
-        )  # system id in use; None: no autopilot was heard yet.
-        self.autopilot = NO_AUTOPILOT  # MAV_AUTOPILOT
-        self.others: dict[
-            int, int
-        ] = {}  # other autopilots on the link: when each was last heard, ns, by system id
+        self.system = settings.system or None  #: System id in use. None: none yet.
+        self.autopilot = NO_AUTOPILOT  #: MAV_AUTOPILOT
+        #: Last message of each other autopilot on the link, ns, by system id.
+        self.others: dict[int, int] = {}
         self.counts: Counter[str] = Counter()
-        self.events: deque[str] = deque(
-            maxlen=32
-        )  # what has happened, in words, for the log
-        self.armed = False  # whether its last heartbeat says so
-        self.disarmed = (
-            0  # for how long all its heartbeats have said that it is not armed, ns
-        )
-        self.begun = 0  # how often a conversation with it began: what it said of parameters before may no longer be so
+        self.events: deque[str] = deque(maxlen=32)  #: Sentences for the log.
+        self.armed = False  #: By the last heartbeat.
+        self.disarmed = 0  #: For how long all heartbeats have reported "disarmed", ns.
+        #: Number of conversations begun. Parameters reported before may have changed.
+        self.begun = 0
         self.peer: Any = None
-        self.behind = 0.0  # s by which the last signature that was too old was so
+        self.behind = 0.0  #: Age of the last signature that was too old, s.
         self._behind_from: Any = None
         self._mavlink = dialect()
         self._send, self._seconds = send, seconds
         self._verifier = Verifier(settings.key) if settings.key else None
         self._parsers: dict[Any, Any] = {}
-        # What is sent before an autopilot was heard comes from system 1.
+        # Before an autopilot is known, messages are sent as system 1.
         self._out = self._mavlink.MAVLink(
             None, settings.system or 1, settings.component
         )
         if settings.key:
-            self._out.signing.secret_key, self._out.signing.sign_outgoing = (
-                settings.key,
-                True,
-            )
+            self._out.signing.secret_key = settings.key
+            self._out.signing.sign_outgoing = True
             self._out.signing.timestamp = now_in_steps(seconds())
-        self._beat = 0  # when the last heartbeat was sent, ns
-        self._scaled_at = 0  # when SCALED_IMU of IMU 1 came last, or was asked for, ns
+        self._beat = 0  # time of the last heartbeat sent, ns
+        self._scaled_at = 0  # last arrival or request of SCALED_IMU of IMU 1, ns
         self._sequence: int | None = None
         self._late = 0  # late messages in a row
         self._lost = False
@@ -175,30 +161,30 @@ class Vehicle:
         self._know_nothing()
 
     def _know_nothing(self) -> None:
-        """Begin with an autopilot of which nothing is known: the first, or another one."""
-        self.kind = self.settings.kind  # kind of messages in use; empty: not chosen yet
-        self.sync, self.clock, self.streams = TimeSync(), BootClock(), Streams()
+        """Begin with an autopilot of which nothing is known."""
+        self.kind = self.settings.kind  #: Kind of messages in use. Empty: not chosen.
+        self.sync = TimeSync()
+        self.clock = BootClock()
+        self.streams = Streams()
         self.units: dict[int, UnitTrack] = {}
-        self.magnetometers: set[int] = set()  # units of which only a magnetometer came
-        self.heard = 0  # when it was last heard, ns; 0: never
-        self.gives_gyros = False  # whether it has sent any
-        self.parameters: deque[tuple[str, float]] = deque(
-            maxlen=64
-        )  # what it has said of them, to be taken out
+        self.magnetometers: set[int] = set()  #: Units that sent only a magnetometer.
+        self.heard = 0  #: Time of the last message, ns. 0: none.
+        self.gives_gyros = False
+        #: Parameters reported: names and values. The reader takes them out.
+        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
         self._found = self._first_imu = 0
-        self._seen: set[tuple[str, int]] = (
-            set()
-        )  # kinds and units of which samples came, until a kind is chosen
+        # Kinds and units that sent samples, until a kind is chosen.
+        self._seen: set[tuple[str, int]] = set()
 
     # What comes in ------------------------------------------------------------------------------------------------
 
     def reopened(self) -> None:
-        """Begin with clean parsers: the link was opened anew."""
+        """Clear the parsers: the link was opened anew."""
         self._parsers.clear()
         self.peer = self._behind_from = None
 
     def feed(self, peer: Any, data: bytes, now: int) -> list[ImuSample]:
-        """Take bytes from an address, at the monotonic time now, ns, and return the samples in them, by that clock."""
+        """Return the samples in bytes from an address at monotonic time now, ns, by that clock."""
         samples = []
         for message in self._parsed(peer, data):
             if message.get_msgId() == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
@@ -208,7 +194,7 @@ class Vehicle:
         return samples
 
     def _process(self, message: Any, peer: Any, now: int) -> ImuSample | None:
-        """Take one message; return the sample in it, if it is one of the autopilot in use."""
+        """Take one message and return its sample, if the autopilot in use sent one."""
         number, data = message.get_msgId(), bytes(message.get_msgbuf())
         header = 10 if data[0] == 0xFD else 6
         sequence, system, component = data[4:7] if header == 10 else data[2:5]
@@ -221,7 +207,7 @@ class Vehicle:
                 self.counts["signed late"] += 1
                 self.behind, self._behind_from = self._verifier.behind, peer
         elif number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
-            # Of another dialect: without its layout there is no checksum to believe it by.
+            # Of another dialect: the checksum depends on the unknown layout.
             self.counts["unknown"] += 1
             if self._sequence is not None and sequence == (self._sequence + 1) & 255:
                 self._sequence = sequence
@@ -240,20 +226,18 @@ class Vehicle:
         return None
 
     def _parsed(self, peer: Any, data: bytes) -> list[Any]:
-        """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
+        """Return the messages in bytes; each address has a parser of its own."""
         parser = self._parsers.pop(peer, None)
         if parser is None:
             parser = self._mavlink.MAVLink(None)
             parser.robust_parsing = True
         self._parsers[peer] = parser
         if len(self._parsers) > _PEERS:
-            # The address in use keeps its own; of the others the one that is silent the longest goes.
+            # Drop the parser of the address that is silent the longest, never of the one in use.
             del self._parsers[next(one for one in self._parsers if one != self.peer)]
         try:
             messages = parser.parse_buffer(data) or []
-        except (
-            Exception
-        ):  # pymavlink lets through what goes wrong with the bytes of others.
+        except Exception:  # pymavlink raises anything on bad bytes
             self.counts["bad"] += 1
             del self._parsers[peer]
             return []
@@ -270,7 +254,7 @@ class Vehicle:
         peer: Any,
         now: int,
     ) -> bool:
-        """Whether a message comes from the autopilot in use, at the address in use; takes one into use."""
+        """Return whether the autopilot in use sent a message; a new one may come into use."""
         is_autopilot = component == AUTOPILOT_COMPONENT
         beats = is_autopilot and number == HEARTBEAT
         beats = (
@@ -283,7 +267,7 @@ class Vehicle:
             and system != self.system
             and self._may_change_to(system, beats, number, now)
         ):
-            # It is taken into use with its next heartbeat.
+            # It comes into use with its next heartbeat.
             self.system, self.begun = system, self.begun + 1
             self._know_nothing()
         if system != self.system or not is_autopilot:
@@ -305,7 +289,7 @@ class Vehicle:
             return False
         if not self.heard or self._lost or peer != self.peer:
             if not beats:
-                # Only one that says it is an autopilot is taken into use, and again after silence.
+                # Only a heartbeat begins a conversation, the first and each after silence.
                 self.counts["before a heartbeat"] += 1
                 return False
             self._begin_with(message, peer, now)
@@ -320,7 +304,7 @@ class Vehicle:
         return True
 
     def _may_change_to(self, system: int, beats: bool, number: int, now: int) -> bool:
-        """Whether another one may be the autopilot now: none is given, and that in use is lost or gives no gyros."""
+        """Return whether another autopilot may come into use: the present one is lost or silent."""
         is_gone = self.system is None or self._lost
         if self.settings.system or not system or not (is_gone or not self.gives_gyros):
             return False
@@ -329,16 +313,14 @@ class Vehicle:
         return beats and (is_gone or now - self._found > LOST)
 
     def _begin_with(self, message: Any, peer: Any, now: int) -> None:
-        """Take an autopilot into use, or again."""
+        """Begin or resume a conversation with an autopilot."""
         again = "again, " if self._found else ""
-        self.peer, self.autopilot, self._found, self._lost = (
-            peer,
-            message.autopilot,
-            now,
-            False,
-        )
-        self.begun, self._disarmed_at = self.begun + 1, None
-        self._behind_from = None
+        self.peer = peer
+        self.autopilot = message.autopilot
+        self._found = now
+        self._lost = False
+        self.begun += 1
+        self._disarmed_at = self._behind_from = None
         self._out.srcSystem = self.system
         self._sequence, self._scaled_at = None, now
         self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
@@ -355,7 +337,7 @@ class Vehicle:
             self.streams.want(wanted, self._interval)
 
     def _count_lost(self, sequence: int) -> bool:
-        """Count what is missing before a message; return whether it is not late, nor one that came before."""
+        """Count the messages lost before this one; return whether it is newer than the last."""
         gap = 0 if self._sequence is None else (sequence - self._sequence - 1) & 255
         is_new = gap < 128
         self.counts["lost"] += gap if is_new else 0
@@ -378,7 +360,7 @@ class Vehicle:
         if number == SCALED:
             self._scaled_at = now
         elif number == RAW and sample.unit == 0 and now - self._scaled_at > STAND_IN:
-            # Unless it is in use itself.
+            # Unless RAW_IMU itself was chosen.
             kind = kind if self.kind == kind else MESSAGES[SCALED].kind
         if not self.kind and not self._choose(kind, sample.unit, now):
             return None
@@ -391,7 +373,7 @@ class Vehicle:
     def _timed(
         self, sample: ImuSample, milliseconds: bool, now: int
     ) -> ImuSample | None:
-        """Return a sample with its stamp by the monotonic clock here, if it is new and its time can be."""
+        """Return a sample stamped by the monotonic clock here; None: repeated or impossible."""
         track = self.units.setdefault(sample.unit, UnitTrack())
         self.magnetometers.discard(sample.unit)
         restarts, offset = self.clock.restarts, self.sync.offset(now)
@@ -426,7 +408,7 @@ class Vehicle:
         return sample._replace(stamp=stamp)
 
     def _choose(self, kind: str, unit: int, now: int) -> bool:
-        """Choose the kind of messages with the most units, the finest of several; return whether that is done."""
+        """Choose the kind of messages with the most units, the finest of several; return success."""
         self._first_imu = self._first_imu or now
         self._seen.add((kind, unit))
         if now - self._first_imu < CHOICE:
@@ -443,7 +425,7 @@ class Vehicle:
     # What goes out ------------------------------------------------------------------------------------------------
 
     def tick(self, now: int) -> None:
-        """Send what is due; called often."""
+        """Send due messages; called often."""
         if is_second := now - self._beat >= NS:
             self._beat = now
             self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
@@ -465,7 +447,7 @@ class Vehicle:
                 self.streams.want((RAW,), self._interval)
 
     def _check_rates(self, now: int) -> None:
-        """Ask again for messages that come too slowly; of those with several units the slowest counts."""
+        """Request messages again that come too slowly; the slowest unit of a message counts."""
         for number in numbers(self.kind):
             unit = MESSAGES[number].unit
             if unit not in self.magnetometers:
@@ -481,13 +463,13 @@ class Vehicle:
         self._say("statustext", severity, text.encode("ascii", "replace")[:50])
 
     def read_parameter(self, name: str) -> None:
-        """Ask for a parameter; what it says comes in `parameters`."""
+        """Request a parameter; its value arrives in `parameters`."""
         self._say(
             "param_request_read", self.system, AUTOPILOT_COMPONENT, name.encode(), -1
         )
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter; it says so to all."""
+        """Set a parameter; the autopilot reports the new value."""
         self._say(
             "param_set", self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32
         )
@@ -510,12 +492,12 @@ class Vehicle:
         )
         data = getattr(out, f"{name}_encode")(*fields).pack(out)
         out.seq = (out.seq + 1) % 256
-        # One whose time of signatures is behind is told ours by what is sent: MAVLink has it take over later times.
+        # Our signed messages set an autopilot whose signing clock is behind.
         self._send(bytes(data), self._behind_from if self.peer is None else self.peer)
 
     @property
     def in_reach(self) -> bool:
-        """Whether the autopilot is heard."""
+        """Whether messages of the autopilot arrive."""
         return bool(self._found) and not self._lost
 
     @property
