@@ -3,8 +3,8 @@
 
 """Failover of one ArduPilot: the policy joined to the vehicle, the monitor and the file.
 
-`Failover.turn` collects what is known now, asks `fdi_ros.mavlink.failover_policy`, sends
-its orders and announces its conditions. It decides nothing by itself.
+`Failover.turn` collects the present view, asks `fdi_ros.mavlink.failover_policy`, sends
+the orders and announces the conditions. All decisions are the policy's.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LATE = 1.0  #: Age of the newest judged sample from which the monitor is late, s
 LOSSY = 0.1  #: Largest share of lost messages at which failover is ready.
 SLOW = 300 * MS  #: Longest round trip at which failover is ready, ns.
 MONITOR_LATE = "the monitor is late"
-SIZING = 200 * MS  #: A text waits at most so long for the size of an error, ns.
+SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
 STEADY = 3 * NS  #: Readiness must have changed for this time to be announced, ns.
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns.
@@ -61,7 +61,7 @@ class Failover:
     settings
         Settings of the policy.
     path
-        File that keeps the IMUs out of use. `ConfigError` if it cannot be used.
+        File that keeps the IMUs out of use. Raises `ConfigError` if unusable.
     seconds
         Clock of this computer, Unix time, s.
     """
@@ -80,12 +80,11 @@ class Failover:
         self._seconds = seconds
         count = len(channels) // 3
         interval = round(NS / vehicle.settings.rate)
-        #: When the monitor last reported these IMUs in its diagnostics, ns; 0: never,
-        #: or it reported others since.
+        #: Time of the monitor's last diagnostics with these IMUs, ns. 0: none, or others since.
         self.reported = 0
         #: Nobody else publishes on the topics of the monitor and of this node.
         self.is_alone = False
-        #: Age of the newest judged sample when it was reported, s; NaN: unknown.
+        #: Age of the newest judged sample when reported, s. NaN: unknown.
         self.age = math.nan
         self.evidence = Evidence(count, interval, settings.min_size)
         self._file = FailoverFile(path, count)
@@ -99,10 +98,10 @@ class Failover:
         self._read_at = -NS
         self._hurry = False
         self._unsized: dict[int, int] = {}  # IMUs out of use, not announced yet: since
-        self._counted = (0, 0, 0)  # time, ns; messages lost and received until then
+        self._counted = (0, 0, 0)  # time, ns, and messages lost and received until then
         self._lost = math.nan  # share of messages lost of late
         self._ready: tuple[str, int] = ("", 0)  # the present reason, and since when
-        self._told: str | None = None  # the reason that was announced; None: nothing
+        self._told: str | None = None  # the reason announced last
 
     @property
     def out(self) -> tuple[int, ...]:
@@ -129,7 +128,7 @@ class Failover:
         self.evidence.raw.feed(sample.unit, sample.stamp, sample.rate)
 
     def turn(self, now: int, restore: bool = False) -> None:
-        """Do what is due at time now, ns; restore: the operator puts all back."""
+        """Do all that is due at time now, ns. restore: the operator puts all back."""
         self._note_boot(now)
         self._read(now)
         view = self._view(now, restore)
@@ -153,7 +152,7 @@ class Failover:
             self._vehicle.events.append(error)
 
     def restore(self, now: int) -> tuple[bool, str]:
-        """Put all IMUs back; return whether the autopilot was asked, and an answer."""
+        """Put all IMUs back. Return whether the autopilot was asked, and an answer."""
         ours = ", ".join(imu_name(imu, self._channels) for imu in self.out)
         if not ours:
             return True, "no IMU is out of use by failover"
@@ -215,7 +214,7 @@ class Failover:
     def _view(self, now: int, restore: bool = False) -> View:
         vehicle = self._vehicle
         evidence = self.evidence
-        # Another system's parameters say nothing about the one with an IMU out.
+        # Parameters of another system do not count for the one with an IMU out.
         is_same = vehicle.system == self._system or not self.out
         delivers = [
             k in vehicle.units and now - vehicle.units[k].last < SILENT
@@ -281,10 +280,10 @@ class Failover:
             self._say(WARNING if why else INFO, f"FDI: {words}"[:LENGTH])
 
     def _not_ready(self, view: View, now: int) -> str:
-        """Return why a fault would not be answered now as it should; empty: it would."""
+        """Return why a fault might go unanswered now. Empty: every fault would be answered."""
         memories = self._state.memories
         names = [f"IMU {k + 1}" for k in range(len(memories))]
-        # Each IMU in turn as if it were bad, with fresh reports, in flight.
+        # Suppose each IMU in turn bad, with fresh reports, in flight.
         imus = [imu._replace(heard=now if imu.heard else 0) for imu in view.imus]
         against = []
         for k, imu in enumerate(imus):

@@ -3,9 +3,8 @@
 
 """Evidence for failover: raw samples of the IMUs compared, beside the monitor's states.
 
-The monitor removes learned errors from the samples and remembers what it has declared.
-The raw comparison does neither: it shows by how much the autopilot's own gyros differ
-now. Failover needs both to take an IMU out of use.
+The monitor removes learned errors from the samples and remembers declarations. The raw
+comparison does neither and shows the present difference of the autopilot's own gyros.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 DECAY = 0.5  #: Time constant with which the largest size of late decays, s,
 HEALED = NS // 2  #: until the IMU has agreed for this time, ns.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
-VOTE = 2.0  #: In a set of several IMUs, the odd one must be so many ``min_size`` off.
+VOTE = 2.0  #: Least error of the odd one in a set of several IMUs, in ``min_size``.
 LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR = 0.5
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
-FEWEST = 3  #: and so many samples.
+FEWEST = 3  #: and this number of samples.
 SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
@@ -78,7 +77,7 @@ class RawComparison:
         }
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
-        """Take a sample of an IMU, from 0, at a stamp, ns; rate in rad/s."""
+        """Take a sample of an IMU, from 0: stamp in ns, rate in rad/s."""
         if unit >= len(self._last):
             return
         self._last[unit] = stamp, rate
@@ -105,9 +104,9 @@ class RawComparison:
     def between(
         self, unit: int, other: int, now: int, last: int = 0
     ) -> Difference | None:
-        """Return the difference of two IMUs at time now, ns; None: not compared of late.
+        """Return the difference of two IMUs at time now, ns, or None without recent pairs.
 
-        last: samples that are averaged; 0: those of `AVERAGED`.
+        last: number of samples averaged. 0: all within `AVERAGED`.
         """
         rows = list(self._pairs[min(unit, other), max(unit, other)])[-last:]
         if len(rows) < last or not rows or now - rows[-1][0] > CURRENT:
@@ -131,7 +130,7 @@ class Evidence:
     Parameters
     ----------
     count
-        Number of IMUs; the monitor has three channels for each.
+        Number of IMUs. The monitor has three channels for each.
     interval
         Time between two samples of an IMU, ns.
     min_size
@@ -139,16 +138,16 @@ class Evidence:
     """
 
     def __init__(self, count: int, interval: int, min_size: float) -> None:
-        self.heard = 0  #: When the monitor last sent its states, ns; 0: never.
-        self.begun = 0  #: Since when it has sent them without a break, ns.
+        self.heard = 0  #: Time of the monitor's last states, ns. 0: none.
+        self.begun = 0  #: Time from which states have come without a break, ns.
         self.raw = RawComparison(count, interval)
         self.imus: tuple[Imu, ...] = (Imu(),) * count
-        #: Raw difference of each IMU to the nearest other one now, rad/s; NaN: unknown.
+        #: Raw difference of each IMU to the nearest other one now, rad/s. NaN: unknown.
         self.apart = [math.nan] * count
         self._min_size = min_size
         self._fewest = max(FEWEST, QUICK // interval + 1)
         self._states: list[set[float]] = [set()] * count
-        self._odd = -1  # the IMU that sets point to; -1: none
+        self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0
         self._looked = 0
 
@@ -160,7 +159,7 @@ class Evidence:
         self._states = [set(states[k : k + 3]) for k in range(0, len(states), 3)]
 
     def look(self, delivers: Sequence[bool], now: int) -> tuple[Imu, ...]:
-        """Return the IMUs at time now, ns, given which of them deliver samples."""
+        """Return the IMUs at time now, ns, given which IMUs deliver samples."""
         apart: dict[tuple[int, int], float] = {}  # rad/s, by pair
         for pair in combinations(range(len(delivers)), 2):
             if delivers[pair[0]] and delivers[pair[1]]:
@@ -202,12 +201,12 @@ class Evidence:
         """Return the IMU that is bad without a name, and for how long that must stand, ns.
 
         Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
-        or by less if the monitor doubts it too. Else it is the only IMU with a set. -1: none.
+        or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
 
         Parameters
         ----------
         apart
-            Difference of each pair of IMUs that deliver samples, rad/s; NaN: unknown.
+            Difference of each pair of IMUs that deliver samples, rad/s. NaN: unknown.
         """
         for pair, alike in apart.items() if len(apart) == 3 else ():
             (k,) = {0, 1, 2}.difference(pair)

@@ -22,7 +22,7 @@ LARGEST = 4096  #: Largest file that is read, bytes.
 class Saved(NamedTuple):
     """Content of the file."""
 
-    system: int = 0  #: System id of the autopilot; 0: none yet.
+    system: int = 0  #: System id of the autopilot. 0: none yet.
     out: tuple[int, ...] = ()  #: IMUs out of use by our orders, from 0.
     booted: float = 0.0  #: Unix time at which the autopilot started, s.
 
@@ -39,7 +39,7 @@ class FailoverFile:
         self._retry = 0
 
     def keep(self, saved: Saved, now: int) -> str:
-        """Write content that is new, beside this thread; return an error, or ""."""
+        """Write new content in another thread. Return an error, or an empty text."""
         error = ""
         if self._job is not None and self._job.done():
             cause = self._job.exception()

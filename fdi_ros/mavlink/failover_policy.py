@@ -3,13 +3,13 @@
 
 """Rules of failover: which IMUs of an ArduPilot are to be out of use now.
 
-`decide` is a pure function, called at every tick (10 to 50 times a second). It takes
+`decide` is a pure function, called at every tick (10 to 50 times a second), that takes
 the present view and its own memory, and returns orders, conditions to announce, and
 the next memory. It has no clock and no link. An order sets INS_USEk.
 
 Definitions
     apart    raw rate differs from the nearest other IMU by ``min_size`` or more
-    bad      named by the monitor, and apart. What is only one of both is left in use.
+    bad      named by the monitor, and apart. With only one of both, left in use.
     sound    delivers, and the monitor finds it OK or it is not apart
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
@@ -47,17 +47,17 @@ from typing import NamedTuple
 from fdi_ros.mavlink.protocol import MS, NS
 
 FRESH = 200 * MS  #: Largest age of the report on which an IMU counts as a reserve, ns.
-SETTLED = 2 * NS  #: A parameter message sent so long ago has arrived or is lost, ns.
+SETTLED = 2 * NS  #: Longest way of a parameter message, ns.
 #: A report against our order is ignored for this time after the order, ns: ArduPilot
-#: answers a read up to 100 ms late, with the value of when it read it.
+#: answers a read up to 100 ms late, with the value from the time of reading.
 STALE_ANSWER = NS // 2
-LASTING = NS  #: A change that we have not ordered counts if it stands so long, ns.
-PAUSE = 2 * NS  #: Time that an IMU must not be apart before it goes back, ns.
+LASTING = NS  #: A change that we have not ordered counts after this time, ns.
+PAUSE = 2 * NS  #: An IMU goes back after this time without being apart, ns.
 LONGEST_PAUSE = 16 * NS  #: Bound of the doubled pause, ns.
 RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an order, ns.
 QUICK_TRIES = 10
 SLOW_RETRY = NS  #: Time between further copies, ns.
-GROUNDED = 2 * NS  #: The flight is over after so long disarmed, ns.
+GROUNDED = 2 * NS  #: The flight is over after this time disarmed, ns.
 REACTION = NS  #: A bad IMU in use is announced after this time, ns.
 UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
 ACQUAINTED = 5 * NS  #: Agreement needed once before failover is ready, ns.
@@ -70,7 +70,7 @@ NEVER = -(10**18)  #: A time before all others, ns.
 
 
 class Condition(Enum):
-    """State of an IMU, or of the vehicle, that the pilot hears of when it begins."""
+    """State of an IMU or of the vehicle, announced to the pilot at its beginning."""
 
     FINE = "in use and not bad"
     DANGER = "bad, in use, armed"
@@ -93,49 +93,49 @@ REPEATED = {Condition.DANGER, Condition.LAST_IMU, Condition.LAST_LANE}
 class PolicySettings(NamedTuple):
     """Settings of failover."""
 
-    limit: int = 0  #: Most IMUs out of use by our orders; 0: all but one.
+    limit: int = 0  #: Most IMUs out of use by our orders. 0: all but one.
     min_size: float = 0.03  #: Smallest error that is acted on, rad/s.
 
 
 class Imu(NamedTuple):
-    """One IMU now; times in ns."""
+    """Present state of one IMU. Times in ns."""
 
-    use: bool | None = None  #: Last report of its INS_USE; None: no recent report.
+    use: bool | None = None  #: Last report of its INS_USE. None: no recent report.
     heard: int = NEVER  #: Time of that report.
     named: bool = False  #: The monitor holds this IMU to be faulty.
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
     size: float = float("nan")
-    """Largest raw difference to the nearest other IMU of late, rad/s; NaN: unknown."""
-    agreed: int | None = None  #: Not apart since this time; None: apart or unknown.
+    """Largest raw difference to the nearest other IMU of late, rad/s. NaN: unknown."""
+    agreed: int | None = None  #: Not apart since this time. None: apart or unknown.
 
 
 class View(NamedTuple):
-    """What is known now; times in ns."""
+    """All that is known now. Times in ns."""
 
     imus: tuple[Imu, ...]
     linked: bool = False  #: An ArduPilot that sends SCALED_IMU is heard.
     armed: bool = False
     disarmed: int = 0  #: How long all heartbeats have reported "disarmed".
-    monitored: bool = False  #: The right monitor is alive, and nobody imitates it.
+    monitored: bool = False  #: The right monitor is alive and has no imitator.
     boots: int = 0  #: Number of starts of the autopilot seen.
     restore: bool = False  #: The operator asks now to put all of ours back.
 
 
 @dataclass
 class Memory:
-    """What the policy remembers of one IMU; times in ns."""
+    """Memory of one IMU between ticks. Times in ns."""
 
     ours: bool = False
     held: bool = False
-    seen: bool | None = None  #: INS_USE as last reported; None: not since the boot.
+    seen: bool | None = None  #: INS_USE as last reported. None: not since the boot.
     out_sent: int = NEVER  #: When the last order "out of use" was sent.
     back_sent: int = NEVER  #: When the last order "in use" was sent.
     tries: int = 0  #: Copies sent of the present order.
-    taken: int = 0  #: How often it was taken out in this flight.
+    taken: int = 0  #: Number of times taken out in this flight.
     left_alone: bool = False
     without_notch: bool = False  #: Ours, and out of use at the autopilot's last start.
-    acquainted: bool = False  #: It has agreed with another IMU for `ACQUAINTED` once.
+    acquainted: bool = False  #: Has once agreed with another IMU for `ACQUAINTED`.
     bad_since: int | None = None
     apart_since: int | None = None
     against_since: int | None = None  #: Since when reports contradict `seen`, ns.
@@ -200,12 +200,12 @@ class Decision(NamedTuple):
 
 
 def is_apart(imu: Imu, settings: PolicySettings) -> bool:
-    """Return whether the raw rate of an IMU differs from that of every other one."""
+    """Return whether the raw rate of an IMU differs from every other raw rate."""
     return imu.size >= settings.min_size
 
 
 def is_bad(imu: Imu, settings: PolicySettings) -> bool:
-    """Return whether an IMU is to be out of use. Unknown size: it is not."""
+    """Return whether an IMU is to be out of use. Of unknown size: no."""
     return imu.delivers and imu.named and is_apart(imu, settings)
 
 
@@ -221,7 +221,7 @@ def objection(
     now: int,
     settings: PolicySettings,
 ) -> str:
-    """Return what forbids an order to take IMU k out of use now; empty: nothing."""
+    """Return the reason against an order to take IMU k out of use now. Empty: none."""
     others = [j for j in range(len(memories)) if j != k]
     limit = settings.limit or len(others)
     reserve = any(
@@ -316,7 +316,7 @@ def _remember(
 def _hear(memory: Memory, use: bool, heard: int) -> None:
     """Compare a report of INS_USE, received at heard, ns, with our orders."""
     ordered_at = max(memory.out_sent, memory.back_sent)
-    # Without an order of this run, what is ours is out by the last run's.
+    # Without an order of this run, the last run's order counts.
     ordered = memory.back_sent > memory.out_sent
     is_first = memory.seen is None and ordered_at == NEVER
     expected = (memory.seen,) if ordered_at == NEVER else (memory.seen, ordered)
@@ -418,7 +418,7 @@ def _is_due(
     if not view.linked or (memory.tries and now - last < pause):
         return False
     if memory.held:
-        # Once it was reported out, another report is a late answer or another station.
+        # After a report "out", another value is a late answer or another station's.
         is_open = memory.seen is not False
         return is_open and not objection(k, memories, view, now, settings)
     unanswered = not imu.use or imu.heard <= memory.back_sent

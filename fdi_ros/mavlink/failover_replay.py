@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The policy of failover asked about a recorded flight: its orders, had it been armed."""
+"""Orders that the policy of failover would have given in a recorded flight, if armed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fdi_ros.mavlink.failover_words import imu_name
 from fdi_ros.mavlink.protocol import MS, NS
 
 _STEP = 20 * MS  # the policy is asked so often, ns
-_AFTER = 40 * NS  # and for so long after a change, ns: longer than every pause of it
+_AFTER = 40 * NS  # and for this time after a change, ns: longer than every pause
 _BEGIN = 10 * NS  # time of the policy at the start of the recording, ns
 
 
@@ -33,7 +33,7 @@ class Change(NamedTuple):
     at: float  #: Time since the start, s.
     channel: str  #: Name.
     state: str  #: Name of the new `ChannelState`.
-    error: float  #: Estimated error, rad/s; 0: not estimated.
+    error: float  #: Estimated error, rad/s. 0: not estimated.
 
 
 class _Channel(NamedTuple):
@@ -123,7 +123,7 @@ def _has_set(channels: Sequence[_Channel]) -> bool:
 
 
 def _size(channels: Sequence[_Channel]) -> float:
-    """Return the largest error of declared channels, rad/s; infinite: not estimated."""
+    """Return the largest error of declared channels, rad/s. Infinite: not estimated."""
     declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
     errors = [one.error or float("inf") for one in channels if one.state in declared]
     return max(errors, default=0.0)

@@ -1,13 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bytes from and to an autopilot over UDP, TCP or a serial line, and the signatures of MAVLink 2.
+"""Bytes from and to an autopilot over UDP, TCP or a serial line, and MAVLink 2 signatures.
 
-A link never waits, is opened again when lost, and is bounded. Only the standard library and, for serial lines,
-pyserial; pymavlink's own connections wait, print and end processes.
+A link never waits. A lost one is opened again. All buffers are bounded. Only the standard
+library is used, and pyserial for serial lines. pymavlink's own connections wait, print and
+end processes.
 
-The check of signatures is not pymavlink's: that one remembers the time in a message before it has looked at the
-signature, so one forged message with a late time locks the true sender out, and forged link ids fill its memory.
+pymavlink checks signatures unsafely: the time in a message is kept before the signature is
+checked, so one forged late message locks the true sender out, and forged link ids fill the
+memory. `Verifier` replaces that check.
 """
 
 from __future__ import annotations
@@ -29,11 +31,9 @@ from fdi_ros.mavlink.protocol import NS
 from fdi_ros.system import require
 from fdi_ros.system.files import open_regular
 
-MOST_AT_ONCE = 1 << 15  # bytes that are read before others get their turn
-MOST_WAITING = (
-    1 << 12
-)  # bytes that wait to be sent: half a second of a slow line. What is more is dropped.
-RETRY = NS  # between two attempts to open a link, ns
+MOST_AT_ONCE = 1 << 15  #: Bytes read before others get their turn.
+MOST_WAITING = 1 << 12  #: Bytes that may wait to be sent: half a second of a slow line.
+RETRY = NS  #: Time between two attempts to open a link, ns.
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (
     errno.ECONNREFUSED,
@@ -46,20 +46,20 @@ _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD
 
 
 class Link:
-    """A way to an autopilot, opened by a function; messages that are sent wait, whole, until there is room."""
+    """Link to an autopilot, opened by a function. Messages wait whole until they can be sent."""
 
     def __init__(self, url: str, make: Callable[[], Any], gone: str = _CLOSED) -> None:
         self.url = url
-        self.trouble = "not open yet"  # why it is not open, in words; empty: it is
-        self.dropped = 0  # messages that could not be sent
-        self.opened = 0  # how often it was opened
+        self.trouble = "not open yet"  #: Why the link is not open. Empty: open.
+        self.dropped = 0  #: Messages that could not be sent.
+        self.opened = 0  #: Number of times that the link was opened.
         self._make, self._gone = make, gone
         self._attempt = 0
-        self._handle: Any = None  # the socket or the serial port, which never waits; None: there is none.
+        self._handle: Any = None  # non-blocking socket or serial port
         self._waiting = bytearray()
 
     def _is_connected(self) -> bool:
-        """Whether the handle can be used; raises OSError if it never can."""
+        """Return whether the handle is usable. Raises OSError if the attempt failed."""
         if not select.select([], [self._handle], [], 0)[1]:
             return False
         if isinstance(self._handle, socket.socket):
@@ -67,8 +67,8 @@ class Link:
         return True
 
     def _read(self) -> tuple[Any, bytes]:
-        """Read once, from whom and what; raises BlockingIOError where nothing is there, OSError when lost."""
-        # A serial line without bytes reads as empty, too: what claims to have some and has none is gone.
+        """Return sender and bytes of one read. Raises BlockingIOError without data, OSError if lost."""
+        # A serial line without bytes reads as empty too. Ready and empty: gone.
         if not select.select([self._handle], [], [], 0)[0]:
             raise BlockingIOError
         data = os.read(self._handle.fileno(), _DATAGRAM)
@@ -77,7 +77,7 @@ class Link:
         return None, data
 
     def receive(self, now: int) -> list[tuple[Any, bytes]]:
-        """Open the link if need be, return what has arrived, from whom (None: there is only one); send what waits."""
+        """Return the bytes that arrived, with their sender (None: the only one). Opens the link."""
         found: list[tuple[Any, bytes]] = []
         size = 0
         try:
@@ -99,7 +99,7 @@ class Link:
         return found
 
     def send(self, data: bytes, peer: Any) -> None:
-        """Send one message, or drop it."""
+        """Send one message or drop the message."""
         if self.trouble:
             return
         if len(self._waiting) + len(data) > MOST_WAITING:
@@ -119,10 +119,10 @@ class Link:
             self._lost(error.strerror or str(error))
 
     def wait(self, seconds: float) -> None:
-        """Wait until there is something to read, or to go on with, at most so long."""
+        """Wait until the link can be read or goes on opening, at most for a time, s."""
         handles = [] if self._handle is None else [self._handle]
         try:
-            # A connection that is made, or fails, can be written to.
+            # A connection becomes writable when made, and when failed.
             select.select(
                 handles, handles if self.trouble or self._waiting else [], [], seconds
             )
@@ -143,7 +143,7 @@ class Link:
 
 
 class Udp(Link):
-    """UDP to an address; None: to whoever has sent."""
+    """UDP to an address. None: to the sender."""
 
     def __init__(
         self, url: str, make: Callable[[], Any], address: tuple[str, int] | None
@@ -157,12 +157,12 @@ class Udp(Link):
         except OSError as error:
             if error.errno not in _UNREACHABLE:
                 raise
-            # An answer to what was sent to nobody.
+            # The report of an earlier message that nobody received.
             raise BlockingIOError from error
         return peer, data
 
     def send(self, data: bytes, peer: Any) -> None:
-        """Send one message, or drop it."""
+        """Send one message or drop the message."""
         to = self._address or peer
         if self._handle is None or to is None:
             return
@@ -191,7 +191,7 @@ def _raise(code: int) -> None:
 
 
 def open_link(url: str) -> Link:
-    """Return the link of a URL, which opens itself when it is first read; `FdiError` if it cannot be one."""
+    """Return the link of a URL, opened at the first read. Raises `FdiError` for a wrong URL."""
     kind, _, rest = url.partition(":")
     place, _, last = rest.rpartition(":")
     number = int(last) if last.isdecimal() and len(last) < 9 else -1
@@ -199,7 +199,7 @@ def open_link(url: str) -> Link:
         require("a serial line", ("serial",))
         from serial import Serial
 
-        # Two programs that read one line each get half of it.
+        # Two readers of one line would each get half of the bytes.
         port = partial(
             Serial, place, number, timeout=0, write_timeout=0, exclusive=True
         )
@@ -227,11 +227,11 @@ def open_link(url: str) -> Link:
 
 
 KEY_BYTES = 32
-BLOCK = 13  # bytes of a signature: link id, time, and 6 of the digest
-EPOCH = 1_420_070_400  # s: times count from 2015 on, in steps of 10 us
-STEPS = 100_000  # of time, in a second
-LATE = 60 * STEPS  # a sender not heard before may be so far behind
-_SENDERS = 16  # links of the one autopilot that are kept apart, at most
+BLOCK = 13  #: Bytes of a signature: link id, time, and 6 of the digest.
+EPOCH = 1_420_070_400  #: Unix time from which signatures count, s: 2015.
+STEPS = 100_000  #: Steps of time in a second.
+LATE = 60 * STEPS  #: Largest delay of a new sender, steps.
+_SENDERS = 16  # largest number of links of the autopilot
 
 
 def now_in_steps(seconds: float) -> int:
@@ -240,7 +240,7 @@ def now_in_steps(seconds: float) -> int:
 
 
 def read_key(path: str) -> bytes:
-    """Read a key: 32 bytes, or 64 hexadecimal digits. `FdiError` if it is none, or is not its owner's alone."""
+    """Return a key of 32 bytes or 64 hexadecimal digits. Raises `FdiError` if others can read the file."""
     try:
         with open_regular(path) as file:
             about = os.fstat(file.fileno())
@@ -268,17 +268,18 @@ def read_key(path: str) -> bytes:
 
 
 class Verifier:
-    """Checks signatures made with a key of 32 bytes, and that none comes a second time."""
+    """Checks signatures made with a key of 32 bytes, and refuses repeated messages."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._latest: dict[
-            tuple[int, int, int], int
-        ] = {}  # time of the last message, by link id, system and component
-        self.behind = 0.0  # s by which the last message was too old, though signed with the key; 0: it was not
+        # Time of the last message by link id, system and component.
+        self._latest: dict[tuple[int, int, int], int] = {}
+        self.behind = (
+            0.0  #: Delay of the last message if rightly signed but too old, s.
+        )
 
     def accepts(self, message: bytes, system: int, component: int, now: int) -> bool:
-        """Whether a whole message is signed with the key and new; now is the time of a signature made here now."""
+        """Return whether a message is rightly signed and new. now: present time in steps."""
         self.behind = 0.0
         if len(message) < BLOCK + 12 or message[0] != 0xFD or not message[2] & 1:
             return False

@@ -1,14 +1,14 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is told of a link: its diagnostics, and what a monitor declares as short texts for the ground station.
+"""Diagnostics of a link, and a monitor's declarations as short texts for the ground station.
 
 Texts are STATUSTEXT, at most as many as a link carries. Severities are ArduPilot's: CRITICAL
 for what endangers the flight, WARNING for what may pass, INFO for good news. A set of
-channels is a WARNING: in it, healthy channels are in doubt as well. So is a gyro with an
-error below `GRAVE`. Suspicions are not announced. A text that waits gives the state of when
-it is sent. Channels of a unit in the same state share one text. These texts give the
-monitor's state. What the autopilot uses is in the texts of failover.
+channels is a WARNING, because healthy channels are in doubt too. A gyro with an error below
+`GRAVE` is a WARNING as well. Suspicions are not announced. A delayed text gives the state at
+the time of sending. Channels of a unit in the same state share one text. These texts give
+the monitor's state. The texts of failover give the autopilot's use of IMUs.
 """
 
 from __future__ import annotations
@@ -21,25 +21,23 @@ from fdi_ros.mavlink.protocol import ENOUGH, MESSAGES, MS, NS, RESOLUTION, numbe
 from fdi_ros.mavlink.vehicle import LOST, UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
-LOSSY = 0.05  # share of messages lost on the link that is worth a warning
+LOSSY = 0.05  #: Share of lost messages from which the link is a WARN.
 
 
 class Reporter:
-    """Describes a link; what is counted is also told of the time since the last report."""
+    """Describes a link; counts are given since the last report too."""
 
     def __init__(
         self, link: Link, vehicle: Vehicle, names: Sequence[str], topics: Sequence[str]
     ) -> None:
-        self._link, self._vehicle, self._names, self._topics = (
-            link,
-            vehicle,
-            names,
-            topics,
-        )
+        self._link = link
+        self._vehicle = vehicle
+        self._names = names
+        self._topics = topics
         self._before: dict[str, int] = {}
 
     def lines(self, prefix: str, hardware: str, now: int) -> list[StatusLine]:
-        """Return the statuses at the monotonic time now, ns; names begin with prefix."""
+        """Return the statuses at monotonic time now, ns. Names begin with prefix."""
         recent = {
             name: count - self._before.get(name, 0)
             for name, count in self._vehicle.counts.items()
@@ -134,7 +132,7 @@ class Reporter:
         )
 
     def _message(self, unit: int) -> int | None:
-        """Return the id of the message that brings a unit; None: not known."""
+        """Return the id of the message with a unit, or None if unknown."""
         return next(
             (
                 number
@@ -182,32 +180,32 @@ class Reporter:
         )
 
 
-CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
-LENGTH = 50  # characters of a STATUSTEXT
-EVERY = NS  # between two texts, ns
-AT_ONCE = 5  # texts that may follow one another at once after a quiet time
-SETTLE = NS // 5  # what changes within so long is put together, ns
-SILENT = 3 * NS  # a monitor that reports nothing for so long is silent, ns
+CRITICAL, WARNING, INFO = 2, 4, 6  #: MAV_SEVERITY
+LENGTH = 50  #: Characters of a STATUSTEXT.
+EVERY = NS  #: Mean time between texts, ns.
+AT_ONCE = 5  #: Texts that may follow each other at once after a quiet time.
+SETTLE = NS // 5  #: Changes within this time share texts, ns.
+SILENT = 3 * NS  #: A monitor without reports for this time is silent, ns.
 STANDING = (
     2 * NS
-)  # `NOTHING_SEEN` is announced if it stands so long, ns: one late unit is none
-GRAVE = 0.03  # rad/s; ArduCopter flies with a smaller error of a gyro
-FROZEN = "FROZEN"  # in place of the state of a channel that is not declared: its unit gives old values
+)  #: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
+GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
+FROZEN = "FROZEN"  #: State of an undeclared channel whose unit repeats old values.
 _STATES = {
     "FAULTY": (CRITICAL, "faulty"),
     "AMBIGUOUS": (WARNING, "one of them faulty"),
     "STALE": (WARNING, "no data"),
     FROZEN: (WARNING, "frozen"),
-}  # by the state of a channel that is announced
+}  # severity and words by state
 _QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
 NOTHING_SEEN = "no further fault would be seen"
 
 
 def _format_whole(line: StatusLine) -> str:
-    """Say what of a monitor's own status is announced; empty: nothing."""
+    """Return the words for a monitor's own status. Empty: nothing to announce."""
     if line.level == Level.STALE:
-        # At a start there is nothing yet that could be missed.
+        # At a start nothing can be missed yet.
         return "" if line.message == "no sample yet" else "no samples"
     if line.message.startswith("no fused rate"):
         return (
@@ -219,7 +217,7 @@ def _format_whole(line: StatusLine) -> str:
 
 
 def _fit(name: str, words: str) -> str:
-    """Return a text about a unit or channel; of a name that is too long, its end."""
+    """Return a text about a unit or channel. A name that is too long loses its beginning."""
     return f"FDI: {name[-(LENGTH - len(f'FDI:  {words}')) :]} {words}"
 
 
@@ -229,11 +227,11 @@ class Announcer:
     Parameters
     ----------
     channels
-        Names of the channels; reports on others are ignored.
+        Names of the channels. Reports on others are ignored.
     apart
-        Beside failover, which sends texts of its own: by how much the raw rate of a unit,
-        from 0, differs from every other one now, rad/s; NaN: unknown. Sets and good news
-        stay in the diagnostics then, and a name waits while the raw rates contradict it.
+        Given beside failover, which sends texts of its own: present difference of the raw
+        rate of a unit, from 0, to the nearest other one, rad/s, NaN if unknown. Sets and
+        good news then stay in the diagnostics. A name waits while raw rates contradict it.
     """
 
     def __init__(
@@ -245,20 +243,19 @@ class Announcer:
             **dict.fromkeys(channels, ("OK", "")),
             WHOLE: ("", ""),
         }
-        """State of each channel, with the set that it is one of, and what is wrong with the whole, empty: nothing."""
-        self._said = dict(self._now)  # the same as the ground station knows it
+        """State and set of each channel, and the trouble of the whole. Empty: none."""
+        self._said = dict(self._now)  # the same as last announced
         self._apart = dict.fromkeys(channels, "")
-        """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
+        """Present difference of each channel and the other of its pair, rad/s."""
         self._errors = dict.fromkeys(channels, math.inf)  # estimated, rad/s
         self._heard = 0
-        self._changed: int | None = (
-            None  # when the first of what has changed since the last texts did, ns
-        )
+        # Time of the first change since the last texts, ns.
+        self._changed: int | None = None
         self._nothing_since: int | None = None
         self._tokens, self._filled = float(AT_ONCE), 0
 
     def hear(self, lines: Sequence[StatusLine], now: int) -> None:
-        """Take the diagnostics of the monitor, under names without its own, at a time, ns."""
+        """Take the monitor's diagnostics, without its name in theirs, at time now, ns."""
         self._heard = now
         for line in lines:
             state = line.value("state")
@@ -316,7 +313,7 @@ class Announcer:
         return self._raw_apart(unit) < min(GRAVE, error / 2)
 
     def _alike(self) -> list[tuple[str, ...]]:
-        """Return what has changed, together where it stands alike: the channels of a set, those of a whole unit."""
+        """Return the changed channels in groups that share a text: a set, or a whole unit."""
         left = {name: now for name, now in self._now.items() if now != self._said[name]}
         groups = dict.fromkeys(now for now in left.values() if now[0] == "AMBIGUOUS")
         found = [
@@ -327,14 +324,14 @@ class Announcer:
             if len(unit) == 3 and len(states) == 1 and not states & {*groups, ("", "")}:
                 found.append(unit)
         together = {name for names in found for name in names}
-        # What is wrong with the whole comes first of what is as grave.
+        # Of equal severity the whole comes first.
         return sorted(
             found + [(name,) for name in left if name not in together],
             key=lambda names: names != (WHOLE,),
         )
 
     def _text(self, names: tuple[str, ...]) -> tuple[int, str]:
-        """Return the text about channels that stand alike, or about the whole."""
+        """Return the text about a group of channels, or about the whole."""
         state, group = self._now[names[0]]
         if names == (WHOLE,):
             return (
@@ -351,7 +348,7 @@ class Announcer:
         return severity, _fit(who, words)
 
     def _set_text(self, group: str) -> str:
-        """Text for a set of channels, their names separated by commas; of whole units those are named."""
+        """Return the text for a set, given as names with commas between. Whole units are named."""
         names = set(group.split(", "))
         units = [
             unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)
