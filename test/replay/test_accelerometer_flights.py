@@ -1,0 +1,78 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Accelerometers in flights of ArduPilot's simulation, whose faults are known, and in a bag with injected ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag.recordings import imu, write_bag
+from monitor.test_accelerometers import flight, settings
+
+from fdi_ros.replay.run import replay
+from fdi_ros.replay.words import summary_text
+
+SITL = Path(__file__).parents[3] / "shared" / "data" / "sitl"
+BEGINS = 55.13  # clock of the autopilot at the first message, s
+TOLD = 1.0  # a fault is told of for so long after its end, s
+in_sitl = pytest.mark.skipif(
+    not SITL.is_dir(), reason=f"needs the recordings in {SITL}"
+)
+
+
+@in_sitl
+def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_wrong():
+    rows = np.genfromtxt(SITL / "accel_faults.txt", dtype=str)
+    faults = [
+        (float(on) - BEGINS, float(off) - BEGINS, f"imu_{int(unit) - 1}.accel_{axis}")
+        for on, off, unit, axis, kind, _ in rows
+        if kind != "noise_times"
+        for axis in axis.lower()
+    ]
+    summary = replay(SITL / "accel_faults.tlog")
+    named = [one for one in summary.story.episodes if one.state == "FAULTY"]
+    for one in summary.story.episodes:
+        assert one.measured_in == "m/s^2"
+        active = {name for on, off, name in faults if on <= one.start_s <= off + TOLD}
+        assert active & one.ever
+        assert one.state != "FAULTY" or set(one.channels) <= active
+    assert len({one.channels for one in named}) >= 6
+    assert {on for on, _, _ in faults} == {
+        max(on for on, _, _ in faults if on <= one.start_s)
+        for one in summary.story.episodes
+    }
+
+
+@in_sitl
+def test_nothing_is_declared_in_a_healthy_simulated_flight_with_vibration():
+    summary = replay(SITL / "accel_healthy_vibration.tlog")
+    assert summary.verdict.word == "HEALTHY"
+    assert len(summary.monitor.channels) == 18
+    assert all(one.checked > 0.9 for one in summary.monitor.channels)
+
+
+def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path):
+    block, _ = flight(800)
+    config = settings()
+    messages = [
+        (topic, stamp + 1000 * k, imu(stamp, rate, force=tuple(force)))
+        for stamp, rates, forces in zip(
+            block.stamp.tolist(), block.z, block.acceleration.z, strict=True
+        )
+        for k, (topic, rate, force) in enumerate(
+            zip(config.topics, np.split(rates, 3), np.split(forces, 3), strict=True)
+        )
+    ]
+    path = write_bag(tmp_path / "flight", messages)
+    fault = "channel=imu_2.accel_z kind=bias size=2 start=4"
+    summary = replay(path, config, [fault])
+    (outcome,) = summary.scores.faults
+    assert (outcome.outcome, outcome.channels) == ("named", ("imu_2.accel_z",))
+    text = summary_text(summary)
+    assert "2 m/s^2" in text
+    assert "fused specific force meanwhile" in text
+    (episode,) = summary.story.episodes
+    assert "m/s^2" in episode.words and "rad/s" not in episode.words
+    lost = replay(path, config, ["channel=imu_3 kind=triad_loss start=4"])
+    assert len(lost.scores.faults[0].channels) == 6
