@@ -36,18 +36,21 @@ from fdi_ros.core.judging import (
     take_verdict,
 )
 from fdi_ros.core.level import update_level
-from fdi_ros.core.records import Bank, Core, Current, PathSettings, Sample
+from fdi_ros.core.records import Bank, Core, PathSettings, Sample
 from fdi_ros.core.repeated import all_repeat, update_repeated
 from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
 from fdi_ros.core.subsets import fill_rate
 
 NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
-# and this many times every other channel: body vibration never shows on one channel
-# only
+# and this many times every channel of the other units: body vibration never shows on
+# one unit only
 NOISIER = 1.4
 # share of the range: where the others predict less, a value out of range is a fault
 RAIL_MARGIN = 0.9
+LOUD = 1.5  # times the noise expected, below which a channel is not noisy
+# time constants of the usual noise where noise is louder, and quieter, s
+LOUDER_TIME, QUIETER_TIME = 120.0, 10.0
 # ranges that the detector sees of a value out of range at most: any shows as well
 RAIL_LIMIT = 10.0
 WAITING = -1  # instead of a number of events
@@ -272,19 +275,42 @@ def apply_estimate(core: Core) -> None:
 
 
 @compiled
-def update_noisy(settings: PathSettings, now: Current) -> None:
-    """Find channels that are much noisier than expected, and than all distinguishable others."""
-    n, noise, sensors = settings.n, now.verdict.noise, settings.sensors
-    now.noisy = 0
-    for i in range(n):
-        if noise[i] < NOISY:
+def update_noisy(core: Core) -> None:
+    """Find channels much noisier than expected or than usual, and than all distinguishable ones of other units."""
+    settings, noise, usual = (
+        core.settings,
+        core.now.verdict.noise,
+        core.health.usual_noise,
+    )
+    core.now.noisy = 0
+    for i in range(settings.n):
+        if noise[i] > 0.0:
+            louder = noise[i] > usual[i]
+            share = settings.period / (LOUDER_TIME if louder else QUIETER_TIME)
+            usual[i] += (min(share, 1.0) if usual[i] > 0.0 else 1.0) * (
+                noise[i] - usual[i]
+            )
+        is_loud = noise[i] > LOUD and noise[i] > NOISY * usual[i]
+        if noise[i] < NOISY and not is_loud:
             continue
+        own = unit_of(settings, i)
         above = True
-        for j in range(n):
-            if j != i and not sensors.alike[i, j] and noise[j] * NOISIER > noise[i]:
+        for j in range(settings.n):
+            is_other = not own >> j & 1 and not settings.sensors.alike[i, j]
+            if is_other and noise[j] * NOISIER > noise[i]:
                 above = False
         if above:
-            now.noisy |= 1 << i
+            core.now.noisy |= 1 << i
+            core.health.noisy[i] += 1
+
+
+@compiled
+def unit_of(settings: PathSettings, i: int) -> int:
+    """Bits of the channels of the unit of a channel; of one without a unit its own bit."""
+    for unit in range(settings.units):
+        if settings.members[unit] >> i & 1:
+            return int(settings.members[unit])
+    return 1 << i
 
 
 @compiled
@@ -348,7 +374,7 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     if now.learned_from:
         skip_sample(core)
         return write_events(core, subsets[alive(core)], row, True, events, count)
-    update_noisy(settings, now)
+    update_noisy(core)
     fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous
     changed = decide(settings, core.decision, now.evidence)

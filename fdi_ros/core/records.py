@@ -280,6 +280,8 @@ class Health:
     ]  # samples in each condition
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
+    noisy: Counts  # samples in which it was much noisier than the other units
+    usual_noise: Channels  # over noise_std: of late, what is louder counting slowly
     gone: Channels  # share of the values lately received that are not finite
     absent: Channels  # share of the samples lately without a value
     lapses: Channels  # how often lately one without a value came after one with it
@@ -572,6 +574,7 @@ class PathSettings:
     mean_limit: Channels  # largest mean error of a channel that returns, rad/s
     # largest difference of a channel that agrees again, in its standard deviations
     return_limit: Real
+    period: Real  # of the samples, s
     # Of estimate and fusion:
     publish_under_doubt: (
         Flag  # a rate of channels under doubt, where they cannot be left out

@@ -206,6 +206,7 @@ def _fill_settings(
 ) -> None:
     n, integrity = geometry.n, config.integrity
     settings["n"], settings["natural"] = n, RATE.natural
+    settings["period"] = 1.0 / config.sample_rate
     describe_sensors(settings["sensors"], geometry, noise)
     settings["largest_noise"] = noise.noise_std.max()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)

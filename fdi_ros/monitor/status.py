@@ -58,7 +58,8 @@ class ChannelStatus:
     residual: float  #: Of the last sample, in ``unit``, NaN where missing.
     last_received: int  #: Stamp of the last sample with a value, ns, 0 if none.
     counts: Mapping[str, int]
-    """``samples``, with ``missing``, ``non-finite``, ``out of range`` and ``stuck`` among them, and ``spikes``: how
+    """``samples``, with ``missing``, ``non-finite``, ``out of range``, ``stuck`` and ``noisy`` (much noisier than
+    expected, and than the other units) among them, and ``spikes``: how
     often a few values were far off and left out of the rate."""
     #: Share of the recent samples in which the channel gave a finite value.
     delivers: float = 1.0
@@ -309,6 +310,7 @@ def _channel(
             ),
             "out of range": int(count[Condition.OUT_OF_RANGE]),
             "stuck": int(health["stuck"][i] + count[Condition.FROZEN]),
+            "noisy": int(health["noisy"][i]),
             "spikes": int(core["sample"]["estimate"]["spikes"][i]),
         },
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),

@@ -26,6 +26,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
+from fdi_ros.core.path import NOISY
 from fdi_ros.core.sources import source_of
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
@@ -237,13 +238,14 @@ class Judge(Walk):
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [one.name for one in status.channels if status.is_far(one)]
         channels = tuple(self._channels(end, status.channels))
+        degraded_by_name = {**self._degraded, **self._noisy(status.channels)}
         monitor = MonitorResult(
             channels=channels,
             units=tuple(self._units(status)),
             delays=tuple(
                 DelayResult(unit.name, late, std) for unit, late, std in delays
             ),
-            degraded=tuple(self._degraded.values()),
+            degraded=tuple(degraded_by_name.values()),
             bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
             note=status.note,
             protection_level=ProtectionLevel(
@@ -266,6 +268,18 @@ class Judge(Walk):
             monitor,
             replace(story, episodes=tuple(episodes)),
         )
+
+    def _noisy(self, statuses: Sequence[ChannelStatus]) -> dict[str, str]:
+        """Say for how long channels were noisy, seconds at least, by their name."""
+        seconds = {
+            one.name: one.counts["noisy"] / (self.rate or math.inf) for one in statuses
+        }
+        return {
+            name: f"{name}: for {time:.1f} s noise of more than {NOISY:g} times what is"
+            " expected or usual, and more than the other units have"
+            for name, time in seconds.items()
+            if time >= LASTING
+        }
 
     def _channels(
         self, end: float, statuses: Sequence[ChannelStatus]

@@ -395,7 +395,7 @@ def test_a_noisy_channel_is_told_and_stays_in_use():
     }
     assert warned == {"monitor": Level.WARN, "imu_1.y": Level.WARN}
     assert 4 < channel.noise < 9
-    words = f"agrees with the others; noise {channel.noise:.1f} times noise_std and above the others'"
+    words = f"agrees with the others; noise {channel.noise:.1f} times noise_std and above the other units'"
     assert lines["imu_1.y"].message == words
     assert "degraded: imu_1.y" in lines["monitor"].message
     assert channel.state == ChannelState.OK

@@ -38,6 +38,10 @@ def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_
         assert active & one.ever
         assert one.state != "FAULTY" or set(one.channels) <= active
     assert len({one.channels for one in named}) >= 6
+    # Noise five times as large declares nothing, and is told of.
+    for axis in "xyz":
+        words = f"imu_0.accel_{axis}: for "
+        assert [one for one in summary.monitor.degraded if one.startswith(words)]
     assert {on for on, _, _ in faults} == {
         max(on for on, _, _ in faults if on <= one.start_s)
         for one in summary.story.episodes
@@ -73,6 +77,7 @@ def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path)
     assert "2 m/s^2" in text
     assert "fused specific force meanwhile" in text
     (episode,) = summary.story.episodes
-    assert "m/s^2" in episode.words and "rad/s" not in episode.words
+    assert "m/s^2" in episode.words
+    assert "rad/s" not in episode.words
     lost = replay(path, config, ["channel=imu_3 kind=triad_loss start=4"])
     assert len(lost.scores.faults[0].channels) == 6
