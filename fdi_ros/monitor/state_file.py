@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Biases and declarations that outlive the process, in one small file."""
+"""Biases and declarations of the gyros that outlive the process, in one small file.
+
+Those of the accelerometers are found anew at each start.
+"""
 
 from __future__ import annotations
 
@@ -66,8 +69,8 @@ DAMAGED = (
 
 
 def _content(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the lasting state of a monitor, in the fields of the file, with channels by name and biases in rad/s."""
-    core, names = pipeline.core[0], pipeline.channel_names
+    """Return the lasting state of the gyros, in the fields of the file, with channels by name and biases in rad/s."""
+    core, names = pipeline.core[0], pipeline.geometry.channel_names
     bias, decision, learned = (
         core["bias"],
         core["decision"],
@@ -131,7 +134,7 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
     Raise a refusal, or one of `DAMAGED`.
     """
     names, detector, settings = (
-        pipeline.channel_names,
+        pipeline.geometry.channel_names,
         pipeline.guard,
         pipeline.config.bias,
     )
@@ -245,7 +248,8 @@ def _check(
 
 def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
     """Write a state of a certain age, s, into the records of a monitor."""
-    core, names, n = pipeline.core[0], pipeline.channel_names, pipeline.geometry.n
+    core, n = pipeline.core[0], pipeline.geometry.n
+    names = pipeline.geometry.channel_names
     settings, faulty, ambiguous = (
         core["settings"],
         state["declared"]["faulty"],

@@ -16,6 +16,7 @@ from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.state_file import StateFile
 
 GRAVITY = 9.81
 NOISE = 0.15  # m/s^2
@@ -214,3 +215,12 @@ def test_accelerometers_may_be_excluded_and_the_detector_changed_under_way():
     with pytest.raises(ConfigError, match="leaves no rate"):
         pipeline.reconfigure(before.replaced({"excluded_channels": lost}))
     assert pipeline.config is before
+
+
+def test_the_state_file_keeps_the_gyros(tmp_path):
+    pipeline, (block, _) = Pipeline(settings()), flight(200)
+    pipeline.process(block)
+    assert len(pipeline.channel_names) == 18
+    assert StateFile(tmp_path / "state", 60.0).save(pipeline)
+    again = Pipeline(settings())
+    assert StateFile(tmp_path / "state", 60.0).restore(again)
