@@ -1,0 +1,110 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The fused rate with its instant and covariance is true where clocks, steps of the values or the motion are odd.
+
+Each figure is bounded from both sides.
+"""
+
+import numpy as np
+import pytest
+from monitor.streams import RATE, SIGMA, START, config, parallel
+
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.pipeline import Pipeline
+
+MILLISECOND = 1_000_000
+
+
+def swung(seconds):
+    """Quick turns about all axes, (N, 3) rad/s, with up to 9 rad/s^2."""
+    return 2.0 * np.sin(2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3]) + np.arange(3.0))
+
+
+def late_unit(delay, seconds=30.0, seed=0):
+    """Output of three units mounted alike, of which the second is stamped late by a delay, s."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    time = np.arange(round(seconds * RATE)) / RATE
+    z = np.hstack([swung(time), swung(time - delay), swung(time)])
+    z += np.random.default_rng(seed).normal(0.0, SIGMA, z.shape)
+    stamp = START + np.round(1e9 * time).astype(np.int64)
+    return pipeline.process(Block(stamp, z)), stamp
+
+
+def test_the_rate_is_of_the_instant_that_is_stated():
+    output, stamp = late_unit(0.008)
+    last = slice(-500, None)
+    back = (stamp - output.instant)[last] / MILLISECOND
+    assert back.min() > 7.0
+    assert back.max() < 9.0
+    seconds = (output.instant[last] - START) * 1e-9
+    error = output.rate[last] - swung(seconds)
+    # At the stamp the rate is off by up to 70 mrad/s.
+    assert np.sqrt((error**2).mean()) < 0.004
+
+
+def test_a_delay_that_is_not_taken_off_is_in_the_covariance_of_a_turn():
+    """Each unit may be the one in time: the rate is of any instant between theirs."""
+    delay = 0.0016
+    output, stamp = late_unit(delay)
+    assert (stamp == output.instant).all()
+    acceleration = np.gradient(swung(np.arange(len(stamp)) / RATE), 1.0 / RATE, axis=0)
+    quick = np.abs(acceleration[:, 1]) > 7.0
+    quick[:-500] = False
+    std = np.sqrt(output.covariance[:, 1, 1])
+    own = std[-500:].min()
+    ratio = np.sqrt(std[quick] ** 2 - own**2) / (delay * np.abs(acceleration[quick, 1]))
+    assert 0.45 < ratio.mean() < 0.9
+
+
+def test_steps_of_the_values_are_in_the_covariance_of_a_bias_that_was_learned_at_rest():
+    """Without noise a gyro in coarse steps shows a bias within half of one, and the same one all the time."""
+    step, found, stds = 0.004, [], []
+    given = {"noise__noise_std": 0.0005, "bias__startup_bias_duration": 2.0}
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        pipeline = Pipeline(config(**given))
+        bias = random.uniform(-0.9, 0.9, pipeline.geometry.n) * step
+        time = np.arange(260) / RATE
+        rate = np.zeros((260, 3))
+        rate[210:] = 0.5 * np.sin(np.outer(time[210:] - 2.1, [9.0, 7.0, 8.0]))
+        z = rate @ pipeline.geometry.axes.T + bias
+        z += random.normal(0.0, 0.0003, z.shape)
+        z = np.round(z / step) * step
+        output = pipeline.process(Block(START + np.arange(260) * 10 * MILLISECOND, z))
+        error = output.rate[215] - rate[215]
+        found.append(error @ np.linalg.solve(output.covariance[215], error))
+        stds.append(pipeline.core["sample"]["bias_std"][0, : pipeline.geometry.n])
+    # In some flights no value changes at rest, and the step stays unknown.
+    assert np.median(stds) == pytest.approx(step / np.sqrt(12.0), rel=0.02)
+    # The mean of a chi-square with 3 degrees of freedom is 3.
+    assert 1.5 < np.mean(found) < 5.0
+
+
+def test_a_sample_that_is_not_judged_has_the_uncertainty_of_its_own_motion():
+    """After rest a vehicle turns beyond the range of one gyro at once, and no errors of scale were known before."""
+    scale = 0.01
+    which = parallel(3, health__max_rate=[4.0] + [30.0] * 8, noise__scale_std=scale)
+    pipeline = Pipeline(which)
+    z = np.zeros((330, 9))
+    z[300:, [0, 3, 6]] = 5.0
+    z[300:, 0] = 4.0
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    z[300:, 0] = 4.0
+    output = pipeline.process(Block(START + np.arange(330) * 10 * MILLISECOND, z))
+    std = np.sqrt(output.covariance[301:310, 0, 0])
+    assert (std > 0.8 * scale * 5.0 / np.sqrt(2.0)).all()
+    assert (std < 3.0 * scale * 5.0).all()
+
+
+@pytest.mark.parametrize(("repeated", "published"), [(0.08, True), (0.25, False)])
+def test_a_rate_of_values_that_all_repeat_in_motion_is_withheld(repeated, published):
+    pipeline = Pipeline(parallel(3))
+    time = np.arange(400) / RATE
+    z = np.tile(swung(time), 3)
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    last = 200 + round(repeated * RATE)
+    z[200:last] = z[200]
+    output = pipeline.process(Block(START + np.arange(400) * 10 * MILLISECOND, z))
+    assert output.valid[last - 1] == published
+    assert output.valid[250:].all()
