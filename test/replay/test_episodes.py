@@ -27,7 +27,7 @@ from fdi_ros.replay.episodes import (
     pieces,
     size_words,
 )
-from fdi_ros.replay.outcomes import Evaluation, score
+from fdi_ros.replay.outcomes import Evaluation, Followed, score
 from fdi_ros.replay.recorder import Batches, Recorder
 from fdi_ros.replay.run import Sink, Walk
 from fdi_ros.replay.verdict import verdict_of
@@ -568,3 +568,11 @@ def test_a_fault_on_what_is_declared_already_is_not_called_missed():
         ["channel=g1,g2,g3 kind=triad_loss start=30"], event(5, 1, S.FAULTY)
     ).faults
     assert not of_a_unit.declared_before
+
+
+@pytest.mark.parametrize(("after", "explained"), [(0.9, True), (1.1, False)])
+def test_a_declaration_soon_after_a_fault_is_explained_by_it(after, explained):
+    """A second: so long the evidence of a fault may take."""
+    one = Followed(parse_fault("channel=g1 kind=bias size=1 start=5 stop=8"), [0], "g1")
+    assert one.is_active(8.0 + after) == explained
+    assert not one.is_active(4.9)
