@@ -251,6 +251,10 @@ def _check_consistency(config: Config) -> None:
         raise ConfigError(
             f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel"
         )
+    if config.accelerometers.enabled == "on" and not config.has_units:
+        raise ConfigError(
+            f"accelerometers.enabled is 'on', but input is {config.input!r}: expected input 'imus'"
+        )
     learned = config.bias.startup_bias_duration * config.sample_rate
     if 0 < learned < MIN_LEARNED:
         raise ConfigError(

@@ -11,6 +11,7 @@ from bag.recordings import imu
 from monitor.streams import RATE, SIGMA, START, parallel, struck
 from monitor.test_receiver import Ear
 
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import integrity_labels
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.errors import ConfigError
@@ -224,3 +225,8 @@ def test_the_state_file_keeps_the_gyros(tmp_path):
     assert StateFile(tmp_path / "state", 60.0).save(pipeline)
     again = Pipeline(settings())
     assert StateFile(tmp_path / "state", 60.0).restore(again)
+
+
+def test_an_array_of_gyros_has_no_accelerometers():
+    with pytest.raises(ConfigError, match="input is 'channels': expected input 'imus'"):
+        Config.from_parameters({"accelerometers.enabled": "on"})
