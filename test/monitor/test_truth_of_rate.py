@@ -108,3 +108,26 @@ def test_a_rate_of_values_that_all_repeat_in_motion_is_withheld(repeated, publis
     output = pipeline.process(Block(START + np.arange(400) * 10 * MILLISECOND, z))
     assert output.valid[last - 1] == published
     assert output.valid[250:].all()
+
+
+@pytest.mark.parametrize(("size", "copied"), [(0.02, False), (0.5, True)])
+def test_smooth_values_make_no_copy_where_noise_would_hide_the_motion(size, copied):
+    """Equal values to the bit are one sensor only where they change by more than noise may."""
+    pipeline = Pipeline(parallel(2))
+    time = np.arange(600) / RATE
+    z = np.tile(0.5 * size * swung(time), 2)
+    pipeline.process(Block(START + np.arange(600) * 10 * MILLISECOND, z))
+    assert bool(pipeline.core["copies"]["channels"][0]) == copied
+
+
+def test_the_bias_of_a_unit_at_half_the_rate_is_learned():
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    time = np.arange(2000) / RATE
+    z = np.tile(0.3 * swung(time), 3)
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    z[:, 6] += 0.006
+    received = np.ones(z.shape, dtype=bool)
+    received[::2, 6:] = False
+    pipeline.process(Block(START + np.arange(2000) * 10 * MILLISECOND, z, received))
+    bias = pipeline.core["sample"]["estimate"]["bias"][0, :9]
+    assert bias[6] - (bias[0] + bias[3]) / 2 == pytest.approx(0.006, abs=0.0015)
