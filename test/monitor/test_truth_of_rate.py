@@ -131,3 +131,14 @@ def test_the_bias_of_a_unit_at_half_the_rate_is_learned():
     pipeline.process(Block(START + np.arange(2000) * 10 * MILLISECOND, z, received))
     bias = pipeline.core["sample"]["estimate"]["bias"][0, :9]
     assert bias[6] - (bias[0] + bias[3]) / 2 == pytest.approx(0.006, abs=0.0015)
+
+
+def test_noise_beyond_the_settings_is_no_fault_for_a_method_that_learns_none():
+    """It judges residuals by the noise of the moment, so three times the noise brings no alarm more than usual."""
+    pipeline = Pipeline(parallel(3, detector__name="likelihood_ratio"))
+    time = np.arange(3000) / RATE
+    z = np.tile(0.3 * swung(time), 3)
+    z += np.random.default_rng(0).normal(0.0, 3.0 * SIGMA, z.shape)
+    output = pipeline.process(Block(START + np.arange(3000) * 10 * MILLISECOND, z))
+    assert not any(event.declares for event in output.events)
+    assert output.alarm[500:].mean() < 0.002
