@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.samples import Block
+from fdi_ros.model.quantity import FORCE, RATE, Quantity
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
@@ -32,6 +34,7 @@ from fdi_ros.replay.verdict import verdict_of
 from fdi_ros.replay.words import fault_sections, health_section, notes, sentences
 from fdi_ros.report.layout import (
     FINE,
+    FORCES,
     RADIANS,
     SMALL,
     Columns,
@@ -59,27 +62,199 @@ MOST_CARDS = 200  # episodes shown; JSON has all.
 SHOWN_AROUND = 2.0  # what the link of an episode shows before and after it, at least, s
 
 
-class Report(Sink):
-    """Collects the outputs of the monitor, in bounded memory, and lays them out in a unit; ``rate``: in Hz.
+class Words(NamedTuple):
+    """Titles of what is drawn of gyros or of accelerometers."""
 
-    A channel's reading of a body axis is the fused rate, moved along the channel's own axis until the channel agrees.
+    vector: str
+    statistic: str
+    fused: str
+    residuals: str
+    spectrum: str
+    level: str
+
+
+WORDS = {
+    RATE: Words(
+        "fused rate",
+        "statistic, and threshold",
+        "Fused rate, and each channel's reading of it",
+        "Residuals",
+        "Spectrum of the differences",
+        "Protection level",
+    ),
+    FORCE: Words(
+        "fused specific force",
+        "statistic of accelerometers, and threshold",
+        "Fused specific force, and each accelerometer's reading of it",
+        "Residuals of the accelerometers",
+        "Spectrum of the differences of the accelerometers",
+        "Protection level of the specific force",
+    ),
+}
+
+
+class Curves:
+    """Curves of the gyros or of the accelerometers, drawn over the time of the page.
+
+    A channel's reading of a body axis is the fused vector, moved along the channel's own
+    axis until the channel agrees.
+
+    Parameters
+    ----------
+    geometry
+        Channels, n.
+    rate
+        Samples per second, Hz.
+    unit
+        Of the figures on the page.
+    quantity
+        What the channels measure.
     """
 
-    def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
-        self._unit = unit
+    def __init__(
+        self, geometry: Geometry, rate: float, unit: Unit, quantity: Quantity = RATE
+    ) -> None:
         self.names = geometry.channel_names
+        self.unit = unit
+        self._words = WORDS[quantity]
+        #: begin of the names of its series
+        self._own = "" if quantity == RATE else f"{quantity.name}."
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._sees = np.abs(geometry.axes) >= SEES_AXIS * norm[:, None]
         self._gain = geometry.axes / norm[:, None] ** 2
         fine = ["statistic", "threshold", *(f"rate.{axis}" for axis in _AXES)]
         small = [f"{what}.{axis}" for what in ("deviation", "level") for axis in _AXES]
         small += [f"residual.{i}" for i in range(geometry.n)]
-        self._store = PageStore(
-            {**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)}
-        )
+        kinds = {**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)}
+        #: names and kinds of its series
+        self.kinds = {f"{self._own}{name}": kind for name, kind in kinds.items()}
+        self.spectrum = Spectrum(self.names, rate) if there("scipy") else None
+        #: largest statistic and threshold
+        self._peaks = np.zeros(2)
+
+    def columns(self, output: Output) -> Array:
+        """Return the values of its series, (N, c), and note the largest."""
+        deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
+        vectors = [output.rate, deviation, output.level, output.residual]
+        judged = np.column_stack([output.statistic, output.threshold])
+        largest = judged.max(axis=0, initial=0.0, where=np.isfinite(judged))
+        self._peaks = np.maximum(self._peaks, largest)
+        return np.column_stack([judged, np.column_stack(vectors) * self.unit.factor])
+
+    def statistic(self, layout: Mapping[str, Any]) -> Figure:
+        """Draw the statistic and its threshold."""
+        log = self._peaks[0] > LOG_FROM * self._peaks[1] > 0
+        lines = [
+            self._line("statistic", "statistic", _INK, 1.2),
+            self._line("threshold", "threshold", "#e0662f", 1.8, dash="dash"),
+        ]
+        figure = _plot(lines, 240, self._words.statistic, True, layout)
+        figure["layout"]["yaxis"]["type"] = "log" if log else "linear"
+        return figure
+
+    def sections(
+        self, common: Mapping[str, Any], scale: Mapping[str, Any]
+    ) -> list[Section]:
+        """Lay out the fused vector, the residuals, their spectrum and the level.
+
+        ``common``: layout of every plot. ``scale``: how a plot chooses its scale.
+        """
+        words, last = self._words, len(self.names) - 1
+        of_residuals = {**scale, "scale": f"{self._own}residuals", **common}
+        levels = [
+            self._line(f"level.{axis}", axis, colour_of(k))
+            for k, axis in enumerate(_AXES)
+        ]
+        title = f"protection level, {self.unit.name}"
+        level = _plot(levels, 220, title, True, {**scale, **common})
+        spectrum = self.spectrum and self.spectrum.section(self.unit)
+        if spectrum:
+            spectrum = replace(spectrum, title=words.spectrum)
+        return [
+            Section(
+                words.fused,
+                f"Band: two standard deviations. What each channel makes of an axis: the"
+                f" {words.vector} moved along the channel's own axis until it agrees.",
+                "",
+                [self._rate(k, {**scale, **common}) for k in range(len(_AXES))],
+            ),
+            Section(
+                words.residuals,
+                f"Channel minus {words.vector} along its axis; all on one scale.",
+                "",
+                [
+                    self._residual(i, i == last, of_residuals)
+                    for i in range(len(self.names))
+                ],
+            ),
+            *([spectrum] if spectrum else []),
+            Section(
+                words.level,
+                f"Bound on the error of the {words.vector} with one undetected fault; gaps: none can be given.",
+                "",
+                [level],
+            ),
+        ]
+
+    def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
+        """Draw the fused vector about an axis, and what the channels that see it make of it."""
+        rate, axis = f"rate.{_AXES[k]}", _AXES[k]
+        band = {
+            "type": "band",
+            "packed": f"{self._own}{rate}",
+            "spread": [f"{self._own}deviation.{axis}", 2],
+            "name": "",
+            "showlegend": False,
+        }
+        data = [{**band, "line": {"color": "#808080"}}]
+        for i in np.flatnonzero(self._sees[:, k]).tolist():
+            plus = [f"{self._own}residual.{i}", float(self._gain[i, k])]
+            line = self._line(rate, self.names[i], colour_of(i), 1.1)
+            group = f"{self._own}channel {i}"
+            data.append({**line, "plus": plus, "legendgroup": group, "rank": i})
+        data.append({**self._line(rate, "fused", _INK, 1.3), "rank": -1})
+        title = f"{axis}, {self.unit.name}"
+        return _plot(data, 210, title, k == len(_AXES) - 1, layout)
+
+    def _residual(self, i: int, last: bool, layout: Mapping[str, Any]) -> Figure:
+        line = self._line(f"residual.{i}", self.names[i], colour_of(i), 1.1)
+        title = f"{self.names[i]}, {self.unit.name}"
+        return _plot([{**line, "showlegend": False}], 112, title, last, layout)
+
+    def _line(
+        self,
+        series: str,
+        name: str,
+        colour: str,
+        width: float | None = None,
+        **more: Any,
+    ) -> dict[str, Any]:
+        """Draw one of its series."""
+        look = {"color": colour, **({} if width is None else {"width": width}), **more}
+        packed = f"{self._own}{series}"
+        return {"type": "scatter", "packed": packed, "name": name, "line": look}
+
+
+class Report(Sink):
+    """Collects the outputs of the monitor, in bounded memory, and lays them out.
+
+    Accelerometers have curves of their own from the first output that has any.
+
+    Parameters
+    ----------
+    geometry
+        Gyros.
+    rate
+        Samples per second, Hz.
+    unit
+        Of rates on the page.
+    """
+
+    def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
+        self._unit, self._sample_rate = unit, rate
+        self._curves = [Curves(geometry, rate, unit)]
+        self._store = PageStore(self._curves[0].kinds)
         self._first_states: list[str] = []
-        self._spectrum = Spectrum(self.names, rate) if there("scipy") else None
-        self._peaks = np.zeros(2)  # of statistic and threshold
         self._origin: int | None = None  # stamp that times count from, ns
         self._last = 0.0
 
@@ -89,8 +264,9 @@ class Report(Sink):
 
     def begin_stretch(self) -> None:
         """Break the curves: nothing is recorded between the last sample and the next."""
-        if self._spectrum:
-            self._spectrum.begin_stretch()
+        for curves in self._curves:
+            if curves.spectrum:
+                curves.spectrum.begin_stretch()
         self._store.add(
             np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan)
         )
@@ -103,14 +279,10 @@ class Report(Sink):
             self._first_states = [
                 ChannelState(state).name for state in output.state[0].tolist()
             ]
-        output = output.halves[0]
+            self._find_accelerometers(output, pipeline)
+        halves = list(zip(self._curves, output.halves, strict=True))
         time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
-        deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
-        rates = (
-            np.column_stack([output.rate, deviation, output.level, output.residual])
-            * self._unit.factor
-        )
-        columns = np.column_stack([output.statistic, output.threshold, rates])
+        columns = np.column_stack([curves.columns(half) for curves, half in halves])
         # Curves also break where samples are missing for a while within a stretch.
         holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
@@ -119,12 +291,18 @@ class Report(Sink):
             if len(part):
                 self._store.add(time[part], columns[part])
                 self._last = float(time[part[-1]])
-            if self._spectrum:
-                self._spectrum.add(output.residual[part])
-        judged = columns[:, :2]
-        self._peaks = np.maximum(
-            self._peaks, judged.max(axis=0, initial=0.0, where=np.isfinite(judged))
-        )
+            for curves, half in halves:
+                if curves.spectrum:
+                    curves.spectrum.add(half.residual[part])
+
+    def _find_accelerometers(self, output: Output, pipeline: Pipeline) -> None:
+        """Make the curves of the accelerometers, if the first output has any."""
+        if output.acceleration is None:
+            return
+        _, accelerometers = pipeline.halves
+        rate, geometry = self._sample_rate, accelerometers.geometry
+        self._curves.append(Curves(geometry, rate, FORCES, FORCE))
+        self._store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
@@ -146,18 +324,15 @@ class Report(Sink):
         }
         names = [one.name for one in summary.monitor.channels]
         states = _timeline(names, self._first_states, summary, quiet)
-        statistic = self._statistic({**common, "marks": [*common["marks"], *said]})
-        levels = [
-            _line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)
-        ]
+        spoken = {**common, "marks": [*common["marks"], *said]}
+        statistics = [curves.statistic(spoken) for curves in self._curves]
         stretches = stretch_words(story)
-        spectrum = self._spectrum and self._spectrum.section(unit)
         sections = [
             Section(
                 "The recording",
                 f"{self._zoom_hint()} {_marks_hint(summary)}",
                 "",
-                [states, statistic],
+                [states, *statistics],
             ),
             _episode_section(story, bool(scores.faults), unit, self._origin),
             *(
@@ -165,36 +340,10 @@ class Report(Sink):
                 if stretches
                 else []
             ),
-            Section(
-                "Fused rate, and each channel's reading of it",
-                "Band: two standard deviations. What each channel makes of an axis: the fused rate moved along the"
-                " channel's own axis until it agrees.",
-                "",
-                [self._rate(k, {**scale, **common}) for k in range(len(_AXES))],
-            ),
-            Section(
-                "Residuals",
-                "Channel minus fused rate along its axis; all on one scale.",
-                "",
-                [
-                    self._residual(i, {**scale, "scale": "residuals", **common})
-                    for i in range(len(self.names))
-                ],
-            ),
-            *([spectrum] if spectrum else []),
-            Section(
-                "Protection level",
-                "Bound on the error of the fused rate with one undetected fault; gaps: none can be given.",
-                "",
-                [
-                    _plot(
-                        levels,
-                        220,
-                        f"protection level, {unit.name}",
-                        True,
-                        {**scale, **common},
-                    )
-                ],
+            *(
+                section
+                for curves in self._curves
+                for section in curves.sections(common, scale)
             ),
             *fault_sections(scores, unit),
             health_section(summary, unit),
@@ -225,49 +374,6 @@ class Report(Sink):
         return (
             f"{words} A long recording: of every {self._store.width} samples the smallest and the largest value are"
             " drawn; close up, the lines between them are no course of time."
-        )
-
-    def _statistic(self, layout: Mapping[str, Any]) -> Figure:
-        log = self._peaks[0] > LOG_FROM * self._peaks[1] > 0
-        threshold = _line("threshold", "threshold", "#e0662f", 1.8, dash="dash")
-        lines = [_line("statistic", "statistic", _INK, 1.2), threshold]
-        figure = _plot(lines, 240, "statistic, and threshold", True, layout)
-        figure["layout"]["yaxis"]["type"] = "log" if log else "linear"
-        return figure
-
-    def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
-        """Draw the fused rate about an axis, and what the channels that see it make of it."""
-        rate, axis = f"rate.{_AXES[k]}", _AXES[k]
-        band = {
-            "type": "band",
-            "packed": rate,
-            "spread": [f"deviation.{axis}", 2],
-            "name": "",
-            "showlegend": False,
-        }
-        data = [{**band, "line": {"color": "#808080"}}]
-        for i in np.flatnonzero(self._sees[:, k]).tolist():
-            plus = [f"residual.{i}", float(self._gain[i, k])]
-            line = _line(rate, self.names[i], colour_of(i), 1.1)
-            data.append(
-                {**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i}
-            )
-        data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
-        return _plot(
-            data, 210, f"{axis}, {self._unit.name}", k == len(_AXES) - 1, layout
-        )
-
-    def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
-        line = {
-            **_line(f"residual.{i}", self.names[i], colour_of(i), 1.1),
-            "showlegend": False,
-        }
-        return _plot(
-            [line],
-            112,
-            f"{self.names[i]}, {self._unit.name}",
-            i == len(self.names) - 1,
-            layout,
         )
 
 
@@ -378,13 +484,6 @@ def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
         )
         found[f"protection level {when}"] = f"{axes} {unit.name}"
     return found
-
-
-def _line(
-    packed: str, name: str, colour: str, width: float | None = None, **more: Any
-) -> dict[str, Any]:
-    look = {"color": colour, **({} if width is None else {"width": width}), **more}
-    return {"type": "scatter", "packed": packed, "name": name, "line": look}
 
 
 def _plot(
