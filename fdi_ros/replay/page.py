@@ -169,7 +169,8 @@ class Curves:
         level = _plot(levels, 220, title, True, {**scale, **common})
         spectrum = self.spectrum and self.spectrum.section(self.unit)
         if spectrum:
-            spectrum = replace(spectrum, title=words.spectrum)
+            hint = spectrum.hint.replace("fused rate", words.vector)
+            spectrum = replace(spectrum, title=words.spectrum, hint=hint)
         return [
             Section(
                 words.fused,
