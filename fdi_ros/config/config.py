@@ -41,6 +41,7 @@ from fdi_ros.config.settings import (
     setting,
 )
 from fdi_ros.errors import ConfigError
+from fdi_ros.system import find_shipped
 from fdi_ros.system.files import NAME
 from fdi_ros.system.text import did_you_mean, html_table, shown
 from fdi_ros.system.yaml_file import parse_yaml, read_yaml
@@ -102,11 +103,20 @@ class Config:
     ) -> Config:
         """Read one or more ROS 2 parameter files; later files win, as with ``--params-file``.
 
-        ``overrides``: ``{"section.field": value}``, which win over all files.
-        `ConfigError` if a file is missing or is not a parameter file, or a parameter is
-        wrong.
+        Parameters
+        ----------
+        path
+            Paths, or names of shipped files: ``two_imus.yaml``, ``px4``.
+        overrides
+            ``{"section.field": value}``, which win over all files.
+
+        Raises
+        ------
+        ConfigError
+            If a file is missing or is no parameter file, or a parameter is wrong.
         """
-        files = [path] if isinstance(path, (str, Path)) else path
+        given_paths = [path] if isinstance(path, (str, Path)) else path
+        files = [find_shipped(Path(one)) for one in given_paths]
         given = {
             name: value
             for file in files

@@ -187,6 +187,9 @@ def word_of(concerns: Iterable[Concern]) -> Word:
     return Word.LOOK if words else Word.HEALTHY
 
 
+_BY_URGENCY = (Word.HEALTHY, Word.LOOK, Word.CANNOT_TELL, Word.FAULTY)
+
+
 def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     """Return the first word of the verdict on a monitor at its last sample."""
     if any(map(is_declared, status.channels)):
@@ -195,10 +198,11 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     if not status.has_rate or not status.can_detect or far:
         return Word.CANNOT_TELL
     states = {channel.state for channel in status.channels}
-    if ChannelState.UNCHECKED in states:
+    if ChannelState.OK not in states:
         return Word.CANNOT_TELL
-    if states != {ChannelState.OK}:
-        return Word.LOOK
+    # How long a channel was unchecked is among the concerns.
+    if not states <= {ChannelState.OK, ChannelState.UNCHECKED}:
+        return max(word_of(concerns), Word.LOOK, key=_BY_URGENCY.index)
     return word_of(concerns)
 
 

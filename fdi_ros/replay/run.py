@@ -424,10 +424,13 @@ def read(
     return blocks()
 
 
+OneFault = Fault | str | Mapping[str, Any]
+
+
 def replay(
     path: Source,
     config: ConfigSource = None,
-    faults: Sequence[Fault | str | Mapping[str, Any]] = (),
+    faults: OneFault | Sequence[OneFault] = (),
     start: float = 0.0,
     end: float = math.inf,
     *,
@@ -444,7 +447,8 @@ def replay(
         Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording, if its units are
         mounted alike.
     faults
-        To be injected, each in words or as a mapping: ``"channel=imu_2.y kind=bias size=0.2 start=30"`` or
+        One or several to be injected, each in words or as a mapping:
+        ``"channel=imu_2.y kind=bias size=0.2 start=30"`` or
         ``{"channel": "imu_2.y", "kind": "bias", "size": 0.2, "start": 30}``.
     sinks
         Take the outputs of the monitor as they come.
@@ -464,7 +468,7 @@ def replay(
     else:
         settings = Config.of(config)
     begun, period = clock(), max((sink.period for sink in sinks), default=0)
-    given = tuple(map(_fault, faults))
+    given = _faults(faults)
     judge: Judge | None = None
     deliveries = Deliveries(len(settings.topics), start)
     taps = [*(sink.tap for sink in sinks), deliveries.tap]
@@ -557,6 +561,13 @@ def with_unused(summary: Summary, unused: Sequence[tuple[str, str]]) -> Summary:
     stream = replace(summary.stream, unused=tuple(unused))
     summary = replace(summary, stream=stream)
     return replace(summary, verdict=verdict_of(summary))
+
+
+def _faults(given: OneFault | Sequence[OneFault]) -> tuple[Fault, ...]:
+    """Return one fault or several."""
+    if isinstance(given, (Fault, str, Mapping)):
+        return (_fault(given),)
+    return tuple(map(_fault, given))
 
 
 def _fault(given: Fault | str | Mapping[str, Any]) -> Fault:

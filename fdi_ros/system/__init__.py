@@ -51,14 +51,26 @@ def resolve(path: str) -> Path:
     printed.
     """
     given = Path(path)
-    if given.exists():
-        return given
+    found = find_shipped(given)
+    if found != given:
+        print(visible(f"fdi: no {given} here, taking {found}"), file=sys.stderr)
+    return found
+
+
+def find_shipped(given: Path) -> Path:
+    """Return an existing path unchanged, or else the shipped file with this name.
+
+    Parameter files need no ending: ``px4`` is ``px4.yaml``. A path that is no shipped file
+    is returned unchanged too.
+    """
     place = shipped_folder()
+    if given.exists() or place is None:
+        return given
     for shipped in shipped_files():
-        if path == shipped.name or (
-            place is not None and given == Path("config") / shipped.relative_to(place)
-        ):
-            print(visible(f"fdi: no {given} here, taking {shipped}"), file=sys.stderr)
+        names = {Path(shipped.name), Path("config") / shipped.relative_to(place)}
+        if shipped.parent == place and shipped.suffix == ".yaml":
+            names.add(Path(shipped.stem))
+        if given in names:
             return shipped
     return given
 
