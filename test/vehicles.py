@@ -3,7 +3,7 @@
 
 """Recordings of vehicles with units on random mounts, late stamps and biases that move, and the truth behind them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,6 +39,7 @@ class Vehicle:
     """(n,) average over the recording, rad/s."""
     late: Array
     """(units,) by how much their stamps are late against those of the first, s."""
+    motion: Motion
 
     @property
     def nominal(self):
@@ -112,4 +113,26 @@ def vehicle(seed, kind, units=3, sample_rate=100.0):
         axes,
         bias.mean(axis=0),
         late,
+        motion,
     )
+
+
+def with_forces(one, arms, noise=0.05, seed=0):
+    """Return the recording of a vehicle with accelerometers at arms (units, 3), m; errors of m/s^2 and 0.5 %."""
+    rng, t = np.random.default_rng([21, seed]), (one.block.stamp - START) * 1e-9
+    step, z = 2e-3, np.empty((len(t), len(arms), 3))
+    fine = np.arange(-DELAY - 0.01, t[-1] + DELAY + 0.01, step)
+    rate = one.motion.rate_at(fine)
+    turn, attitude = Rotation.identity(), np.empty((len(fine), 3))
+    for k, step_turn in enumerate(Rotation.from_rotvec(rate * step)):
+        attitude[k] = turn.inv().apply([0.0, 0.0, 9.81])
+        turn = turn * step_turn
+    alpha = np.gradient(rate, step, axis=0)
+    for k, arm in enumerate(arms):
+        force = attitude + np.cross(alpha, arm) + np.cross(rate, np.cross(rate, arm))
+        at = np.column_stack([np.interp(t - one.late[k], fine, f) for f in force.T])
+        own = one.axes[3 * k : 3 * k + 3] + rng.normal(0, SCALE, (3, 3))
+        z[:, k] = at @ own.T + rng.normal(0, 0.2, 3)
+    z += noise * rng.standard_normal(z.shape)
+    force = Block(one.block.stamp, z.reshape(len(t), -1))
+    return replace(one.block, acceleration=force)

@@ -44,6 +44,7 @@ from fdi_ros.setup.blocks import (
 )
 from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
 from fdi_ros.setup.noise import projector
+from fdi_ros.setup.positions import Position, find_positions, position_settings
 
 #: of each component of an axis that may point anywhere: the root of a third
 UNKNOWN_MOUNT = 0.58
@@ -129,6 +130,8 @@ class Calibration:
     settings: dict[str, object]
     #: spectrum of differences from the fused rate
     spectrum: Spectrum
+    #: of the accelerometers of all units but the first
+    positions: tuple[Position, ...] = ()
 
     def __post_init__(self) -> None:
         found, n = self.estimate, len(self.names)
@@ -210,6 +213,7 @@ def calibrate(
         raise CalibrationError(
             f"the recording leaves the fit undetermined ({error})"
         ) from error
+    positions = find_positions(block, config, found)
     units = [
         tuple(np.flatnonzero(sensors.unit == k).tolist())
         for k in range(1, sensors.units)
@@ -228,8 +232,10 @@ def calibrate(
         faults=faults,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
-        settings=_settings(config, active, data.step, found),
+        settings=_settings(config, active, data.step, found)
+        | position_settings(positions, config),
         spectrum=spectrum,
+        positions=positions,
     )
 
 

@@ -233,7 +233,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
             * (times if times > WIDER and number >= TRUSTING else 1.0),
         )
     assert walk is not None
-    covariance = found.constant_covariance * _misfit(one.careful, shown)
+    covariance = found.constant_covariance * misfit(one.careful, shown)
     # No less is known than before.
     known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(known, known)
@@ -560,7 +560,7 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
     return coefficients, np.asarray(layout["prior"][shown])
 
 
-def _misfit(of: NormalEquations, found: Smoothed) -> float:
+def misfit(of: NormalEquations, found: Smoothed) -> float:
     """Return the scatter of single windows about the constants over its expectation."""
     n = of.n
     x = (

@@ -43,6 +43,7 @@ from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.calibrate import UNMEASURED, Calibration, StampDelay
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
+from fdi_ros.setup.positions import SHOWN_POSITION
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, Tried, times_words
 from fdi_ros.system.text import LINE, first_of, shown
 
@@ -80,6 +81,7 @@ def calibration_findings(
 ) -> Iterator[Finding]:
     """Yield results, unknown quantities and warnings."""
     yield from _found(result, unit)
+    yield from _positions(result)
     yield from _unknown(result, body_frame, unit)
     yield from _warnings(result, unit)
 
@@ -124,6 +126,31 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
             delay.value,
             delay.error,
             SHOWN * delay.error,
+        )
+
+
+def _positions(result: Calibration) -> Iterator[Finding]:
+    """Yield the positions of accelerometers, measured or not."""
+    for one in result.positions:
+        name, known = one.name, one.measured
+        values = [
+            f"{axis} {value:.3f} +- {error:.3f}" if shows else f"{axis} not measured"
+            for axis, value, error, shows in zip(
+                "xyz", one.value, one.error, known, strict=True
+            )
+        ]
+        words = f"accelerometers of {name}, position from the first unit, m: "
+        words += ", ".join(values)
+        error = float(one.error.max())
+        if known.all():
+            yield Finding(
+                Role.FOUND, "position", words, [name], error=error, bound=SHOWN_POSITION
+            )
+            continue
+        words += "; the configured position is kept there. Turn the vehicle back and"
+        words += " forth about all axes"
+        yield Finding(
+            Role.UNKNOWN, "position", words, [name], error=error, bound=SHOWN_POSITION
         )
 
 
@@ -437,6 +464,15 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
                 "shown": d.shown,
             }
             for d in result.delays
+        ],
+        "positions": [
+            {
+                "unit": one.name,
+                "position_m": one.value,
+                "std_m": one.error,
+                "measured": one.measured,
+            }
+            for one in result.positions
         ],
         "faults": [
             {

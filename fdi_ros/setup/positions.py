@@ -1,0 +1,268 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Positions of accelerometers against each other, from the turns of a recording.
+
+An accelerometer at r from the first measures ``alpha x r + omega x (omega x r)`` more.
+The difference d of the specific forces of two units in blocks of 40 ms is
+
+    d = ([alpha x] + [omega x][omega x]) r + D f + late df/dt + b,
+
+with the rate of the calibrated gyros, the mean force f of both units, their relative
+scale and mount errors D (3, 3), and a bias b that walks. Weighted least squares over
+all windows (`fdi_ros.setup.smoother`) gives r with its standard errors. Positions along
+an axis that no turn shows stay at their prior, with its error.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi_ros.config.config import Config
+from fdi_ros.inspection.turns import SQUARE
+from fdi_ros.model.quantity import FORCE
+from fdi_ros.model.samples import Array, Block, Mask
+from fdi_ros.monitor.accelerometers import (
+    accelerometer_names,
+    felt_units,
+    lever_arms,
+)
+from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
+from fdi_ros.setup.blocks import make_blocks, prepare
+from fdi_ros.setup.estimate import (
+    MOST_STEPS,
+    SCALE_STD,
+    USUAL_WALK,
+    StateEstimate,
+    misfit,
+)
+from fdi_ros.setup.noise import projector
+from fdi_ros.setup.smoother import NormalEquations, find_random_walk, smooth
+
+#: of a position before anything is shown, m
+POSITION_STD = 0.5
+#: of the difference of two biases before anything is shown, m/s^2
+BIAS_STD = 1.5
+#: largest standard error of a position that counts as measured, m
+SHOWN_POSITION = 0.01
+#: weights of a block and its neighbours: the mean force then lasts as long as the
+#: difference of two rates, to second order
+ALIKE = np.array([1.0, 4.0, 1.0]) / 6.0
+#: fewest blocks of a window in use
+LEAST_BLOCKS = 5
+#: angular acceleration over its noise, in power, from which a window turns
+TURNING = 3.0
+#: fits, each with the noise that the one before left in every window
+ROUNDS = 3
+#: of the walking bias, and of position, scale and mount errors, and delay
+BIASES, STATES = 3, 16
+
+
+class Position(NamedTuple):
+    """Where the accelerometers of a unit are, seen from those of the first."""
+
+    #: number of the unit
+    unit: int
+    #: its name
+    name: str
+    #: (3,) along the axes of the body, m
+    value: Array
+    #: (3,) standard errors, m
+    error: Array
+
+    @property
+    def measured(self) -> Array:
+        """Whether the recording shows the position, (3,) along the axes of the body."""
+        return np.asarray(self.error < SHOWN_POSITION)
+
+
+def find_positions(
+    block: Block, config: Config, found: StateEstimate
+) -> tuple[Position, ...]:
+    """Find the positions of all units but the first from a calibrated recording.
+
+    Empty without accelerations of the first unit. Units with an excluded accelerometer
+    are left out.
+    """
+    units = felt_units(block) if config.has_units else ()
+    excluded = set(config.excluded_channels)
+    kept = [
+        unit
+        for unit in units
+        if excluded.isdisjoint(accelerometer_names(config, [unit]))
+    ]
+    if not kept or kept[0] != 0 or block.acceleration is None:
+        return ()
+    force = _forces(block.acceleration, config, found)
+    turning, noise = _turning(found)
+    return tuple(
+        Position(
+            unit,
+            config.imu_names[unit],
+            *_position(force[:, 0], force[:, unit], turning, noise, found),
+        )
+        for unit in kept[1:]
+    )
+
+
+def _forces(block: Block, config: Config, found: StateEstimate) -> Array:
+    """Specific forces (B, units, 3) in the frame of the body, over `FORCE.natural`."""
+    axes = build_geometry(config).axes.reshape(-1, 3, 3)
+    most = np.broadcast_to(config.accelerometers.max_acceleration, block.z.shape[1])
+    data = prepare(block, most)
+    mean = make_blocks(data, _delays(config, found)).mean.reshape(-1, len(axes), 3)
+    return np.asarray(np.einsum("uab,kub->kua", np.linalg.inv(axes), mean)) / (
+        FORCE.natural
+    )
+
+
+def _delays(config: Config, found: StateEstimate) -> Array:
+    """Delay of the stamps of every channel (3 units,), s, 0 for units not in use."""
+    used = np.array(
+        [
+            name not in config.excluded_channels
+            for name in build_geometry(config).channel_names
+        ]
+    )
+    delay = np.zeros(len(used))
+    delay[used] = found.delay
+    of_units = delay.reshape(-1, 3)
+    return np.repeat(of_units[np.arange(len(of_units)), np.abs(of_units).argmax(1)], 3)
+
+
+def _turning(found: StateEstimate) -> tuple[Array, Array]:
+    """Return the matrices (B, 3, 3) that positions are multiplied by, 1/s^2, NaN if unknown.
+
+    Also the covariance (W, 3, 3) of the noise of the angular acceleration.
+    """
+    blocks, rate = found.blocks, found.rate
+    span = blocks.seconds[2:] - blocks.seconds[:-2]
+    acceleration = np.full_like(rate, np.nan)
+    near = (span < 2.5 * blocks.length)[:, None]
+    change = (rate[2:] - rate[:-2]) / span[:, None]
+    acceleration[1:-1] = np.where(near, change, np.nan)
+    # What no rate explains is noise, about alike in all channels.
+    apart = projector(found.axes)
+    size = np.nan_to_num((np.diff(blocks.mean, axis=0) @ apart) ** 2).sum(axis=1) / 2
+    total = np.add.reduceat(np.append(size, 0.0), blocks.start) / blocks.size
+    of_rate = np.linalg.inv(found.axes.T @ found.axes) / max(len(apart) - 3, 1)
+    noise = total[:, None, None] * of_rate / (2.0 * blocks.length**2)
+    square = (rate**2).sum(axis=1)[:, None, None] * np.eye(3)
+    inward = (rate[:, :, None] * rate[:, None, :] - square).reshape(-1, 9)
+    turning = _cross(acceleration) + _smooth(inward).reshape(-1, 3, 3)
+    return turning, np.asarray(noise)
+
+
+def _smooth(values: Array) -> Array:
+    """Average blocks (B, c) with their neighbours; NaN at both ends."""
+    found = np.full_like(values, np.nan)
+    found[1:-1] = ALIKE[0] * (values[2:] + values[:-2]) + ALIKE[1] * values[1:-1]
+    return found
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices (B, 3, 3) of the vector product with vectors (B, 3)."""
+    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2))
+
+
+def _position(
+    first: Array,
+    other: Array,
+    turning: Array,
+    noise: Array,
+    found: StateEstimate,
+) -> tuple[Array, Array]:
+    """Fit the position of one unit to forces (B, 3) of the first and its own.
+
+    Returns it with its standard errors, (3,) m.
+    """
+    blocks = found.blocks
+    # The noise of the difference is not that of the mean.
+    difference, mean = _smooth(other - first), _smooth(0.5 * (first + other))
+    signals = np.zeros((len(mean), 3, BIASES + STATES - 3))
+    signals[:, :, :3] = np.eye(3)
+    signals[:, :, 3:6] = turning / FORCE.natural
+    signals[:, :, 6:15] = np.kron(np.eye(3), mean[:, None, :]).reshape(-1, 3, 9)
+    signals[:, :, 15] = np.gradient(mean, blocks.seconds, axis=0)
+    usable = np.isfinite(signals).all(axis=2) & np.isfinite(difference)
+    good: Mask = np.asarray(usable.all(axis=1))
+    count = np.add.reduceat(good, blocks.start)
+    known = count >= LEAST_BLOCKS
+    if known.sum() < LEAST_BLOCKS:
+        return np.zeros(3), np.full(3, POSITION_STD)
+    signals[~good], difference = 0.0, np.where(good[:, None], difference, 0.0)
+    # Of noise alone no position is learned.
+    subtracted = np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3) - noise
+    subtracted /= FORCE.natural**2
+    power = (signals[:, :, 3:6] ** 2).sum(axis=(1, 2))
+    power = np.add.reduceat(power, blocks.start) / np.maximum(count, 1)
+    turns = power > TURNING * np.trace(subtracted, axis1=1, axis2=2)
+    signals[:, :, 3:6] *= turns[blocks.window][:, None, None]
+    moments = np.add.reduceat(np.einsum("bas,bat->bst", signals, signals), blocks.start)
+    moments[:, 3:6, 3:6] -= (count * turns)[:, None, None] * subtracted
+    values, vectors = np.linalg.eigh(moments)
+    moments = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
+    cross = np.add.reduceat(np.einsum("bas,ba->bs", signals, difference), blocks.start)
+    prior = np.concatenate(
+        [
+            np.full(3, BIAS_STD / FORCE.natural),
+            np.full(3, POSITION_STD),
+            np.full(9, SQUARE),
+            [UNIT_DELAY],
+        ]
+    )
+    each = -(-blocks.windows // MOST_STEPS)
+    groups = np.arange(0, blocks.windows, each)
+    middle = np.add.reduceat(blocks.time, groups) / np.diff(
+        groups, append=blocks.windows
+    )
+    apart = np.diff(middle, append=middle[-1])
+    residual = difference
+    for _ in range(ROUNDS):
+        square = np.add.reduceat((residual**2).sum(axis=1), blocks.start)
+        if residual is difference:
+            total = np.add.reduceat(difference, blocks.start)
+            square -= (total**2).sum(axis=1) / np.maximum(count, 1)
+        # Smoothing keeps the mean of white noise, not its size.
+        variance = square / np.maximum(3 * count - 3, 1) / (ALIKE**2).sum()
+        # A window is quiet by chance, too.
+        variance = np.maximum(variance, 0.5 * np.median(variance[known]))
+        weight = np.where(known, 1.0 / np.maximum(variance, 1e-18), 0.0)
+        of = NormalEquations(
+            BIASES,
+            np.add.reduceat(weight[:, None, None] * moments, groups),
+            np.add.reduceat(weight[:, None] * cross, groups),
+            apart,
+            prior,
+            np.zeros(len(prior)),
+        )
+        walk = find_random_walk(of)
+        fitted = smooth(of, walk.value or min(walk.possible, USUAL_WALK))
+        bias = np.repeat(fitted.curve, each, axis=0)[blocks.window]
+        explained = signals[:, :, 3:] @ fitted.constant + bias * good[:, None]
+        residual = difference - explained
+    covariance = fitted.constant_covariance[:3, :3] * misfit(of, fitted)
+    value = fitted.constant[:3]
+    # No recording shows the scale that all gyros have in common.
+    common = SCALE_STD * float(np.linalg.norm(value))
+    error = np.minimum(np.hypot(np.sqrt(np.diag(covariance)), common), POSITION_STD)
+    return value, error
+
+
+def position_settings(
+    positions: tuple[Position, ...], config: Config
+) -> dict[str, object]:
+    """Return the changed parameters: what is measured, the rest as configured."""
+    if not any(one.measured.any() for one in positions):
+        return {}
+    units = range(len(config.topics))
+    known = lever_arms(config, units)[::3].copy()
+    for one in positions:
+        known[one.unit] = np.where(one.measured, one.value, known[one.unit])
+    return {
+        "accelerometers.positions": [
+            round(float(value), 4) + 0.0 for value in known.ravel()
+        ]
+    }
