@@ -4,13 +4,16 @@
 """Tables of text (.csv): a line of column names, then a line per sample.
 
 Names give the columns of time and of the rates about x, y and z of each IMU, with
-units: ``time_us``, ``gyro_1_x [deg/s]``, ``imu_0.x``. A file ``columns.yaml`` in the
-same folder replaces names that are not clear. All its entries are optional:
+units: ``time_us``, ``gyro_1_x [deg/s]``, ``imu_0.x``. Names such as ``accel_1_x [g]``
+give the specific force of the same IMUs, if each has one. A file ``columns.yaml`` in
+the same folder replaces names that are not clear. All its entries are optional:
 
     time: t
     time_unit: ms                   # s, ms, us or ns
     rate_unit: deg/s                # rad/s or deg/s
     imus: [[wx1, wy1, wz1], [wx2, wy2, wz2]]
+    acceleration_unit: g            # m/s^2 or g
+    accelerations: [[ax1, ay1, az1], [ax2, ay2, az2]]
 
 Axes are not turned. An IMU without a value in a line has no message there. Times are
 doubles, so dates are exact to 0.3 us. Files are read in portions of bounded memory.
@@ -57,18 +60,37 @@ _RATE_UNITS = {
     "deg_s": _DEGREES,
     "dps": _DEGREES,
 }
+_GRAVITY = 9.80665
+_FORCE_UNITS = {
+    "m/s^2": 1.0,
+    "m/s2": 1.0,
+    "m/s²": 1.0,
+    "m_s2": 1.0,
+    "mps2": 1.0,
+    "g": _GRAVITY,
+    "mg": 1e-3 * _GRAVITY,
+}
 _UNIT = re.compile(
-    r"[\[(]([^\d\[(\])][^\[(\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
+    r"[\[(]([^\d\[(\])][^\[(\])]*)[\])]$|_(rad_s|radps|deg_s|dps|m_s2|mps2|m?g)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
 )
 _TIME = re.compile(
     r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)"
 )
 _AXIS = re.compile(r"(?:([xyz])|\[([012])\])[._ ]*(\d*)$")
 _GYRO = re.compile(r"gyr|omega|angular_?vel|(^|[._ \d])[gw]\d*$")
+_ACCELEROMETER = re.compile(r"acc|specific_?force|(^|[._ \d])[af]\d*$")
 _OTHER = re.compile(
     r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$"
 )
-"""Names of rates without their axis, and names of other quantities with three axes."""
+"""Names without their axis: of rates, of accelerations, of anything but rates."""
+_ENTRIES = {
+    "time",
+    "time_unit",
+    "rate_unit",
+    "imus",
+    "acceleration_unit",
+    "accelerations",
+}
 
 
 class Columns(NamedTuple):
@@ -82,6 +104,10 @@ class Columns(NamedTuple):
     imus: tuple[tuple[int, int, int], ...]
     #: rates of each IMU are multiplied by this for rad/s
     factors: tuple[float, ...]
+    #: indices of the accelerations along x, y and z of each, empty without any
+    accelerations: tuple[tuple[int, int, int], ...] = ()
+    #: accelerations of each IMU are multiplied by this for m/s^2
+    force_factors: tuple[float, ...] = ()
 
 
 class CsvLog(FlightLog):
@@ -219,23 +245,24 @@ def _columns(
     """
     path = Path(file.name).parent / COLUMNS
     told = read_yaml(path, "file", BagError) if path.exists() else {}
-    if not isinstance(told, dict) or set(told) - {
-        "time",
-        "time_unit",
-        "rate_unit",
-        "imus",
-    }:
-        raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
+    if not isinstance(told, dict) or set(told) - _ENTRIES:
+        raise BagError(f"{path}: expected {', '.join(sorted(_ENTRIES))}")
     imus = told["imus"] if "imus" in told else _imus(names, note)
-    if not isinstance(imus, list) or any(
-        not isinstance(imu, list) or len(imu) != 3 for imu in imus
-    ):
-        raise BagError(f"{path}: imus is a list of three columns for each IMU")
+    forces = told["accelerations"] if "accelerations" in told else _forces(names, imus)
+    for entry, triads in (("imus", imus), ("accelerations", forces)):
+        if not isinstance(triads, list) or any(
+            not isinstance(triad, list) or len(triad) != 3 for triad in triads
+        ):
+            raise BagError(f"{path}: {entry} is a list of three columns for each IMU")
+    if forces and len(forces) != len(imus):
+        raise BagError(
+            f"{path}: accelerations names {len(forces)} IMUs, imus names {len(imus)}"
+        )
     time: Any = told.get(
         "time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None)
     )
     listed = shown(", ".join(names), MOST_SHOWN)
-    for name in (time, *(column for imu in imus for column in imu)):
+    for name in (time, *(column for triad in (*imus, *forces) for column in triad)):
         if name not in names:
             missing = "no column of times" if name is None else f"no column {name!r}"
             raise BagError(
@@ -249,6 +276,10 @@ def _columns(
     rates = [
         _factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x)
         for x, _, _ in imus
+    ]
+    force_factors = [
+        _factor(str(told.get("acceleration_unit", _split(x)[1])), _FORCE_UNITS, 1.0, x)
+        for x, _, _ in forces
     ]
     said = "; ".join(
         f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus, first)
@@ -264,8 +295,16 @@ def _columns(
     note(
         f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}"
     )
-    places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
-    return Columns(names.index(time), tick, places, tuple(rates))
+    if forces:
+        listed = "; ".join(", ".join(force) for force in forces)
+        in_unit = "" if set(force_factors) == {1.0} else ", converted to m/s^2"
+        note(f"accelerations in the order of the IMUs: {listed}{in_unit}")
+    places, beside = (
+        tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
+        for triads in (imus, forces)
+    )
+    factors = tuple(force_factors)
+    return Columns(names.index(time), tick, places, tuple(rates), beside, factors)
 
 
 def has_gyros(file: BinaryIO) -> bool:
@@ -306,11 +345,8 @@ def _factor(unit: str, known: dict[str, float], default: float, name: str) -> fl
     return known.get(unit, default)
 
 
-def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
-    """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
-
-    A gyro that lacks an axis is noted and left out.
-    """
+def _triads(names: Sequence[str]) -> dict[tuple[str, str], dict[str, str]]:
+    """Return the columns of each vector by axis, keyed by the name without its axis and its number."""
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
         plain = _split(name)[0]
@@ -319,6 +355,15 @@ def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
             axis = match[1] or "xyz"[int(match[2])]
             head = plain[: match.start()].rstrip("._ ")
             groups.setdefault((head, match[3]), {}).setdefault(axis, name)
+    return groups
+
+
+def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
+    """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
+
+    A gyro that lacks an axis is noted and left out.
+    """
+    groups = _triads(names)
     whole = {
         key: [axes[axis] for axis in "xyz"]
         for key, axes in groups.items()
@@ -336,14 +381,38 @@ def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
     ]
 
 
+def _forces(names: Sequence[str], imus: Any) -> list[list[str]]:
+    """Return the columns x, y, z of the accelerometer of each IMU, in the order of the names.
+
+    None, unless there is one for each IMU: nothing tells which of them lacks one. Nor
+    is one taken whose unit is unknown: its rates are of use without it.
+    """
+    found = [
+        [axes[axis] for axis in "xyz"]
+        for (head, _), axes in _triads(names).items()
+        if len(axes) == 3
+        and _ACCELEROMETER.search(head)
+        and not _GYRO.search(head)
+        and "cov" not in head
+    ]
+    known = all(
+        _split(name)[1] in ("", *_FORCE_UNITS) for axes in found for name in axes
+    )
+    return found if isinstance(imus, list) and len(found) == len(imus) and known else []
+
+
 def _is_gyro(head: str) -> bool:
     """Whether a name without its axis names a gyro."""
     return _GYRO.search(head) is not None and "cov" not in head
 
 
 def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
-    """Return time and rates of each line, (k, 1 + 3 IMUs); cells without a number are NaN."""
-    chosen = [columns.time, *(column for imu in columns.imus for column in imu)]
+    """Return time, rates and accelerations of each line; cells without a number are NaN.
+
+    (k, 1 + 3 IMUs), or (k, 1 + 6 IMUs) with accelerations.
+    """
+    triads = (*columns.imus, *columns.accelerations)
+    chosen = [columns.time, *(column for triad in triads for column in triad)]
     if not lines:
         return np.empty((0, len(chosen)))
     if delimiter == ";":
@@ -378,16 +447,19 @@ def _number(cells: Sequence[str], column: int) -> float:
 def _samples(
     table: Array, end: Int, columns: Columns, first: int
 ) -> list[tuple[Source, ImuSamples]]:
-    """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at bytes (k,)."""
+    """Return the samples of each IMU in lines, as of `_numbers`, that end at bytes (k,)."""
     # Impossible dates are left out later.
     stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(
         np.int64
     )
-    found = []
+    found, behind = [], 3 * len(columns.imus)
     for k, factor in enumerate(columns.factors):
-        rate = table[:, 1 + 3 * k : 4 + 3 * k] * factor
+        at = 1 + 3 * k
+        rate = table[:, at : at + 3] * factor
+        force = np.full(rate.shape, np.nan)
+        if columns.accelerations:
+            force = table[:, behind + at : behind + at + 3] * columns.force_factors[k]
         measured = ~np.isnan(rate).all(axis=1)
-        found.append(
-            (Source(KIND, first + k), imu_samples(stamp, rate, end=end)[measured])
-        )
+        samples = imu_samples(stamp, rate, force, end)
+        found.append((Source(KIND, first + k), samples[measured]))
     return found

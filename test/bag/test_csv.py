@@ -10,6 +10,8 @@ import pytest
 from bag.logs import UTC, units
 from bag.recordings import bounded
 from bag.test_logs import messages, refusal
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Imu
 
 from fdi_ros.bag.csv_file import CSV_LINE_BYTES
 
@@ -75,6 +77,36 @@ def test_times_have_the_unit_of_their_name_or_that_of_a_date(
     assert said.endswith(" in deg/s")
 
 
+@pytest.mark.parametrize(
+    ("form", "unit"),
+    [
+        ("accel_{k}_{axis} [m/s^2]", 1.0),
+        ("imu_{k}.acc_{axis}_g", 9.80665),
+        ("a{axis}{k} (mg)", 9.80665e-3),
+        ("acc{k}_{axis}", 1.0),
+    ],
+)
+def test_accelerations_stand_beside_the_rates_in_the_unit_of_their_name(
+    tmp_path, form, unit
+):
+    forces = np.hstack([unit.acceleration for unit in UNITS]).astype(float)
+    others = named(form)[1:]
+    table = np.hstack([RATES, forces / unit])
+    path = write(tmp_path, [*named("gyro_{k}_{axis}"), *others], rates=table)
+    found, damage = messages(path)
+    assert any("accelerations in the order of the IMUs" in line for line in damage)
+    for k, (_, rate, data) in enumerate(found.values()):
+        message = deserialize_message(data[7], Imu)
+        given = [getattr(message.linear_acceleration, axis) for axis in AXES]
+        np.testing.assert_allclose(given, forces[7, 3 * k : 3 * k + 3], rtol=1e-12)
+        assert message.linear_acceleration_covariance[0] == 0.0
+        assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
+    # Of one accelerometer beside two gyros nothing tells whose it is.
+    path = write(tmp_path, [*named("gyro_{k}_{axis}"), *others[:3]], rates=table[:, :9])
+    message = deserialize_message(messages(path)[0]["/imu_0"][2][7], Imu)
+    assert message.linear_acceleration_covariance[0] == -1.0
+
+
 @pytest.mark.parametrize("delimiter", [";", "\t"])
 def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(
     tmp_path, delimiter
@@ -125,9 +157,16 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
             f"{IMUS}rate_unit: rpm",
             "column 'p1' has the unit 'rpm', expected one of rad/s",
         ),
-        (f"{IMUS}units: 3", "expected time, time_unit, rate_unit and imus"),
+        (
+            f"{IMUS}units: 3",
+            "expected acceleration_unit, accelerations, imus, rate_unit",
+        ),
+        (
+            f"{IMUS}accelerations: [[p1, q1, r1]]",
+            "accelerations names 1 IMUs, imus names 2",
+        ),
         (f"{IMUS}time: [1]", "has no column [1]"),
-        ("- 1", "expected time, time_unit"),
+        ("- 1", "expected acceleration_unit"),
         ("x: [", "is not YAML"),
         (
             "{time: t, time_unit: ms, imus: [[p1, q1, r1]]}",
