@@ -29,6 +29,9 @@ LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR = 0.5
+#: Share of the rate added to `CLEAR`: gyros of one type differ in scale by up to 3 %, and
+#: healthy ones then by more than `CLEAR` in a turn of 17 rad/s.
+SCALE = 0.05
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
 FEWEST = 3  #: and this number of samples.
 SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
@@ -90,6 +93,10 @@ class RawComparison:
                 rows.append((stamp, (x, y, z)))
             while rows and rows[0][0] <= stamp - AVERAGED:
                 rows.popleft()
+
+    def rate(self, unit: int) -> float:
+        """Return the size of the last rate of an IMU, rad/s."""
+        return math.hypot(*self._last[unit][1])
 
     def least(self, unit: int, other: int, count: int, now: int) -> float:
         """Return the smallest of the last count differences of two IMUs at time now, ns.
@@ -200,8 +207,8 @@ class Evidence:
     ) -> tuple[int, int]:
         """Return the IMU that is bad without a name, and for how long that must stand, ns.
 
-        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
-        or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
+        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`
+        and `SCALE`, or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
 
         Parameters
         ----------
@@ -214,7 +221,8 @@ class Evidence:
             if not alike < max(self._min_size, ALIKE * size):
                 continue
             states = self._states[k]
-            limit = LARGE if states & DOUBTS else CLEAR
+            turning = max(map(self.raw.rate, pair))
+            limit = LARGE if states & DOUBTS else CLEAR + SCALE * turning
             if all(self.raw.least(k, j, self._fewest, now) >= limit for j in pair):
                 return k, 0
             if ChannelState.AMBIGUOUS in states and size >= VOTE * self._min_size:

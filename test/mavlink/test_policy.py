@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.mavlink.failover_evidence import RawComparison
+from fdi_ros.mavlink.failover_evidence import Evidence, RawComparison
 from fdi_ros.mavlink.failover_policy import (
     LASTING,
     LONGEST_PAUSE,
@@ -72,3 +72,19 @@ def test_samples_form_a_pair_within_four_tenths_of_an_interval(apart, compared):
     found = raw.between(0, 1, START + 400 * MS)
     assert (found is not None) == compared
     assert not compared or found.mean == pytest.approx((0.1, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("rate", "factor", "named"),
+    [(20.0, 1.03, False), (20.0, 1.1, True), (20.0, 0.0, True), (0.7, 0.0, True)],
+)
+def test_an_error_of_scale_in_a_fast_turn_is_no_clear_error(rate, factor, named):
+    """Two IMUs agree, and the third one reads the rate times a factor; no doubt."""
+    evidence = Evidence(3, 20 * MS, min_size=0.03)
+    evidence.hear([0.0] * 9, START)
+    for k in range(10):
+        now = START + k * 20 * MS
+        for unit, scale in enumerate((1.0, 1.0, factor)):
+            evidence.raw.feed(unit, now, (scale * rate, 0.0, 0.0))
+        imus = evidence.look([True] * 3, now)
+    assert [imu.named for imu in imus] == [False, False, named]
