@@ -129,12 +129,19 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
         )
 
 
+def _position(axis: str, value: float, error: float) -> str:
+    """Return a measured position in words, m: a value below its error is no number."""
+    if abs(value) < error:
+        return f"{axis} 0 (standard error {error:.3f})"
+    return f"{axis} {value:.3f} +- {error:.3f}"
+
+
 def _positions(result: Calibration) -> Iterator[Finding]:
     """Yield the positions of accelerometers, measured or not."""
     for one in result.positions:
         name, known = one.name, one.measured
         values = [
-            f"{axis} {value:.3f} +- {error:.3f}" if shows else f"{axis} not measured"
+            _position(axis, value, error) if shows else f"{axis} not measured"
             for axis, value, error, shows in zip(
                 "xyz", one.value, one.error, known, strict=True
             )
