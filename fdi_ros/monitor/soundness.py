@@ -198,10 +198,9 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     if not status.has_rate or not status.can_detect or far:
         return Word.CANNOT_TELL
     states = {channel.state for channel in status.channels}
-    if ChannelState.OK not in states:
+    if ChannelState.UNCHECKED in states:
         return Word.CANNOT_TELL
-    # How long a channel was unchecked is among the concerns.
-    if not states <= {ChannelState.OK, ChannelState.UNCHECKED}:
+    if states != {ChannelState.OK}:
         return max(word_of(concerns), Word.LOOK, key=_BY_URGENCY.index)
     return word_of(concerns)
 

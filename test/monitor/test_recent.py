@@ -4,15 +4,18 @@
 """Health of a running monitor: the verdict that a replay of the last minute would give."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from monitor.streams import RATE, parallel, stream, struck
 from numpy.typing import NDArray
 
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.recent import RecentHealth
+from fdi_ros.monitor.soundness import Word, live_word
 
 SECOND = round(RATE)
 
@@ -91,3 +94,17 @@ def test_a_declared_fault_is_faulty_and_what_is_unchecked_cannot_be_told():
     assert last["monitor"].value("verdict") == "FAULTY"
     lines = describe(Pipeline(parallel(2)).status())
     assert dict(lines[0].values)["verdict"] == "CANNOT TELL"
+
+
+def test_a_channel_that_is_unchecked_now_is_not_called_healthy():
+    pipeline = Pipeline(parallel(3))
+    pipeline.process(healthy(2))
+    status = pipeline.status()
+    first, *others = status.channels
+    words = {
+        state: live_word(
+            replace(status, channels=(replace(first, state=state), *others)), []
+        )
+        for state in (ChannelState.OK, ChannelState.UNCHECKED, ChannelState.FAULTY)
+    }
+    assert list(words.values()) == [Word.HEALTHY, Word.CANNOT_TELL, Word.FAULTY]
