@@ -9,7 +9,9 @@ the next memory. It has no clock and no link. An order sets INS_USEk.
 
 Definitions
     apart    raw rate differs from the nearest other IMU by ``min_size`` or more
-    bad      named by the monitor, and apart. With only one of both, left in use.
+    named    by the monitor, now or in its last report, or odd: the raw rates of two of
+             three IMUs agree, and the third is far off (`failover_evidence.Evidence`)
+    bad      named, and apart. With only one of both, left in use.
     sound    delivers, and the monitor finds it OK or it is not apart
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
@@ -22,7 +24,7 @@ Rules, in this order at each tick
     1. Held IMUs go back in use if the operator asks, if no other IMU is left in use,
        or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
        is taken out in a flight. In flight that needs a live monitor. On the ground an
-       IMU that the monitor still names stays out. An IMU that was out when the
+       IMU that is still named stays out. An IMU that was out when the
        autopilot started has no notch filters: only the operator or rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
@@ -102,7 +104,7 @@ class Imu(NamedTuple):
 
     use: bool | None = None  #: Last report of its INS_USE. None: no recent report.
     heard: int = NEVER  #: Time of that report.
-    named: bool = False  #: The monitor holds this IMU to be faulty.
+    named: bool = False  #: By the monitor or the raw rates, as defined above.
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
     size: float = float("nan")
