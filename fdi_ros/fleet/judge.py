@@ -373,6 +373,7 @@ def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
         end=one.end_s,
         size=None if largest is None else largest.rad_s,
         size_std=None if largest is None else largest.std_rad_s,
+        measured_in=one.measured_in,
         words=one.words,
     )
 

@@ -43,7 +43,7 @@ from fdi_ros.system.text import LINE, shown, storable
 Row = Mapping[
     str, Any
 ]  # values of a row by the names of the columns; None where nothing can be said.
-VERSION = 4  # of the columns: raised when one changes its name, type or meaning
+VERSION = 5  # of the columns: raised when one changes its name, type or meaning
 WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
 """The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
 
@@ -104,10 +104,11 @@ class Flight:
         "share of the samples in which nothing checked the channel, or it gave none"
     )
     noise: tuple[float, ...] | None = _column(
-        "noise of each per sample, at the quietest", "rad/s"
+        "noise of each gyro per sample, at the quietest; gyros come first", "rad/s"
     )
     bias: tuple[float, ...] | None = _column(
-        "bias of each at the end: given, learned and followed", "rad/s"
+        "bias of each at the end: given, learned and followed",
+        "rad/s; m/s^2 of accelerometers",
     )
 
 
@@ -128,9 +129,11 @@ class FlightEpisode:
     start: float = _column("first declaration, from the first message", "s")
     end: float = _column("when nothing of it stood any more, or its stretch ended", "s")
     size: float | None = _column(
-        "error by the others; between channels of one axis, how far apart", "rad/s"
+        "error by the others; between channels of one axis, how far apart",
+        "as in measured_in",
     )
-    size_std: float | None = _column("standard error of that", "rad/s")
+    size_std: float | None = _column("standard error of that", "as in measured_in")
+    measured_in: str = _column("unit of the error: rad/s, or m/s^2 of accelerometers")
     words: str = _column("all in one sentence")
 
 

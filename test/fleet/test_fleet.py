@@ -185,7 +185,7 @@ def test_tables_say_what_became_of_each_flight_and_what_their_columns_mean(judge
     assert np.allclose([np.mean(row["noise"]) for row in flights[:2]], 0.002, rtol=0.2)
     for name in ("flights", "episodes"):
         schema = parquet.read_schema(judged / f"{name}.parquet")
-        assert schema.metadata[b"columns"] == b"4"
+        assert schema.metadata[b"columns"] == b"5"
         assert all(one.metadata[b"meaning"] for one in schema)
 
 
