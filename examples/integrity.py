@@ -8,9 +8,11 @@ python3 examples/integrity.py --ros-args -r integrity:=/fdi_node/integrity
 
 from __future__ import annotations
 
+import signal
+
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64MultiArray
 
 STATES = ("OK", "SUSPECT", "AMBIGUOUS", "FAULTY", "STALE", "UNCHECKED", "EXCLUDED")
@@ -46,13 +48,15 @@ class Subscriber(Node):
 
 def main() -> None:
     """Print until interrupted."""
-    rclpy.init()
-    try:
-        rclpy.spin(Subscriber())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
+    # A KeyboardInterrupt while rclpy converts a message becomes a RuntimeError of
+    # rclpy. Therefore an interrupt only sets a flag, which is read between messages.
+    interrupts: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Subscriber()
+    while rclpy.ok() and not interrupts:
+        rclpy.spin_once(node, timeout_sec=0.2)
+    rclpy.try_shutdown()
 
 
 if __name__ == "__main__":
