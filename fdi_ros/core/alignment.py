@@ -1,42 +1,48 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time alignment: messages of 1 to 4 sensor units to samples, by their stamps.
+"""Time alignment: form samples from the messages of 1 to 4 sensor units, by stamps.
 
-Decisions come from stamps in arrival order alone: no clock and no timer, so that a
-recording played through it gives the samples that the live node formed. One message is
-entered, then the samples that it completes are taken out one by one: `enter`, then
-`next_sample` until there is none.
+All decisions follow from the stamps in order of arrival, without clock or timer.
+Therefore a replayed recording gives the same samples as the live node. `enter` takes
+one message; then `next_sample` returns the samples that this message completes, until
+none is left.
 
-Where a sample is formed: at the stamp of a message, if there is none between it and the
-message before of the same unit. So samples come at the rate of the fastest unit,
-whatever the phases. What the other units give at that stamp:
+Instant of a sample
+    A sample is formed at the stamp of a message if no other sample lies between this
+    message and the previous one of its unit. Thus samples have the rate of the fastest
+    unit, whatever the phases of the others. At that stamp another unit contributes
 
-- a message within ``max_skew`` (and nearer than half the message interval) counts as of
-  that instant, as it is, once;
-- else the line between the messages before and after, if they are near enough
-  (`MAX_BRIDGE`, `MAX_STEPS`);
-- else nothing: NaN, not received.
+    - its message within ``max_skew``, and nearer than half the message interval, as if
+      measured at that instant, and only once;
+    - or the linear interpolation between its messages before and after, if these are
+      close enough (`MAX_BRIDGE`, `MAX_STEPS`);
+    - or else no value: NaN, not received.
 
-A sample is formed as soon as every live unit has delivered for its stamp, or beyond.
-The wait is at most the message interval of the slowest unit; if one falls silent,
-``timeout`` by the stamps of the others, once; and never longer than `MAX_PENDING`
-messages.
+Waiting
+    A sample is formed when every live unit has a message at its stamp or later. The
+    wait lasts at most one message interval of the slowest unit. After a unit falls
+    silent, the wait lasts once ``timeout``, by the stamps of the other units. It never
+    lasts longer than `MAX_PENDING` messages.
 
-Which stamps are accepted: a stamp belongs to the common time base if it is at most
-``timeout`` behind the common time, the newest stamp that two units have reached, and
-not ahead of all other units by more. So of three units or more, one whose clock is
-fast, slow, jumps or is random leaves the base alone; of two, the newest counts, but
-where one falls behind by ``timeout`` without a jump the other may be fast. Until it
-comes back, or a third delivers, neither is believed: samples are formed, without values
-(`are_parted`). Only units that deliver count: one does until another has gone on for
-``timeout`` since its last message. When all leave the base together (a clock set back,
-a pause of the whole system) it has moved. That is accepted once every live unit stands
-within ``timeout`` of the others there, or one has gone on there for ``timeout`` while
-no other delivered. After a step back, ``shift`` is added to the stamps of samples.
+Accepted stamps
+    The common time is the newest stamp that two units have reached. A stamp belongs to
+    the time base if it is at most ``timeout`` behind the common time, and is not ahead
+    of all other units by more. With three or more units, a single clock that is fast,
+    slow, random or jumps leaves the time base unchanged. With two units the newest
+    stamp counts. If one of two falls behind by ``timeout`` without a jump, the other
+    may be fast: until it comes back or a third unit delivers, samples have no values
+    (`are_parted`). Only units that deliver are considered: a unit delivers until
+    another has gone on for ``timeout`` since its last message.
 
-Delays that are set are taken off before all of this; estimated ones after it
-(`fdi_ros.core.restamping`).
+Restart
+    If all units leave the time base together (a clock set back, or a pause of the whole
+    system), the time base moves. This needs every live unit within ``timeout`` of the
+    others in the new base, or one unit that goes on there for ``timeout`` while no
+    other delivers. After a step back, ``shift`` is added to the stamps of samples.
+
+Delays from the configuration are subtracted before all this, and estimated delays
+after it (`fdi_ros.core.restamping`).
 """
 
 from __future__ import annotations
@@ -54,17 +60,16 @@ from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, U
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
-# longest span that is interpolated, over the timeout: a unit that lost four messages is
-# hardly there
+#: Longest interpolated span, as a share of the timeout.
 MAX_BRIDGE = 0.25
-MAX_STEPS = (
-    2.5  # and in usual message intervals: one lost message is bridged, two are not
-)
-MAX_STAMP = (
-    1 << 61
-)  # ns: beyond all that an Imu can carry, and no sum or difference of two overflows
-_UNKNOWN = 1 << 62  # step before the first message of a time base, ns
-_NONE, _ALL = -_UNKNOWN, _UNKNOWN  # before and after all stamps, ns
+#: Longest interpolated span, in usual message intervals: one lost message is bridged,
+#: two are not.
+MAX_STEPS = 2.5
+#: Bound of accepted stamps, ns: greater than any stamp of an Imu, and small enough that
+#: sums and differences of two stamps do not overflow.
+MAX_STAMP = 1 << 61
+_UNKNOWN = 1 << 62  # Step before the first message of a time base, ns.
+_NONE, _ALL = -_UNKNOWN, _UNKNOWN  # Before and after all stamps, ns.
 _IDLE, _FORMING, _RESTARTING = range(3)
 
 
@@ -74,7 +79,11 @@ _IDLE, _FORMING, _RESTARTING = range(3)
 
 @compiled
 def enter(aligner: Aligner, j: int, stamp: int) -> None:
-    """Take a message of unit j, rate and felt force of the aligner at stamp, ns; then take out its samples."""
+    """Enter a message of unit j with the stamp, ns.
+
+    Its rate and specific force are those in the aligner. Afterwards `next_sample` must
+    be called until it returns False.
+    """
     if not 0 <= j < aligner.n:
         return
     unit = aligner.units[j]
@@ -112,7 +121,10 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
 
 @compiled
 def is_live(aligner: Aligner, j: int) -> bool:
-    """Whether unit j has delivered within the timeout, by the stamps of the others: if not, it is not waited for."""
+    """Return whether unit j has delivered within the timeout, by the stamps of the others.
+
+    Samples wait only for live units.
+    """
     unit = aligner.units[j]
     behind = unit.end > 0 and aligner.common - unit.newest > aligner.timeout
     return not behind and not _is_silent(aligner, unit)
@@ -120,7 +132,7 @@ def is_live(aligner: Aligner, j: int) -> bool:
 
 @compiled
 def are_parted(aligner: Aligner) -> bool:
-    """Whether the clocks of the only two units that deliver went apart by more than the timeout, whichever is wrong."""
+    """Return whether the clocks of the only two units that deliver differ by more than the timeout."""
     believed, parted = 0, False
     for j in range(aligner.n):
         believed += aligner.units[j].end > 0 and is_live(aligner, j)
@@ -130,7 +142,7 @@ def are_parted(aligner: Aligner) -> bool:
 
 @compiled
 def _is_silent(aligner: Aligner, unit: Unit) -> bool:
-    """Whether another unit has gone on for the timeout since the last message of this one."""
+    """Return whether another unit has gone on for the timeout since the unit's last message."""
     longest = 0
     for k in range(aligner.n):
         longest = max(longest, unit.passed[k])
@@ -139,7 +151,10 @@ def _is_silent(aligner: Aligner, unit: Unit) -> bool:
 
 @compiled
 def _pass_time(aligner: Aligner, j: int, stamp: int) -> None:
-    """Note by a stamp of unit j for how long the others have been silent; a step beyond the timeout is a jump."""
+    """Measure by a stamp of unit j how long the other units have been silent.
+
+    A step of more than the timeout is a jump and is not counted.
+    """
     unit = aligner.units[j]
     step = stamp - unit.before
     if unit.heard and 0 < step <= aligner.timeout:
@@ -152,7 +167,10 @@ def _pass_time(aligner: Aligner, j: int, stamp: int) -> None:
 
 @compiled
 def _find_common_time(aligner: Aligner) -> None:
-    """Take the newest stamp that two units have reached; while no more than two deliver, the newest."""
+    """Set the common time: the newest stamp that two units have reached.
+
+    While at most two units deliver, the common time is the newest stamp.
+    """
     deliver, newest, second = 0, _NONE, _NONE
     for j in range(aligner.n):
         unit = aligner.units[j]
@@ -166,9 +184,10 @@ def _find_common_time(aligner: Aligner) -> None:
 
 @compiled
 def _is_ahead(aligner: Aligner, j: int, stamp: int) -> bool:
-    """Whether a stamp of unit j is ahead of the time base: of every other unit that delivers, where these are two.
+    """Return whether a stamp of unit j is ahead of the time base.
 
-    Each is as far as its last message and what has passed since, by the stamps of unit j.
+    With two or more other units that deliver, the stamp must be ahead of each. The time
+    of another unit is its last stamp plus the time since, by the stamps of unit j.
     """
     others = near = 0
     for k in range(aligner.n):
@@ -181,7 +200,7 @@ def _is_ahead(aligner: Aligner, j: int, stamp: int) -> bool:
 
 @compiled
 def _is_outside(aligner: Aligner, j: int, stamp: int) -> bool:
-    """Whether a stamp of unit j is outside of the time base."""
+    """Return whether a stamp of unit j is outside the time base."""
     return aligner.common - stamp > aligner.timeout or _is_ahead(aligner, j, stamp)
 
 
@@ -189,7 +208,7 @@ def _is_outside(aligner: Aligner, j: int, stamp: int) -> bool:
 def _accept(
     aligner: Aligner, unit: Unit, stamp: int, rate: Array, force: Array
 ) -> None:
-    """Let a message wait."""
+    """Add a message to the waiting messages of its unit."""
     step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
     message = unit.messages[unit.end % RING]
     message.stamp, message.step = stamp, step
@@ -208,7 +227,11 @@ def _accept(
 
 @compiled
 def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
-    """Note a refused stamp; return whether all units have left the time base, or most if these were never in it."""
+    """Record a refused stamp, and return whether the time base has moved.
+
+    This is so if all live units have left the time base, or most of them and none of
+    these was ever in it.
+    """
     unit, timeout = aligner.units[j], aligner.timeout
     _count_refused(unit, stamp, aligner.common)
     if (unit.end > 0 and stamp == unit.newest) or not _is_outside(aligner, j, stamp):
@@ -227,14 +250,14 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
         elif is_live(aligner, i):
             here += 1
     if here:
-        # The first stamp of all makes a base: most units may have another one from the start.
+        # The first stamp received defines the time base, even if most units have another.
         return here < there and new
     return there > 1 or stamp - unit.off_first >= timeout
 
 
 @compiled
 def _count_refused(unit: Unit, stamp: int, common: int) -> None:
-    """Count a stamp that is no newer than the last of its unit, or outside the time base."""
+    """Count a stamp that is not newer than the last of its unit, or is outside the time base."""
     if unit.end > 0 and stamp == unit.newest:
         unit.counters.duplicate += 1
     elif unit.end > 0 and stamp < unit.newest:
@@ -248,18 +271,18 @@ def _count_refused(unit: Unit, stamp: int, common: int) -> None:
 
 @compiled
 def _stands_at(aligner: Aligner, unit: Unit, stamp: int) -> bool:
-    """Whether a unit stands near a stamp outside the time base."""
+    """Return whether the refused stamps of a unit are near a stamp outside the time base."""
     return unit.off and abs(unit.off_last - stamp) <= aligner.timeout
 
 
 @compiled
 def _restart(aligner: Aligner) -> None:
-    """Begin the time base anew with the messages that showed that it has moved."""
+    """Begin a new time base with the messages that have shown the move."""
     stamp, newest = aligner.moved_to, aligner.common
     for j in range(aligner.n):
         if aligner.units[j].end > 0:
             newest = max(newest, aligner.units[j].newest)
-    # No sample from now on can be as old as the newest message of the old base.
+    # Every later sample must be newer than the newest message of the old base.
     aligner.shift = max(stamp, newest + aligner.shift + 2 * aligner.timeout + 1) - stamp
     aligner.common = stamp
     aligner.restarts += 1
@@ -283,7 +306,7 @@ def _restart(aligner: Aligner) -> None:
 
 @compiled
 def next_sample(aligner: Aligner, sample: Sample) -> bool:
-    """Form the next sample that is complete; False if there is none before the next message."""
+    """Form the next complete sample. Return False if it needs another message."""
     if aligner.phase == _IDLE:
         return False
     if _form(aligner, sample):
@@ -320,11 +343,16 @@ def _form(aligner: Aligner, sample: Sample) -> bool:
 
 @compiled
 def _anchor(aligner: Aligner) -> tuple[int, int]:
-    """Return stamp and step of the earliest message without a sample between it and the one before; step 0: none."""
+    """Return stamp and step, ns, of the message at which the next sample is formed.
+
+    This is the earliest message for which no sample lies between itself and the
+    previous one of its unit. The step is 0 if no message qualifies.
+    """
     stamp, step = _ALL, 0
     for j in range(aligner.n):
         unit = aligner.units[j]
-        # If not the first that waits, then the second: samples have not passed the first.
+        # Of each unit only the first two waiting messages can qualify, because samples
+        # have not passed the first one.
         for k in range(unit.begin, min(unit.begin + 2, unit.end)):
             message = unit.messages[k % RING]
             if not aligner.formed or message.stamp - message.step >= aligner.last:
@@ -336,7 +364,7 @@ def _anchor(aligner: Aligner) -> tuple[int, int]:
 
 @compiled
 def _has_delivered(aligner: Aligner, j: int, stamp: int, step: int) -> bool:
-    """Whether unit j need not be waited for to form a sample at the anchor's stamp."""
+    """Return whether a sample at the anchor's stamp need not wait for unit j."""
     unit = aligner.units[j]
     if (unit.end > 0 and unit.newest >= stamp) or not is_live(aligner, j):
         return True
@@ -345,7 +373,7 @@ def _has_delivered(aligner: Aligner, j: int, stamp: int, step: int) -> bool:
 
 @compiled
 def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> None:
-    """Put into a sample at the anchor's stamp what unit j gives there."""
+    """Write the values of unit j at the anchor's stamp into a sample."""
     unit = aligner.units[j]
     after = _after(unit, stamp)
     match = _match(unit, after, stamp, step, aligner.max_skew)
@@ -382,7 +410,10 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
 
 @compiled
 def has_force(force: Array, start: int) -> bool:
-    """Whether three values from a place on are a specific force: one that is not there is NaN on all axes."""
+    """Return whether the three values from ``start`` on contain a specific force.
+
+    Where a message has none, all three are NaN.
+    """
     missing = 0
     for a in range(3):
         missing += math.isnan(force[start + a])
@@ -391,7 +422,10 @@ def has_force(force: Array, start: int) -> bool:
 
 @compiled
 def _after(unit: Unit, stamp: int) -> int:
-    """Return the number of the first message that waits and is beyond a stamp; an anchor has at most two before."""
+    """Return the number of the unit's first waiting message after a stamp.
+
+    At most two messages wait before an anchor, so the search is short.
+    """
     k = unit.begin
     while k < unit.end and unit.messages[k % RING].stamp <= stamp:
         k += 1
@@ -400,11 +434,11 @@ def _after(unit: Unit, stamp: int) -> int:
 
 @compiled
 def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
-    """Return the number of the message that counts as of the anchor's instant, -1 if there is none."""
+    """Return the number of the message that counts as measured at the anchor, or -1."""
     for k in range(after, max(unit.used, after - 1) - 1, -1):
         message = unit.messages[k % RING]
         apart = abs(message.stamp - stamp)
-        # Nearer than half a step, or the message after a lost one would be taken for it.
+        # Less than half a step away: otherwise the message after a lost one would match.
         if k < unit.end and apart <= max_skew and 2 * apart < min(message.step, step):
             return k
     return -1
@@ -423,11 +457,26 @@ def align_messages(
     start: int,
     samples: NDArray[Any],
 ) -> tuple[int, int]:
-    """Enter messages (M,) in order of arrival from number `start` on, as long as there is room for samples (S,).
+    """Enter messages in order of arrival until they end or the samples (S,) are full.
 
-    Of each: unit, stamp, ns, values (M, 6): rate, rad/s, and specific force, m/s^2; the
-    `Aligner` is in rows (1,). Returned are the number of the next message to be
-    entered, and of samples formed. Fewer than S: all is done.
+    Parameters
+    ----------
+    rows
+        The `Aligner`, (1,).
+    unit, stamp
+        Unit, and stamp in ns, of each message, (M,).
+    values
+        Rate, rad/s, and specific force, m/s^2, of each message, (M, 6).
+    start
+        Number of the first message to enter.
+    samples
+        Receives the samples, (S,).
+
+    Returns
+    -------
+    tuple
+        Number of the next message to enter, and number of samples formed. With fewer
+        than S samples, all messages were entered.
     """
     aligner, count = rows[0], 0
     while count < len(samples):
@@ -447,9 +496,21 @@ def align_messages(
 class Alignment:
     """Aligns the messages of a number of units.
 
-    ``max_skew``: stamps this close count as one instant, ns. ``timeout``: a unit silent
-    for longer than this by the stamps of the others is not waited for, ns. ``delays``:
-    by how much the stamps of each unit are late, s, (units,); empty: not at all.
+    Parameters
+    ----------
+    units
+        Number of units.
+    max_skew
+        Stamps that differ by at most this much count as one instant, ns.
+    timeout
+        Samples do not wait for a unit that is silent for longer than this, ns.
+    delays
+        Delay of the stamps of each unit, s, (units,). Empty: no delays.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of bounds, or if the number of delays is not that of units.
     """
 
     def __init__(
@@ -478,7 +539,10 @@ class Alignment:
         row["units"]["delay"][: len(delays)] = [round(1e9 * delay) for delay in delays]
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
-        """Take one message and return the samples that it completes, mostly none or one, (S,) `Sample`."""
+        """Enter one message and return the samples that it completes, (S,) `Sample`.
+
+        S is mostly 0 or 1.
+        """
         return self._aligned(
             np.array([unit]),
             np.array([stamp]),
@@ -486,32 +550,37 @@ class Alignment:
         )
 
     def push_block(self, unit: Int, stamp: Int, values: Array) -> Block:
-        """Take recorded messages in order of arrival and return the samples that they complete.
+        """Enter recorded messages in order of arrival and return their samples.
 
-        Messages: unit (M,), stamp (M,) ns, values (M, 3) rad/s, or (M, 6) with the
-        specific force behind them, m/s^2, all NaN where a message has none.
+        Parameters
+        ----------
+        unit, stamp
+            Unit, and stamp in ns, of each message, (M,).
+        values
+            Rates, rad/s, (M, 3). Or (M, 6) with the specific force, m/s^2, in the last
+            three columns, which are NaN where a message has none.
         """
         return as_block(self._aligned(unit, stamp, values), self.units)
 
     def flush(self) -> NDArray[Any]:
-        """Return what is left at the end of a recording, without waiting for any unit, (S,) `Sample`."""
+        """Return the remaining samples at the end of a recording, (S,) `Sample`."""
         self.rows["phase"], self.rows["force"] = _FORMING, _ALL
         return self._aligned(
             np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 6))
         )
 
     def is_live(self, unit: int) -> bool:
-        """Whether a unit is waited for."""
+        """Return whether samples wait for a unit."""
         return bool(is_live(self.rows[0], unit))
 
     @property
     def are_parted(self) -> bool:
-        """Whether the clocks of the only two units that deliver went apart."""
+        """Whether the clocks of the only two units that deliver differ too much."""
         return bool(are_parted(self.rows[0]))
 
     @property
     def counters(self) -> tuple[dict[str, int], ...]:
-        """What was counted, by name, for each unit."""
+        """Counters of each unit, by name."""
         rows = self.rows["units"]["counters"][0, : self.units]
         return tuple(
             {name: int(row[name]) for name in Counters.__annotations__} for row in rows
@@ -519,12 +588,12 @@ class Alignment:
 
     @property
     def lag(self) -> list[int]:
-        """How far the last message of each unit stood behind the newest of all, ns."""
+        """By how much the last message of each unit was older than the newest of all, ns."""
         return list(self.rows["units"]["lag"][0, : self.units].tolist())
 
     @property
     def shift(self) -> int:
-        """Added to the stamps of the samples, ns; 0 until all clocks were set back."""
+        """Offset added to the stamps of samples, ns. 0 until all clocks were set back."""
         return int(self.rows["shift"][0])
 
     def _aligned(self, unit: Int, stamp: Int, values: Array) -> NDArray[Any]:
@@ -542,7 +611,10 @@ class Alignment:
 
 
 def as_block(samples: NDArray[Any], units: int) -> Block:
-    """Block of samples, (S,) `Sample`, with the accelerations of all units if any has one."""
+    """Return a block of samples, (S,) `Sample`.
+
+    The block contains accelerations if any sample has one.
+    """
     stamp, n = samples["stamp"].copy(), 3 * units
 
     def half(values: str, there: str) -> Block:

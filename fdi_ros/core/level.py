@@ -4,19 +4,19 @@
 """Protection level of the fused rate.
 
 A name or a set may be wrong: other channels may be faulty in place of the channels left
-out. D are the channels left out as faulty, W the union of D and the fused channels. A
-rival hypothesis h assumes that D is healthy and that one or two others, R, are faulty.
-With u = A z and gain G of W (`fdi_ros.core.parity`), its error and rate are those of
-solution separation (`fdi_ros.monitor.integrity`):
+out. D are the channels left out as faulty. W is the union of D and the fused channels.
+A rival hypothesis h assumes that D is healthy and that one or two others, R, are
+faulty. With u = A z and the gain G of W (`fdi_ros.core.parity`), its error and rate are
+those of solution separation (`fdi_ros.monitor.integrity`):
 
     f_h = A_RR^-1 u_R,    x_h = G z - G_R f_h,    P_h = P_W + G_R A_RR^-1 G_R',    chi_h
     = z' A z - u_R' f_h.
 
-Against the name its odds in this sample are ``o_h exp(-(chi_h - chi_0) / 2)``, o_h
-those of its faults beside a single one. So the level of an axis is at least ``|x_0 -
-x_h| + q sigma_h``, with the Chernoff bound ``Q(q) <= exp(-q^2 / 2)`` on the risk shared
-by all rivals. Samples are judged one by one: what others have shown before makes no
-rival unlikely.
+Its odds against the name in this sample are ``o_h exp(-(chi_h - chi_0) / 2)``, where
+o_h are the prior odds of its faults against a single fault. Therefore the level of an
+axis is at least ``|x_0 - x_h| + q sigma_h``, with the Chernoff bound ``Q(q) <= exp(-q^2
+/ 2)`` on the risk, which all rivals share. Each sample is judged alone: earlier samples
+make no rival unlikely.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ from fdi_ros.model.samples import Array
 def fill_growth(
     n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array
 ) -> None:
-    """How many times noise_std^2 the square of each channel's error in a sample is, into growth (n,).
+    """Write each channel's mean square error, in units of its noise_std^2, into growth (n,).
 
-    ``variance`` (n,): of the sample, (rad/s)^2; ``remaining`` (n,): standard deviation
-    of each channel's unknown bias, rad/s. Their correlation is unknown: an axis with
-    gains G is off by up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch
-    et al. 2015), whose square is at most n times the one of independent biases.
+    ``variance`` (n,) is that of the sample, (rad/s)^2. ``remaining`` (n,) is the
+    standard deviation of each channel's unknown bias, rad/s. The correlation of the
+    biases is unknown. An axis with gains G is off by up to ``sum |G_i| std(b_i)``, as
+    by the nominal biases of Blanch et al. (2015). The square of this sum is at most n
+    times the square for independent biases.
     """
     for i in range(n):
         growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (
@@ -53,13 +54,13 @@ def fill_growth(
 
 @compiled
 def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
-    """Protection level (3,) of the channels in mask, rad/s, from the growth of their errors (n,).
+    """Write the protection level (3,) of the channels in mask, rad/s, for the growth (n,).
 
-    For fixed shares of the risk the level is the largest of functions that are concave
-    in the variances and of degree 1/2: of each the tangent is an upper bound, and among
-    the tangents at multiples of noise_std^2 the best one gives ``level sqrt(sum_i p_i
-    growth_i)`` with weights p that sum to one. ``subset.share`` has the largest p_i of
-    all these functions.
+    For fixed shares of the risk, the level is the largest of several functions that are
+    concave in the variances and homogeneous of degree 1/2. The tangent to each function
+    is an upper bound. Among the tangents at multiples of noise_std^2, the best one
+    gives ``level sqrt(sum_i p_i growth_i)`` with weights p that sum to one.
+    ``subset.share`` contains the largest p_i over all functions.
     """
     least, most = math.inf, 0.0
     for i in range(n):
@@ -83,13 +84,16 @@ def passes_test(
     growth: Array,
     residual: Array,
 ) -> bool:
-    """Whether the residuals (n,) of the channels in mask pass the separation test that the level rests on."""
+    """Return whether the residuals (n,) of the channels in mask pass the separation test.
+
+    The protection level presumes that they do.
+    """
     passes, least = True, math.inf
     for i in range(n):
         if mask >> i & 1:
             least = min(least, growth[i])
     for i in range(n):
-        # Usually this cheap bound decides.
+        # In most samples this cheap bound decides.
         if mask >> i & 1 and not abs(residual[i]) <= subset.limit[i] * math.sqrt(least):
             before = after = 0.0
             for j in range(n):
@@ -103,14 +107,15 @@ def passes_test(
     return passes
 
 
-# least share of a variance in its parity, and of A_ii A_jj in the determinant: else
-# none shows, or alike
+#: Smallest share of a channel's variance that must remain in its residual, and of
+#: A_ii A_jj in the determinant of a pair. Below it no residual shows the channel, or
+#: the two channels look alike.
 APART = 1e-3
 
 
 @compiled
 def cover_rivals(core: Core) -> None:
-    """Raise ``core.last.level`` to what holds if a name or the set is wrong; the covariance of the sample is known."""
+    """Raise ``core.last.level`` to a bound that also holds if a name or the set is wrong."""
     now, decision, n = core.now, core.decision, core.settings.n
     fill_parity(now.parity, core.settings.sensors, now.fused, now.uncertainty)
     chi = chi_of(now.parity, n, now.fused, now.corrected)
@@ -125,17 +130,17 @@ def cover_rivals(core: Core) -> None:
 class Rival(NamedTuple):
     """A rival of the declaration: one or two of the fused channels are faulty."""
 
-    first: int
-    second: int  #: the same channel where it is one
-    error: tuple[float, float]  #: estimated, rad/s
-    variance: tuple[float, float]  #: of the errors, (rad/s)^2
-    covariance: float  #: of the two, (rad/s)^2
-    log_odds: float  #: over its share of the risk
+    first: int  #: Channel, from 0.
+    second: int  #: Channel, from 0. Equal to ``first`` for a single fault.
+    error: tuple[float, float]  #: Estimated errors of both channels, rad/s.
+    variance: tuple[float, float]  #: Variances of the estimates, (rad/s)^2.
+    covariance: float  #: Covariance of the two estimates, (rad/s)^2.
+    log_odds: float  #: Logarithm of its odds, divided by its share of the risk.
 
 
 @compiled
 def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
-    """Chi-square z' A z of the channels in mask."""
+    """Return the chi-square z' A z of the channels in mask."""
     total = 0.0
     for i in range(n):
         for j in range(n):
@@ -146,16 +151,16 @@ def chi_of(parity: Parity, n: int, mask: int, z: Array) -> float:
 
 @compiled
 def cover(core: Core, out: int, chi: float) -> None:
-    """Raise the level to what holds if the channels ``out`` are healthy, and one or two of those fused are not.
+    """Raise the level for the rivals of ``out``: its channels healthy, one or two fused faulty.
 
-    ``chi``: chi-square of the channels fused.
+    ``chi`` is the chi-square of the fused channels.
     """
     n, now, information = core.settings.n, core.now, core.now.parity.information
     mask = now.fused | out
     fill_parity(now.parity, core.settings.sensors, mask, now.uncertainty)
     for i in range(n):
         now.rival[i] = dot_in(information[i], now.corrected, n, mask)
-    # Each channel of a set takes a degree of freedom out of chi.
+    # Each channel left out reduces the degrees of freedom of chi by one.
     gained = 0.5 * (chi - chi_of(now.parity, n, mask, now.corrected))
     rivals = number_in(now.fused, n) ** 2
     free = number_in(out, n) - 1.0
@@ -170,9 +175,12 @@ def cover(core: Core, out: int, chi: float) -> None:
 
 @compiled
 def cover_single(core: Core, i: int, base: float) -> None:
-    """Raise the level for a fault of channel i; ``base``: log odds where it explains nothing."""
+    """Raise the level for a fault of channel i.
+
+    ``base`` is the logarithm of the odds of a fault that explains no residual.
+    """
     information, u = core.now.parity.information[i, i], core.now.rival[i]
-    # With less no residual shows the channel.
+    # With less, no residual shows the channel.
     if information * core.now.uncertainty[i] > APART:
         log_odds = base + 0.5 * u * u / information
         cover_rival(
@@ -185,12 +193,12 @@ def cover_single(core: Core, i: int, base: float) -> None:
 
 @compiled
 def cover_pair(core: Core, i: int, j: int, base: float) -> None:
-    """Raise the level for faults of channels i and j; base as in `cover_single`."""
+    """Raise the level for faults of channels i and j, with base as in `cover_single`."""
     information, prior = core.now.parity.information, core.settings.prior
     a, b, c = information[i, i], information[j, j], information[i, j]
     u, v = core.now.rival[i], core.now.rival[j]
     determinant = a * b - c * c
-    # Of two that look alike one is enough.
+    # Two channels that look alike are covered by the single faults.
     if determinant > APART * a * b:
         error = (b * u - c * v) / determinant, (a * v - c * u) / determinant
         explained = 0.5 * (error[0] * u + error[1] * v)
@@ -201,7 +209,7 @@ def cover_pair(core: Core, i: int, j: int, base: float) -> None:
 
 @compiled
 def cover_rival(core: Core, rival: Rival) -> None:
-    """Widen the level of each axis to what holds if a rival is true."""
+    """Raise the level of each axis to a bound that holds if the rival is true."""
     if rival.log_odds <= 0.0:
         return
     now, last, parity = core.now, core.last, core.now.parity
@@ -221,13 +229,14 @@ def cover_rival(core: Core, rival: Rival) -> None:
 
 @compiled
 def update_level(core: Core, subsets: NDArray[Any]) -> None:
-    """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
+    """Update the protection level of the fused rate in this sample.
 
-    It is that of the rate with weights as expected, in the motion of this sample; by
-    how much the fused rate differs from that; and what passes for rate and shows in no
-    residual. There is none without a fused rate, while a doubtful channel has to be
-    fused for want of others, and where the separation test fails, whatever the verdict
-    is.
+    The level is a sum of three parts: the level of the rate with its expected weights,
+    the difference between that rate and the fused rate, and a bound on the errors that
+    all channels share, which no residual shows. The level is infinite without a fused
+    rate, while a doubtful channel is fused for want of others, and where the separation
+    test fails. If the level of the fused channels has not been calculated yet,
+    ``core.wanted`` is set to their mask.
     """
     last, now, subset = core.last, core.now, subsets[core.now.fused]
     passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused
@@ -247,7 +256,7 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             )
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
-            # The instant of any unit may be the right one.
+            # The units measure at different instants, and each may be the right one.
             apart = core.sample.estimate.spread * core.acceleration.value[a]
             last.level[a] += abs(apart)
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:

@@ -1,10 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every record of the sample path, in the order of a sample; `Core` is what one monitor has and remembers.
+"""All records of the sample path, in the order in which a sample passes them.
 
-Settings are in `PathSettings`, figures of the present sample alone in `Current`. Most
-of the rest is memory. Methods have records of their own.
+`Core` is the whole record of one monitor. Settings are in `PathSettings`, figures that
+last for one sample in `Current`. Most other fields are memory between samples. Detection
+methods have their own records.
 """
 
 from __future__ import annotations
@@ -35,42 +36,44 @@ from fdi_ros.compiling.compiled import (
     record,
 )
 
-MAX_PENDING = 1024  # messages of one unit that wait at most
-RING = (
-    MAX_PENDING + 2
-)  # messages kept of one unit: those that wait, one too many, and the one before them
-# kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz
+#: Largest number of waiting messages of one unit.
+MAX_PENDING = 1024
+#: Stored messages of one unit: the waiting ones, one too many, and the previous one.
+RING = MAX_PENDING + 2
+#: Samples stored to bring all units to the instant of the latest unit: 60 ms at 16 kHz.
 RESTAMP_SAMPLES = 1024
-BIAS_PORTIONS = 15  # into which the time of the average at the start is divided
-# that the window of the angular acceleration spans; of a longer one the last count
+#: Portions into which the time of the start-up average is divided.
+BIAS_PORTIONS = 15
+#: Largest number of samples in the window of the angular acceleration.
 ACCELERATION_SAMPLES = 1024
-DECISION_SAMPLES = 1000  # samples in the longest window of the votes
+#: Samples in the longest voting window.
+DECISION_SAMPLES = 1000
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
 
 @record
 class Inlet:
-    """What was counted of one input topic."""
+    """Counters of one input topic."""
 
     received: Whole  # messages
     malformed: Whole  # messages
-    error: Whole  # why the last malformed one was refused
-    stamp: Whole  # of the last good message, ns; `NEVER` where there was none
+    error: Whole  # reason why the last malformed message was refused
+    stamp: Whole  # of the last good message, ns, or `NEVER`
     lag: Whole  # least lag behind the other inputs since `NEVER` was written here, ns
 
 
 @record
 class Counters:
-    """What one unit has delivered; messages, but for the last two, which count samples."""
+    """Counts of the messages of one unit. The last two fields count samples."""
 
     received: Whole
-    duplicate: Whole  # the stamp of the message before, again
-    backward: Whole  # an older stamp than the message before
-    ahead: Whole  # a stamp ahead of the clock
-    jumped: Whole  # a stamp ahead of the common time by more than the timeout
-    late: Whole  # a stamp that the samples had already gone past
-    interpolated: Whole
-    missing: Whole
+    duplicate: Whole  # same stamp as the previous message
+    backward: Whole  # older stamp than the previous message
+    ahead: Whole  # stamp ahead of the clock
+    jumped: Whole  # stamp ahead of the common time by more than the timeout
+    late: Whole  # stamp older than the last sample
+    interpolated: Whole  # samples
+    missing: Whole  # samples
 
 
 @record
@@ -79,33 +82,32 @@ class Accepted:
 
     stamp: Whole  # ns
     rate: Vector  # rad/s
-    force: Vector  # specific force, m/s^2; all NaN: the message has none
-    step: Whole  # since the message before, ns
-    bridges: Flag  # the span since the message before may be interpolated
+    force: Vector  # specific force, m/s^2, or NaN if the message has none
+    step: Whole  # since the previous message, ns
+    bridges: Flag  # the span since the previous message may be interpolated
 
 
 @record
 class Unit:
-    """One stream of messages: the last one that samples have passed, and those that wait.
+    """Messages of one unit: the waiting ones, and the last one that samples have passed.
 
-    Messages are numbered from 0 in each time base. Message k lies at k % `RING`.
+    Messages are numbered from 0 in each time base. Message k is at index k % `RING`.
     """
 
-    begin: Whole  # number of the first that waits; the one before it is the last passed
-    end: Whole  # number of the next
-    used: Whole  # number after the last that entered a sample as it is
+    begin: Whole  # number of the first waiting message
+    end: Whole  # number of the next message
+    used: Whole  # number after the last message that entered a sample unchanged
     usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
-    newest: Whole  # stamp of the last accepted message, ns, if any
-    lag: Whole  # how far the last stood behind the common time, ns
-    heard: Flag  # there was a message
+    newest: Whole  # stamp of the last accepted message, ns
+    lag: Whole  # of the last message behind the common time, ns
+    heard: Flag  # a message has come
     before: Whole  # stamp of the last message, accepted or not, ns
-    passed: Annotated[
-        NDArray[np.int64], "i8", (MAX_UNITS,)
-    ]  # by each other unit since the last accepted, ns
-    delay: Whole  # by how much its stamps are late, ns; taken off every one
-    leapt: Flag  # its stamps jumped back by more than the timeout, and none was accepted since
-    parted: Flag  # without a jump it has fallen behind the common time by more than the timeout
-    off: Flag  # the last messages stood outside the time base
+    # time that each other unit has gone on since the last accepted message, ns
+    passed: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]
+    delay: Whole  # of the stamps, subtracted from each, ns
+    leapt: Flag  # stamps jumped back by more than the timeout; none accepted since
+    parted: Flag  # fell behind the common time by more than the timeout without a jump
+    off: Flag  # the last messages were outside the time base
     off_first: Whole  # first stamp of the present run outside the time base, ns
     off_last: Whole  # last stamp of the run, ns
     off_rate: Vector  # rad/s
@@ -116,25 +118,28 @@ class Unit:
 
 @record
 class Aligner:
-    """What alignment remembers; stamps as in the messages, less the delay of their unit, without the shift."""
+    """Memory of the alignment.
+
+    Stamps are those of the messages less the delay of their unit, without the shift.
+    """
 
     n: Whole  # units
     max_skew: Whole  # ns
     timeout: Whole  # ns
-    bridge: Whole  # longest span that is interpolated, ns
+    bridge: Whole  # longest interpolated span, ns
     begun: Flag  # a message was accepted
-    common: Whole  # newest stamp that two units have reached, or the only ones that deliver, ns
+    common: Whole  # newest stamp that two units have reached, ns
     formed: Flag  # a sample was formed in this time base
     last: Whole  # stamp of the last sample, ns
-    shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
-    restarts: Whole  # times that the time base began anew
-    # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base
-    # moves after it
+    shift: Whole  # added to the stamps of samples, ns
+    restarts: Whole  # number of new time bases
+    # _IDLE: no sample before the next message. _RESTARTING: the time base moves after
+    # the next sample.
     phase: Whole
     force: Whole  # samples up to this stamp are formed without waiting, ns
-    moved_to: Whole  # stamp outside the time base where it begins anew, ns
-    rate: Vector  # of the message that is entered, rad/s
-    felt: Vector  # its specific force, m/s^2; all NaN: it has none
+    moved_to: Whole  # stamp at which the new time base begins, ns
+    rate: Vector  # of the message being entered, rad/s
+    felt: Vector  # specific force of that message, m/s^2, or NaN if it has none
     units: Annotated[list[Unit], MAX_UNITS]
 
 
@@ -143,11 +148,11 @@ class Sample:
     """One sample of all units, three channels each."""
 
     stamp: Whole  # ns
-    shift: Whole  # stamp minus that of the message, ns
-    z: Channels  # rad/s, NaN where nothing was received
-    received: Flags
-    force: Channels  # of the accelerometers, m/s^2, NaN where nothing was received
-    felt: Flags  # `received` of the accelerometers
+    shift: Whole  # stamp less that of the message, ns
+    z: Channels  # rates, rad/s, NaN where not received
+    received: Flags  # by gyro
+    force: Channels  # specific forces, m/s^2, NaN where not received
+    felt: Flags  # received, by accelerometer
 
 
 @record
@@ -160,58 +165,55 @@ class Sensors:
     scale_std: Channels  # 1
     timing_std: Channels  # s
     constant: Flag  # the variance depends on neither rate nor acceleration
-    gain: Axes  # row i: share of channel i in the least-squares rate, weights all equal
-    share: Channels  # S_ii: what of a channel's own error stays in its residual
+    gain: Axes  # row i: share of channel i in the least-squares rate of equal weights
+    share: Channels  # S_ii: share of a channel's own error in its residual
     detectable: Flags  # a fault of the channel reaches the parity vector
-    alike: Annotated[
-        NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)
-    ]  # channels that cannot be told apart
+    # pairs of channels that no residual distinguishes
+    alike: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]
 
 
 @record
 class Estimate:
-    """What the estimator knows of the errors of the sensors in a sample."""
+    """Estimated errors of the sensors in one sample."""
 
-    known: Flag  # the rest is of this sample
+    known: Flag  # the other fields belong to this sample
     checked: Mask  # channels whose uncertainty hides no fault
     corrected: Channels  # values less their estimated errors, rad/s
-    variance: Channels  # of their noise at the moment, (rad/s)^2
+    variance: Channels  # of the present noise, (rad/s)^2
     covariance: Square  # of the estimated errors, (rad/s)^2
-    # largest variance of a residual over the one expected, at least 1; only where it is
-    # asked for
+    # largest ratio of a residual's variance to the expected one, at least 1; valid only
+    # after `wants_excess`
     excess: Real
-    bias: Channels  # of each, beyond the one at the start, rad/s
-    bias_std: Channels  # standard deviation of that, rad/s
-    # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
-    late: Units
-    behind: Real  # by how much the values lie before the stamp, if the earliest unit is in time, s
+    bias: Channels  # in addition to the bias from the start, rad/s
+    bias_std: Channels  # standard deviation of `bias`, rad/s
+    late: Units  # certain delay of the stamps of each unit, s, which `restamp` corrects
+    behind: (
+        Real  # time from the values to the stamp, if the earliest unit is in time, s
+    )
     spread: Real  # largest delay between units, s
-    spikes: Counts  # of each channel so far: a few values far off, left out of the rate
+    spikes: Counts  # short outliers of each channel so far, left out of the rate
 
 
 @record
 class SampleInput:
     """A sample of one set of channels: values in order, without gaps.
 
-    Of a method that takes any set of channels: of all channels, those in ``mask`` are
-    there. Other masks and `bias_std` are of all channels that there are.
+    A method that takes any set of channels gets all channels, and ``mask`` has those
+    that are present. Other masks and `bias_std` refer to all channels.
     """
 
     stamp: Whole  # ns
     z: Channels  # rad/s
     mask: Mask
-    out: Mask  # channels taken out of use, which may be there all the same
-    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
+    out: Mask  # channels taken out of use, which may still be present
+    beyond: Mask  # channels out of range, or unusable in this sample by themselves
     acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # standard deviation of each channel's bias at first, rad/s
+    bias_std: Channels  # standard deviation of each channel's initial bias, rad/s
     interrupted: Flag  # a hole in the stream precedes this sample
     held: Flag  # a manoeuvre has just driven a channel out of range: evidence is void
-    # a unit gives old values against the motion of the others: no evidence is taken
-    repeated: Flag
+    repeated: Flag  # a unit repeats old values while the others move: no evidence
     wants_excess: Flag  # another method is to judge the corrected values
-    # filled by the method, if it estimates the errors of the sensors; until the next
-    # one it stands
-    estimate: Estimate
+    estimate: Estimate  # written by the estimator, valid until the next sample
 
 
 @record
@@ -219,21 +221,21 @@ class SampleVerdict:
     """Verdict of a method on one sample; channels as in `SampleInput`."""
 
     statistic: Real
-    threshold: Real  # alarm where the statistic reaches it
+    threshold: Real  # the statistic from which on the method alarms
     alarm: Flag
     isolated: Flag  # every suspect is faulty
     suspects: Flags
-    error: Channels  # estimated error of each suspect, rad/s; 0 elsewhere
-    scores: Channels  # the method's own figure per channel; NaN for one not judged
-    outliers: Flags  # too far off to be used in this sample, which is no alarm
-    noise: Channels  # lately, over noise_std, by a method that measures it; 0: not measured
+    error: Channels  # estimated error of each suspect, rad/s, otherwise 0
+    scores: Channels  # figure of the method for each channel, NaN if not judged
+    outliers: Flags  # too far off to be used in this sample, without an alarm
+    noise: Channels  # recent noise relative to noise_std, 0 if not measured
 
 
 @record
 class Bank:
-    """Where the constants and the memory of a method lie, and which row serves which channels."""
+    """Addresses of a method's constants and memory, and the row for each set of channels."""
 
-    n: Whole  # channels of all
+    n: Whole  # number of all channels
     takes_any: Flag  # the first row serves all sets of channels
     period: Whole  # of samples without stamps, ns
     clock: Whole  # stamp of the next sample without one, ns
@@ -243,9 +245,8 @@ class Bank:
     states: Whole  # address of the first row
     states_size: Whole  # bytes of a row
     rows: Whole  # rows in use
-    row: Annotated[
-        NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)
-    ]  # by the bits of the channels present
+    # row for each set of present channels, by its mask
+    row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]
     judged: SampleVerdict
 
 
@@ -263,40 +264,41 @@ class Condition(IntEnum):
 
 @record
 class Health:
-    """What the checks remember of the samples before, and how each channel fares in this one."""
+    """Memory of the checks of single channels, and their result in this sample."""
 
     begun: Whole  # samples so far
     stamp: Whole  # of the last sample, ns
-    value: Channels  # last finite value delivered, rad/s; NaN before the first
-    run_stamp: Stamps  # when it was first seen, ns
+    value: Channels  # last finite value delivered, rad/s, NaN before the first
+    run_stamp: Stamps  # when that value first came, ns
     received_stamp: Stamps  # of the last sample that the channel delivered, ns
-    limit: Channels  # values from here on are out of range, rad/s
+    limit: Channels  # size from which on a value is out of range, rad/s
     extreme: Channels  # largest size of a value so far, rad/s
-    repeats: Counts  # how often the last value has come in a row
+    repeats: Counts  # number of times the last value has come in a row
     bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
     condition: Flags  # `Condition` in this sample
-    counts: Annotated[
-        NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)
-    ]  # samples in each condition
+    # samples in each condition
+    counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
-    noisy: Counts  # samples in which it was much noisier than the other units
-    usual_noise: Channels  # over noise_std: of late, what is louder counting slowly
-    gone: Channels  # share of the values lately received that are not finite
-    absent: Channels  # share of the samples lately without a value
-    lapses: Channels  # how often lately one without a value came after one with it
-    complete_stamp: Stamps  # since when hardly a sample is without a value, ns
-    complete: Mask  # channels that were so for long
-    returning: Counts  # values that are still left out of the rate after one that is not finite
-    leaves: Channels  # how often lately one that is not finite came after one that is
-    # smallest change of the value so far, rad/s: the step of a quantised sensor; 0
-    # before any
+    noisy: Counts  # samples in which the channel was much noisier than the other units
+    usual_noise: (
+        Channels  # recent noise relative to noise_std, slow to follow increases
+    )
+    gone: Channels  # share of non-finite values among the recent ones
+    absent: Channels  # share of recent samples without a value
+    lapses: Channels  # recent number of samples without a value after one with a value
+    complete_stamp: Stamps  # since when nearly every sample has a value, ns
+    complete: Mask  # channels with a value in nearly every sample for long
+    returning: Counts  # values still left out of the rate after a non-finite one
+    leaves: Channels  # recent number of non-finite values after a finite one
+    # smallest change of the value so far, rad/s, 0 before any: the step of a quantised
+    # sensor
     step: Channels
 
 
 @record
 class BufferedSample:
-    """One sample as it was aligned."""
+    """One aligned sample."""
 
     stamp: Whole  # ns
     values: Channels  # rad/s
@@ -315,27 +317,24 @@ class DelayBuffer:
 
 @record
 class Copies:
-    """Units that give the values of another one."""
+    """Units that deliver the values of another unit."""
 
     stamp: Whole  # of the last comparison, ns
-    hits: Annotated[
-        NDArray[np.int64], "i8", (MAX_UNITS, MAX_UNITS)
-    ]  # comparisons in which two units agreed
-    original: Annotated[
-        NDArray[np.int64], "i8", (MAX_UNITS,)
-    ]  # number from 1 of the unit that each repeats; 0: none
-    channels: Mask  # of the units that repeat another one
-    found: Flag  # in the last sample: all that was declared may rest on it
-    # While two are compared:
-    change: Annotated[NDArray[np.float64], "f8", (6,)]  # of either's channels, rad/s
-    products: Annotated[
-        NDArray[np.float64], "f8", (6, 6)
-    ]  # sums of products of the changes, (rad/s)^2
+    # number of comparisons in which two units agreed
+    hits: Annotated[NDArray[np.int64], "i8", (MAX_UNITS, MAX_UNITS)]
+    # number, from 1, of the unit that each unit repeats, or 0
+    original: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]
+    channels: Mask  # of the units that repeat another unit
+    found: Flag  # found in the last sample: earlier declarations may rest on it
+    # During a comparison of two units: changes of the channels of both, rad/s, and sums
+    # of products of the changes, (rad/s)^2
+    change: Annotated[NDArray[np.float64], "f8", (6,)]
+    products: Annotated[NDArray[np.float64], "f8", (6, 6)]
 
 
 @record
 class ValueGroup:
-    """Values of one channel that are taken together."""
+    """Consecutive values of one channel, averaged as one."""
 
     count: Whole
     total: Real  # rad/s
@@ -346,7 +345,7 @@ class ValueGroup:
 
 @record
 class Portion:
-    """Groups of each channel that ended in one portion of the time."""
+    """Groups of each channel that ended in one portion of the averaging time."""
 
     count: Counts  # groups
     total: Channels  # of their means, rad/s
@@ -355,15 +354,13 @@ class Portion:
 
 @record
 class Bias:
-    """Bias of each channel, and the average that is being taken."""
+    """Bias of each channel, and the average in progress."""
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
-    # channels of which it is valid: the others were lost, silent or restless at that
-    # time
-    known: Mask
+    known: Mask  # channels with a valid bias; others were lost, silent or restless
     duration: Whole  # of the average, ns
-    centre: Channels  # what each average is expected about, rad/s
+    centre: Channels  # expected average, rad/s
     max_rate: Real  # mean at rest, rad/s
     max_std: Channels  # at rest, rad/s
     turn_ratio: Channels  # largest C / s^2 at rest of k channels, at k - 1
@@ -376,39 +373,40 @@ class Bias:
     count: Counts  # values of each channel
     groups: Annotated[list[ValueGroup], MAX_CHANNELS]  # of each channel, not ended
     portions: Annotated[list[Portion], BIAS_PORTIONS]
-    outcome: Small  # where the bias comes from; or why the last average was refused
+    outcome: Small  # source of the bias, or reason why the last average was refused
     average: Channels  # of the last average, rad/s
     scatter: Channels  # of the last average, rad/s
     heard: Mask  # channels that gave enough values in the last average
     restless: Mask  # heard channels that were not at rest
-    common_rate: Real  # that the averages agree on, rad/s
-    max_common_rate: Real  # at rest, with biases as those seemed to be, rad/s
-    sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
-    max_sway: Real  # at rest, rad/s
-    # While an average is concluded:
-    ordered: Annotated[
-        NDArray[np.float64], "f8", (BIAS_PORTIONS,)
-    ]  # values being sorted
-    part: Channels  # values to be split into what a rate explains and the rest, rad/s
-    turn: Vector  # the rate that explains them, rad/s
-    middle: Channels  # sum of the means of the portions used, rad/s
+    common_rate: Real  # rate on which the averages agree, rad/s
+    max_common_rate: Real  # largest at rest, with the biases found, rad/s
+    sway: Real  # deviation of the portions explained by a rate, per channel, rad/s
+    max_sway: Real  # largest at rest, rad/s
+    # While an average is concluded: values being sorted; values being split into a rate
+    # and the rest, rad/s; that rate, rad/s; sum of the means of the portions used, rad/s
+    ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]
+    part: Channels
+    turn: Vector
+    middle: Channels
 
 
 @record
 class Subset:
-    """Weighted least squares over one set of channels; zero for the others."""
+    """Weighted least squares over one set of channels. Zero for channels outside the set."""
 
     gain: Axes  # row i: share of channel i in the rate, weights 1 / noise_std^2
-    sensitivity: Channels  # what of a channel's own error stays in its residual, 0 to 1
+    sensitivity: Channels  # share of a channel's own error in its residual, 0 to 1
     spans: Flag  # the channels span space
-    spare: Flag  # well enough to leave the others out for a mere suspicion
-    refused: Flag  # enough channels, and the method cannot run on them
-    detectable: Mask  # channels whose fault the method sees
-    has_level: Flag  # level and limit were worked out
-    # protection level of each body axis while all errors are as noise_std says, rad/s
+    spare: Flag  # the geometry suffices to leave the others out on mere suspicion
+    refused: Flag  # enough channels, but the method cannot run on them
+    detectable: Mask  # channels whose fault the method detects
+    has_level: Flag  # level, limit and share are calculated
+    # protection level of each body axis if all errors have noise_std, rad/s
     level: Vector
-    limit: Channels  # largest residual that passes the separation test then, rad/s
-    share: Axes  # row i: weight of the variance of channel i in the level of each axis, at most
+    limit: Channels  # largest residual that then passes the separation test, rad/s
+    share: (
+        Axes  # row i: largest weight of channel i's variance in the level of each axis
+    )
 
 
 @record
@@ -416,65 +414,66 @@ class TimedRate:
     """A body rate and its time."""
 
     stamp: Whole  # ns
-    rate: Vector  # rad/s; NaN where there was none
+    rate: Vector  # rad/s, or NaN
 
 
 @record
 class Acceleration:
     """Rates of the last samples.
 
-    The acceleration is the difference of the rate to the latest sample at least
-    `window` older that had one. Over one sample at 1 kHz a fault's own step would make
-    so much of it that the timing term hides the fault.
+    The acceleration is the difference between the present rate and the rate of the
+    latest sample with a rate that is older by at least `window`. Over one sample at
+    1 kHz the step of a fault would give such a large acceleration that the timing term
+    would hide the fault.
     """
 
     window: Whole  # ns
     count: Whole  # samples so far
-    oldest: Whole  # number of the sample that the difference is taken to
-    history: Annotated[
-        list[TimedRate], ACCELERATION_SAMPLES
-    ]  # by number of the sample, modulo `ACCELERATION_SAMPLES`
-    known: TimedRate  # last rate there was up to the oldest
-    has_known: Whole  # 0: there was none yet
-    value: Vector  # rad/s^2; zero where it is not known
+    oldest: Whole  # number of the sample at the start of the difference
+    # by number of the sample, modulo `ACCELERATION_SAMPLES`
+    history: Annotated[list[TimedRate], ACCELERATION_SAMPLES]
+    known: TimedRate  # last rate up to the oldest sample
+    has_known: Whole  # 1 if `known` is valid
+    value: Vector  # rad/s^2, zero if unknown
 
 
 @record
 class Parity:
-    """Information A and gain G, and the room to work them out."""
+    """Information A and gain G, and working memory for both."""
 
-    information: Square  # A, s^2/rad^2; until then room
+    information: Square  # A, s^2/rad^2, first used as working memory
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # G
     weight: Square  # W = M^-1, s^2/rad^2
-    place: Counts  # channels that are there, in order
-    weighted: Axes  # W H, s^2/rad^2; also room
+    place: Counts  # present channels, in order
+    weighted: Axes  # W H, s^2/rad^2, also used as working memory
     normal: Matrix
     inverse: Matrix
 
 
 @record
 class Evidence:
-    """What the decision gets of one sample."""
+    """Input of the decision from one sample."""
 
     stamp: Whole  # ns
-    suspected: (
-        Mask  # suspects of the verdict; where evidence decides, channels that are stuck
-    )
-    outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
+    # suspects of the verdict, or, if accumulated evidence decides, stuck channels
+    suspected: Mask
+    outliers: Mask  # channels too far off to be used now, without a declaration
     isolated: Flag  # every suspect is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
-    undecided: Mask  # a set that holds a faulty one, by accumulated evidence
-    drifted: Mask  # channels whose bias is surely beyond what a bias may be
-    judged: Flag  # there was a verdict
-    held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
+    undecided: Mask  # a set that contains a faulty one, by accumulated evidence
+    drifted: Mask  # channels whose bias is certainly beyond `max_drift`
+    judged: Flag  # the method gave a verdict
+    held: Flag  # an alarm is suspicion only and counts towards no declaration
     interrupted: Flag  # a hole in the stream precedes this sample
     checked: Mask  # channels whose fault would have shown
-    agrees: Mask  # channels that agree with the others; looked at for declared ones
-    broken: Mask  # channels that have given nothing but non-finite values for long
+    agrees: Mask  # channels that agree with the others, used for declared ones
+    broken: Mask  # channels with only non-finite values for long
     flickers: Mask  # channels whose values seem to come and go
-    intermittent: Mask  # channels of which that is certain
+    intermittent: Mask  # channels whose values certainly come and go
     repeats: Mask  # channels that have repeated one value for long
-    error: Channels  # each channel minus the rate of the channels in use along its axis, rad/s
+    error: (
+        Channels  # channel less the rate of the channels in use, along its axis, rad/s
+    )
 
 
 @record
@@ -482,24 +481,22 @@ class Decision:
     """Declarations, and the alarms of the last window."""
 
     faulty: Mask  # declared faulty
-    ambiguous: Mask  # a set one of which is faulty
+    ambiguous: Mask  # a set that contains a faulty channel
     voted: Mask  # part of the set declared by votes
-    why: Flags  # why each channel was declared
-    at: Whole  # place of the last sample in the window
-    sets: Annotated[
-        NDArray[np.int64], "i8", (4, DECISION_SAMPLES)
-    ]  # of each sample of the window, by kind
-    count: Annotated[
-        NDArray[np.int64], "i8", (4, MAX_CHANNELS)
-    ]  # samples of the window whose set holds a channel, by kind
+    why: Flags  # reason for the declaration of each channel
+    at: Whole  # index of the last sample in the window
+    # channels of each sample of the window, by kind of evidence
+    sets: Annotated[NDArray[np.int64], "i8", (4, DECISION_SAMPLES)]
+    # samples of the window whose set contains a channel, by kind of evidence
+    count: Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
     alarms: Whole  # samples of the window with an alarm that counts
-    last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
-    renewed: Stamps  # when the sum of its errors was begun, ns
+    last_bad: Stamps  # last disagreement or unusable sample of a declared channel, ns
+    renewed: Stamps  # start of the present sum of its errors, ns
     error_sum: Channels  # of its errors since then, rad/s
     error_count: Counts  # of its samples since then
-    earlier_sum: Channels  # of its errors in the clean time before that, rad/s
-    earlier_count: Counts
-    last_doubt: Whole  # last sample with an alarm, or that could not be judged, ns
+    earlier_sum: Channels  # of its errors in the previous clean time, rad/s
+    earlier_count: Counts  # of its samples in the previous clean time
+    last_doubt: Whole  # last sample with an alarm or without a verdict, ns
     suspicion: Mask  # named by an alarm in the window
 
 
@@ -508,18 +505,18 @@ class OutputRow:
     """Results of one sample."""
 
     stamp: Whole  # ns
-    instant: Whole  # that the rate is of, ns: before the stamp, where units are late
-    rate: Vector  # fused body rate, rad/s; NaN without one
-    covariance: Symmetric  # of the fused rate, (rad/s)^2; NaN without one
+    instant: Whole  # of the rate, ns: before the stamp if units are late
+    rate: Vector  # fused body rate, rad/s, or NaN
+    covariance: Symmetric  # of the fused rate, (rad/s)^2, or NaN
     valid: Flag  # a fused rate exists
-    alarm: Flag  # the detector's, before confirmation
+    alarm: Flag  # of the detector, before confirmation
     state: Flags  # `ChannelState` after the sample
-    statistic: Real  # the detector's; NaN where the sample could not be judged
-    threshold: Real  # the detector's; NaN where the sample could not be judged
-    # bias-free channel minus fused rate along its axis, rad/s; NaN where either is
+    statistic: Real  # of the detector, NaN if the sample could not be judged
+    threshold: Real  # of the detector, NaN if the sample could not be judged
+    # bias-free channel less the fused rate along its axis, rad/s, NaN if either is
     # missing
     residual: Channels
-    level: Vector  # protection level of the fused rate, rad/s; infinite where unknown
+    level: Vector  # protection level of the fused rate, rad/s, infinite if unknown
 
 
 @record
@@ -532,124 +529,104 @@ class EventRow:
     before: Small  # `ChannelState`
     after: Small  # `ChannelState`
     reason: Small  # place in `REASONS`
-    group: Mask  # AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone
-    # estimated error in the unit of the quantity; 0 where the reason is neither
-    # disagreement nor drift
+    group: Mask  # the channel, or if AMBIGUOUS the set that contains the faulty one
+    # estimated error in the unit of the quantity, 0 unless the reason is disagreement
+    # or drift
     error: Real
 
 
 @record
 class PathSettings:
-    """Settings, which samples do not change. A change of the detector changes some."""
+    """Settings, constant over samples. A change of the detector changes some of them."""
 
     n: Whole  # channels
-    first: Whole  # number of the first of them among all channels of the monitor
-    # what 1 rad/s stands for in the unit of the quantity: values are divided by it as
-    # they enter
+    first: Whole  # number of the first channel among all channels of the monitor
+    # size in the unit of the quantity that corresponds to 1 rad/s: values are divided
+    # by it on entry
     natural: Real
-    places: Counts  # of each accelerometer among those of a sample
+    places: Counts  # index of each accelerometer in a sample
     arms: Axes  # position of each accelerometer from the first unit, m
-    lever: Flag  # any of them is not zero
+    lever: Flag  # a position is not zero
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
-    members: Annotated[
-        NDArray[np.int64], "i8", (MAX_UNITS,)
-    ]  # bits of the channels of each
-    # Of the checks:
+    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # mask of each unit
+    # Checks of single channels:
     max_rate: Channels  # rad/s
     non_finite_time: Whole  # ns
-    stuck_time: Whole  # ns; 0: never stuck
-    frozen_time: Whole  # ns; 0: never frozen
+    stuck_time: Whole  # ns, 0: no check
+    frozen_time: Whole  # ns, 0: no check
     stale_time: Whole  # ns
     recovery_time: Whole  # ns
-    # When a fault is declared, and whether it is forgiven:
-    # an alarm is accumulated evidence, and declares at once; votes count for stuck
+    # Declaration and recovery:
+    # an alarm is accumulated evidence and declares at once; votes are for stuck
     # channels only
     by_evidence: Flag
-    alarms: Whole  # that confirm a fault
-    window: Whole  # samples among which they count
+    alarms: Whole  # number that confirms a fault
+    window: Whole  # samples in which alarms are counted
     latch: Flag
     clean_time: Whole  # ns
-    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
-    # largest difference of a channel that agrees again, in its standard deviations
-    return_limit: Real
+    mean_limit: Channels  # largest mean error of a channel that recovers, rad/s
+    return_limit: Real  # largest difference of a channel that recovers, in its std
     period: Real  # of the samples, s
-    # Of estimate and fusion:
-    publish_under_doubt: (
-        Flag  # a rate of channels under doubt, where they cannot be left out
-    )
-    # the alarms of the estimator's own detector declare, not those of another method
-    guard_declares: Flag
-    max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
-    risk: (
-        Real  # allowed probability of an error above the level at a sample; 0: no level
-    )
-    reach: Real  # standard deviations that it stands for
-    prior: Channels  # odds that a channel is faulty unnoticed
+    # Estimate and fusion:
+    publish_under_doubt: Flag  # fuse doubted channels that cannot be left out
+    guard_declares: Flag  # alarms of the estimator's own detector declare
+    max_drift: Real  # a larger bias is a fault, rad/s, 0: no limit
+    risk: Real  # allowed probability of an error above the level, 0: no level
+    reach: Real  # standard deviations that correspond to the risk
+    prior: Channels  # odds that a channel has an unnoticed fault
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
-    learned: Channels  # of one averaged at the start, standard deviation, rad/s
+    learned: Channels  # standard deviation of a bias averaged at the start, rad/s
 
 
 @record
 class Current:
-    """Of the sample on its way; of an earlier one only whether it still waits for the detector."""
+    """Figures of the present sample. Only `waiting` refers to the previous one."""
 
-    repeated: Mask  # channels of units that give old values in this sample
+    repeated: Mask  # channels of units that repeat old values in this sample
     all_repeat: Flag  # all channels repeat their values
-    noisy: Mask  # channels much noisier than expected, and than the others
-    waiting: Flag  # `prepare_sample` is done, the detector is to follow
-    learned_from: (
-        Flag  # the bias was learned from the sample, and nothing else is done with it
-    )
-    aligned: Channels  # values of the instant that it stands for, rad/s
-    # values less errors estimated at the last sample, after the estimator now, rad/s
+    noisy: Mask  # channels much noisier than expected and than the others
+    waiting: Flag  # `prepare_sample` is done, and the detector follows
+    learned_from: Flag  # the sample served only to learn the bias
+    aligned: Channels  # values at the instant of the sample, rad/s
+    # values less the errors estimated at the last sample, or by the estimator now, rad/s
     corrected: Channels
-    input: Channels  # values of all channels as the detector takes them, rad/s
+    input: Channels  # values of all channels for the detector, rad/s
     plain: Mask  # delivered and in range
     in_use: Mask  # plain and in use
-    usable: Mask  # in use and fine by themselves
-    doubtful: Mask  # channels suspected, or of a set, in this sample or just before
-    fused: Mask  # channels whose least-squares rate is given
-    withheld: Flag  # there would be a rate, but of channels under doubt
+    usable: Mask  # in use and without a defect of their own
+    doubtful: Mask  # channels suspected or in a set, in this sample or just before
+    fused: Mask  # channels in the fused rate
+    withheld: Flag  # the only possible rate would contain doubted channels
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
-    others_rate: (
-        Vector  # of the channels by which motion is measured in `update_stuck`, rad/s
-    )
-    # sum of the squares by which the others of each channel disagree, (rad/s)^2
+    others_rate: Vector  # rate by which `update_stuck` measures motion, rad/s
+    # sum of squared residuals of the other channels, for each channel, (rad/s)^2
     disagreement: Channels
     doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
-    shared_error: (
-        Axes  # C G', covariance of each channel's error with the rate's, (rad/s)^2
-    )
-    prediction: (
-        Channels  # of each channel by the others, rad/s; NaN where they give none
-    )
-    variance: (
-        Channels  # of noise and what else differs from sample to sample, (rad/s)^2
-    )
-    uncertainty: (
-        Channels  # `variance` plus the variance of the estimated errors, (rad/s)^2
-    )
+    shared_error: Axes  # C G', covariance of channel errors with the rate, (rad/s)^2
+    prediction: Channels  # of each channel by the others, rad/s, or NaN
+    variance: Channels  # of noise and other errors of single samples, (rad/s)^2
+    uncertainty: Channels  # `variance` plus that of the estimated errors, (rad/s)^2
     parity: Parity
     rival: Channels  # A z of channels fused and left out, s/rad
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate
-    tested: Channels  # differences from the rate with weights as expected, rad/s
-    common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
-    lagging: Vector  # change of the rate up to the instant that is stated, rad/s
-    plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
+    tested: Channels  # residuals of the rate with expected weights, rad/s
+    common: Symmetric  # covariance of the rate from the estimated errors, (rad/s)^2
+    lagging: Vector  # change of the rate up to the stated instant, rad/s
+    plain_rate: Vector  # of the fused channels with expected weights, rad/s
     growth: Channels  # error variance with the remaining bias, in noise_std^2
     guard: SampleVerdict  # of the estimator's own detector
     verdict: SampleVerdict  # of the method that declares
-    scaled: Channels  # corrected values with residuals in the noise expected, rad/s
-    asked: SampleInput  # corrected values, where another method declares
+    scaled: Channels  # corrected values, residuals scaled to the expected noise, rad/s
+    asked: SampleInput  # corrected values for another method that declares
     evidence: Evidence
 
 
 @record
 class Core:
-    """What one monitor has beside its detector, its table of sets and its inputs."""
+    """Settings and memory of one monitor, except detector, table of sets and inputs."""
 
     settings: PathSettings
     health: Health
@@ -657,56 +634,46 @@ class Core:
     line: DelayBuffer
     copies: Copies
     sample: SampleInput  # input of the estimator and its detector, with the estimate
-    unit_rate: Annotated[
-        NDArray[np.float64], "f8", (MAX_UNITS, 3)
-    ]  # when each unit last gave a new value, rad/s
-    correction: (
-        Channels  # last estimated error of each channel, taken off its value, rad/s
-    )
-    # what residuals show of the unknown errors of each channel, standard deviation,
-    # rad/s
-    remaining: Channels
+    # rate at the last new value of each unit, rad/s
+    unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
+    correction: Channels  # last estimated error, subtracted from each channel, rad/s
+    remaining: Channels  # standard deviation of unknown errors by the residuals, rad/s
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
-    # prediction of each channel by the others when its present value was first seen,
-    # rad/s; or NaN
+    # prediction by the others when the present value of each channel first came, rad/s,
+    # or NaN
     reference: Channels
     witnesses: Counts  # channels that the reference of each is predicted from
     saturated: Flag  # a manoeuvre has driven a channel out of range
-    saturated_stamp: Whole  # last sample of that, ns
+    saturated_stamp: Whole  # last sample with a saturated channel, ns
     samples: Whole  # so far
     last_stamp: Whole  # of the last sample, ns
     state: Flags  # `ChannelState` after the last sample
     reason: Flags  # of each state, place in `REASONS`
-    since: Stamps  # of the sample that brought the state, ns
-    group: Mask  # after the last sample: the channels one of which is faulty
-    error: Channels  # estimated error when the state came, rad/s
-    wanted: (
-        Mask  # channels fused whose protection level is still to be worked out; 0: none
-    )
+    since: Stamps  # start of the present state, ns
+    group: Mask  # set that contains a faulty channel, after the last sample
+    error: Channels  # estimated error at the start of the present state, rad/s
+    wanted: Mask  # fused channels whose protection level must be calculated, or 0
     last: OutputRow
     now: Current
-    given: Sample  # the sample on its way, its values as the path takes them
-    # half of the monitor that is to work the sample: 0 gyros, 1 accelerometers
-    half: Whole
+    given: Sample  # the present sample, with values in the unit of the path
+    half: Whole  # half of the monitor that takes the sample: 0 gyros, 1 accelerometers
 
 
 @record
 class Live:
-    """What a live monitor needs beside its record."""
+    """Memory of a live monitor in addition to `Core`."""
 
-    fused_at: Whole  # where the rate begins in the fused message
-    integrity_at: Whole  # where the values begin in the integrity message
+    fused_at: Whole  # offset of the rate in the fused message, bytes
+    integrity_at: Whole  # offset of the values in the integrity message, bytes
     channels: Whole  # of all inputs
-    ready: Flag  # a sample is to be worked
+    ready: Flag  # a sample is ready for the pipeline
     sample: Sample
     events: Whole  # of the last sample
-    shift: Whole  # to be taken off the stamp of the last sample to have that of its message, ns
+    shift: Whole  # stamp of the last sample less that of its message, ns
     without_rate: Whole  # samples
     last_stamp: Whole  # of the last array, ns
-    clock_shift: (
-        Whole  # added to the stamps of arrays, ns; 0 until the clock was set back
-    )
-    restarts: Whole  # times that it was
+    clock_shift: Whole  # added to the stamps of arrays, ns
+    restarts: Whole  # number of times that the clock was set back
     inlets: Annotated[list[Inlet], MAX_UNITS]
