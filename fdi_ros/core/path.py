@@ -6,9 +6,9 @@
     values -> checks -> bias -> rate -> estimator and its detector -> other method ->
     decision -> fused rate -> states -> protection level
 
-`prepare_sample` is the path up to the detector, `conclude_sample` the rest. Between
-them the sample waits if the constants of the detector for just the channels present are
-still to be prepared, which happens once for each set of channels.
+`prepare_sample` is the path up to the detector, and `conclude_sample` is the rest. In
+between, the sample waits if the detector has no constants yet for the present set of
+channels. They are prepared once for each set.
 """
 
 from __future__ import annotations
@@ -42,31 +42,33 @@ from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
 from fdi_ros.core.subsets import fill_rate
 
-NOISY = 3.0  # times the noise expected from which a channel is noisy: its weight is then a tenth
-# and this many times every channel of the other units: body vibration never shows on
-# one unit only
+#: A channel is noisy from this multiple of the expected noise on: its weight in the
+#: rate is then a tenth.
+NOISY = 3.0
+#: A noisy channel must also exceed every channel of the other units by this factor:
+#: vibration of the body shows on more than one unit.
 NOISIER = 1.4
-# share of the range: where the others predict less, a value out of range is a fault
+#: Share of the range. If the others predict less, a value out of range is a fault.
 RAIL_MARGIN = 0.9
-LOUD = 1.5  # times the noise expected, below which a channel is not noisy
-# time constants of the usual noise where noise is louder, and quieter, s
+#: Multiple of the expected noise below which a channel is never noisy.
+LOUD = 1.5
+#: Time constants with which the usual noise follows more and less noise, s.
 LOUDER_TIME, QUIETER_TIME = 120.0, 10.0
-# ranges that the detector sees of a value out of range at most: any shows as well
+#: A value out of range is limited to this many ranges before the detector sees it.
 RAIL_LIMIT = 10.0
-WAITING = -1  # instead of a number of events
+WAITING = -1  #: Returned in place of a number of events.
 
 
 class Path(NamedTuple):
-    """What the path works on."""
+    """Arrays of one half of a monitor."""
 
-    core: NDArray[Any]  #: the monitor, (1,) `Core`
-    subsets: NDArray[Any]  #: all sets of channels, (2^n,) `Subset`
-    guard: NDArray[Any]  #: detector that keeps the estimator, (1,) `Bank`
-    guard_memory: NDArray[np.uint8]  #: bytes of its states
-    method: NDArray[
-        Any
-    ]  #: detector whose alarms declare, (1,) `Bank`: the guard or another
-    method_memory: NDArray[np.uint8]  #: bytes of its states
+    core: NDArray[Any]  #: Settings and memory, (1,) `Core`.
+    subsets: NDArray[Any]  #: All sets of channels, (2^n,) `Subset`.
+    guard: NDArray[Any]  #: Detector of the estimator, (1,) `Bank`.
+    guard_memory: NDArray[np.uint8]  #: Bytes of its states.
+    #: Detector whose alarms declare, (1,) `Bank`: the guard or another one.
+    method: NDArray[Any]
+    method_memory: NDArray[np.uint8]  #: Bytes of its states.
 
 
 @compiled
@@ -79,15 +81,33 @@ def run(
     events: NDArray[Any],
     stop_at_event: bool,
 ) -> tuple[int, int, bool]:
-    """Work samples (N,) one after the other, from row `start` on, into ``outs`` (N,) `OutputRow`; stamps increase.
+    """Process samples one after the other, from row `start` on. Stamps increase.
 
-    ``paths``, ``outs``: gyros, accelerometers; the latter count for nothing where
-    ``halves`` is 1. Work ends when too few of ``events``, `EventRow`, are free; with
-    `stop_at_event` after the first sample that brings one. Returned are the row at
-    which it ended, N if all is done; the number of events; and whether something must
-    be prepared. If it is the detector, for ``sample.mask`` of a core, the row was not
-    worked to its end, and ``now.waiting`` is set; if the row before it lacks its level,
-    the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
+    Parameters
+    ----------
+    paths
+        Gyros and accelerometers.
+    halves
+        1 for gyros alone, 2 for both.
+    samples
+        Samples, (N,).
+    start
+        First row to process.
+    outs
+        Receive the results of gyros and accelerometers, each (N,) `OutputRow`.
+    events
+        Receives the changes of state, (E,) `EventRow`. Processing ends if too few rows
+        are free.
+    stop_at_event
+        End after the first sample with an event.
+
+    Returns
+    -------
+    tuple
+        Row at which processing ended, N at the end. Number of events. Whether the
+        caller must prepare something: a detector for ``sample.mask`` of a core with
+        ``now.waiting``, whose row is not finished; the level of the row before, for the
+        channels in ``core.wanted``; or copies, with ``core.copies.found``.
     """
     room = count = 0
     for half in range(halves):
@@ -116,10 +136,10 @@ def step_halves(
     events: NDArray[Any],
     count: int,
 ) -> tuple[int, bool]:
-    """Work one sample through the gyros, then through the accelerometers.
+    """Process one sample of the gyros, then of the accelerometers.
 
-    Returned are the number of events, and whether a detector must be prepared: then
-    give the sample again, and it goes on with that half.
+    Return the number of events, and whether a detector must be prepared. After that
+    the same sample must be passed again; processing continues with the same half.
     """
     gyros = paths[0].core[0]
     while gyros.half < halves:
@@ -138,7 +158,7 @@ def step_halves(
 
 @compiled
 def wants_supply(paths: tuple[Path, Path], halves: int) -> bool:
-    """Whether a half lacks the level of its last sample, or has found copies."""
+    """Return whether a half lacks the level of its last sample, or has found copies."""
     wants = False
     for half in range(halves):
         core = paths[half].core[0]
@@ -148,7 +168,11 @@ def wants_supply(paths: tuple[Path, Path], halves: int) -> bool:
 
 @compiled
 def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int) -> int:
-    """Work one sample; the output is ``core.last``. Return the number of events, or `WAITING`: then give it again."""
+    """Process one sample; the result is ``core.last``.
+
+    Return the number of events, or `WAITING`: then the same sample must be passed again
+    after the detector was prepared.
+    """
     core, method = path.core[0], path.method[0]
     now = core.now
     if not now.waiting:
@@ -168,18 +192,19 @@ def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int)
 
 @compiled
 def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
-    """Let a detector forget all samples. A loop: the assignment of a slice takes seconds to compile."""
+    """Clear the memory of a detector."""
+    # A loop, because the assignment of a slice takes seconds to compile.
     for k in range(bank.rows * bank.states_size):
         memory[k] = 0
 
 
 @compiled
 def prepare_sample(path: Path, sample: Sample) -> None:
-    """Check a sample, learn the bias from it, or correct it and find what the detector is to see.
+    """Check a sample; then learn the bias from it, or prepare the input of the detector.
 
-    The checks see the values as delivered, so that they act at once. Where units are
-    late the values judged are those of an earlier instant, of this and earlier samples
-    that were checked, too.
+    The checks use the values as delivered, so that they act at once. If units are late,
+    the detector gets values of an earlier instant, interpolated between this and
+    earlier samples, which were checked as well.
     """
     core, subsets = path.core[0], path.subsets
     settings, now, stamp = core.settings, core.now, sample.stamp
@@ -222,7 +247,10 @@ def prepare_sample(path: Path, sample: Sample) -> None:
 
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
-    """Fill ``now.aligned`` with values of one instant; return bits of channels in range, and of those fine."""
+    """Fill ``now.aligned`` with values of one instant.
+
+    Return the masks of the channels in range, and of the channels without a defect.
+    """
     settings, aligned = core.settings, core.now.aligned
     delivered = inside = plain = fine = 0
     for i in range(settings.n):
@@ -249,7 +277,10 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 
 @compiled
 def learn_bias(path: Path, stamp: int, plain: int) -> None:
-    """Offer a sample to the start-up average; ``now.learned_from``: the average took the sample."""
+    """Pass a sample to the start-up average.
+
+    ``now.learned_from`` is set if the average uses the sample.
+    """
     core, subsets = path.core[0], path.subsets
     bias = core.bias
     core.now.learned_from = update_bias(core, subsets, stamp, plain, left_out(core))
@@ -263,7 +294,7 @@ def learn_bias(path: Path, stamp: int, plain: int) -> None:
 
 @compiled
 def apply_estimate(core: Core) -> None:
-    """Correct ``now.corrected`` anew by what the estimator has found of the errors of the sensors."""
+    """Correct ``now.corrected`` with the present estimate of the sensor errors."""
     now, estimate = core.now, core.sample.estimate
     for i in range(core.settings.n if estimate.known else 0):
         if math.isfinite(now.input[i]):
@@ -276,7 +307,11 @@ def apply_estimate(core: Core) -> None:
 
 @compiled
 def update_noisy(core: Core) -> None:
-    """Find channels much noisier than expected or than usual, and than all distinguishable ones of other units."""
+    """Find channels much noisier than expected or usual.
+
+    A noisy channel must also be noisier than all distinguishable channels of other
+    units.
+    """
     settings, noise, usual = (
         core.settings,
         core.now.verdict.noise,
@@ -306,7 +341,7 @@ def update_noisy(core: Core) -> None:
 
 @compiled
 def unit_of(settings: PathSettings, i: int) -> int:
-    """Bits of the channels of the unit of a channel; of one without a unit its own bit."""
+    """Return the mask of the unit of a channel, or of the channel if it has no unit."""
     for unit in range(settings.units):
         if settings.members[unit] >> i & 1:
             return int(settings.members[unit])
@@ -315,7 +350,7 @@ def unit_of(settings: PathSettings, i: int) -> int:
 
 @compiled
 def begin_bias(core: Core) -> None:
-    """Begin to follow the biases that were just learned."""
+    """Initialise the estimation of biases after the start-up average."""
     n, settings, motion, largest = (
         core.settings.n,
         core.settings,
@@ -329,8 +364,8 @@ def begin_bias(core: Core) -> None:
         step = core.health.step[i] if core.health.step[i] > 0.0 else largest
         std = settings.turn_on if motion or lost >> i & 1 else settings.learned[i]
         if not motion and step > settings.sensors.noise_std[i]:
-            # Noise does not take a sensor over coarse steps: at rest it was off by up
-            # to half of one all the time.
+            # The noise is smaller than the step of the sensor, and the average does
+            # not remove the quantisation error: up to half a step at rest.
             std = math.sqrt(std * std + step * step / 12.0)
         core.remaining[i] = core.sample.bias_std[i] = std
         core.correction[i] = 0.0
@@ -338,12 +373,12 @@ def begin_bias(core: Core) -> None:
 
 @compiled
 def fill_input(core: Core, out: int) -> None:
-    """Find the rate along each axis, and choose what the detector sees.
+    """Calculate the rate along each axis, and choose the values for the detector.
 
-    It sees usable values, and those out of range that no manoeuvre explains. A
-    hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to
-    come back from its limit, and the manoeuvre is beyond what the error model was made
-    for: what disagrees meanwhile is left out, but not declared.
+    The detector gets usable values, and values out of range that no manoeuvre explains:
+    a hard-over is a fault. A chip that a manoeuvre drives out of range needs time to
+    recover from its limit, and such a manoeuvre is beyond the error model. Meanwhile a
+    channel that disagrees is left out, but not declared.
     """
     now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
     core.sample.mask = now.usable
@@ -367,7 +402,10 @@ def fill_input(core: Core, out: int) -> None:
 
 @compiled
 def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> int:
-    """Decide, fuse and write events after the detector; the output is ``core.last``. Return the number of events."""
+    """Decide, fuse and write events after the detector; the result is ``core.last``.
+
+    Return the number of events.
+    """
     core, subsets = path.core[0], path.subsets
     settings, now, last, verdict = core.settings, core.now, core.last, core.now.verdict
     last.stamp = now.evidence.stamp
@@ -378,14 +416,14 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     fill_suspects(core, gather_evidence(core, subsets))
     before = core.decision.ambiguous
     changed = decide(settings, core.decision, now.evidence)
-    # What this sample has declared is out of use from it on. What was in doubt before
-    # is left out once more, unless too
-    # little would be left: then only channels in doubt from now on.
+    # A channel declared in this sample is out of use from now on. Channels that were in
+    # doubt before are left out once more, unless too few would remain: then only the
+    # channels in doubt from now on.
     now.usable &= ~core.decision.faulty
     now.doubtful = core.decision.suspicion | before | core.decision.ambiguous
     enough = not changed or subsets[now.usable & ~now.doubtful].spare
     fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
-    # The estimator keeps its states whatever is declared.
+    # Declarations do not change the states of the estimator.
     if changed and not settings.guard_declares:
         forget(path.method[0], path.method_memory)
     living = alive(core)
@@ -404,7 +442,7 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
 
 @compiled
 def skip_sample(core: Core) -> None:
-    """Remember a sample that only the bias was learned from."""
+    """Write the result of a sample that only served to learn the bias."""
     last = core.last
     forget_kind(core.decision, core.settings, CHECKED)
     for i in range(core.settings.n):

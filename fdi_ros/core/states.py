@@ -19,13 +19,21 @@ from fdi_ros.core.records import Core, Subset
 class ChannelState(IntEnum):
     """State of one channel, the number in ``~/integrity``."""
 
-    OK = 0  # delivers, is checked against the others and agrees
-    SUSPECT = 1  # left out of the fused rate for now: under suspicion, not confirmed
-    AMBIGUOUS = 2  # one channel of a named set is faulty, undecided which
-    FAULTY = 3  # declared faulty and left out
-    STALE = 4  # gives nothing, or nothing new
-    UNCHECKED = 5  # delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run
-    EXCLUDED = 6  # taken out by the operator
+    #: Delivers, is checked against the others, and agrees.
+    OK = 0
+    #: Suspected but not confirmed, and left out of the fused rate for now.
+    SUSPECT = 1
+    #: In a named set that contains a faulty channel.
+    AMBIGUOUS = 2
+    #: Declared faulty and left out.
+    FAULTY = 3
+    #: Gives no value, or no new value.
+    STALE = 4
+    #: Delivers, but cannot be checked: too few other channels, bias not learned, or the
+    #: detector cannot run.
+    UNCHECKED = 5
+    #: Taken out by the operator.
+    EXCLUDED = 6
 
 
 class Reason(str, Enum):
@@ -59,7 +67,7 @@ _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _C
     range(8, len(REASONS))
 )
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
-"""State by `Condition`; OK where the condition implies none."""
+"""State by `Condition`, or OK if the condition implies none."""
 _OF_CONDITION = (
     _DISAGREES,
     _DISAGREES,
@@ -69,7 +77,8 @@ _OF_CONDITION = (
     _NO_DATA,
     _NON_FINITE,
 )
-"""Why, by `Condition`."""
+"""Reason by `Condition`."""
+# Reason by `Decision.why`.
 _OF_DECISION = (
     _NONE,
     _DISAGREES,
@@ -77,24 +86,24 @@ _OF_DECISION = (
     _NON_FINITE,
     _DRIFTED,
     _INTERMITTENT,
-)  # by why a channel was declared
+)
 
 
 @compiled
 def left_out(core: Core) -> int:
-    """Bits of the channels declared faulty, taken out, or copies of others."""
+    """Return the mask of channels declared faulty, taken out, or copies of others."""
     return core.decision.faulty | core.excluded | core.copies.channels
 
 
 @compiled
 def out_of_use(core: Core) -> int:
-    """Bits of the channels left out, or of unknown bias."""
+    """Return the mask of channels left out, or of unknown bias."""
     return left_out(core) | ~core.bias.known
 
 
 @compiled
 def alive(core: Core) -> int:
-    """Bits of the channels in use that deliver something new."""
+    """Return the mask of channels in use that deliver new values."""
     gone = 0
     for i in range(core.settings.n):
         if core.health.condition[i] in (SILENT, FROZEN):
@@ -104,7 +113,10 @@ def alive(core: Core) -> int:
 
 @compiled
 def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> None:
-    """State of every channel; checked: bits of the channels whose fault would have been declared."""
+    """Update the state of every channel.
+
+    ``checked`` is the mask of channels whose fault would have been declared.
+    """
     for i in range(core.settings.n):
         bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
         # Later rules override earlier ones.
@@ -126,7 +138,7 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
 
 @compiled
 def reason_of(core: Core, subset: Subset, i: int) -> int:
-    """Why a channel is in its state; subset: the channels alive."""
+    """Return the reason of a channel's state. ``subset`` is that of the living channels."""
     state, condition = core.last.state[i], core.health.condition[i]
     if state in (OK, EXCLUDED):
         return _NONE if state == OK else _OPERATOR
@@ -141,7 +153,7 @@ def reason_of(core: Core, subset: Subset, i: int) -> int:
 
 @compiled
 def why_unchecked(core: Core, subset: Subset, i: int) -> int:
-    """Why nothing checks a channel."""
+    """Return the reason why a channel is not checked."""
     if core.copies.channels >> i & 1:
         return _COPY
     if core.bias.learning or not core.bias.known >> i & 1:
@@ -162,7 +174,10 @@ def write_events(
     events: NDArray[Any],
     count: int,
 ) -> int:
-    """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
+    """Store the states of the last sample, and append changes to the events.
+
+    Return the new number of events.
+    """
     last = core.last
     core.group = core.decision.ambiguous
     for i in range(core.settings.n):
@@ -173,14 +188,14 @@ def write_events(
             if reason in (_DISAGREES, _DRIFTED) and not learning:
                 error = core.now.verdict.error[i]
                 if error == 0:
-                    # Of a drift that was declared before a restart the bias is known, too.
+                    # After a restart the bias of a stored drift is known as well.
                     error = (
                         core.sample.estimate.bias[i]
                         if reason == _DRIFTED
                         else last.residual[i]
                     )
                 if not math.isfinite(error):
-                    # It gives nothing in this very sample.
+                    # The channel has no value in this sample.
                     error = 0.0
             event = events[count]
             first = core.settings.first

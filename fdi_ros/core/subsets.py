@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sets of channels, and what depends on the set alone: its least-squares rate and what a method can do with it.
+"""Sets of channels as bit masks: their least-squares rate, and what a method can detect.
 
-A set has one bit for each channel, from the first up; its number is its place in tables
-of all sets.
+Bit i of a mask stands for channel i. The mask is the index of the set in tables of all
+sets.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from fdi_ros.model.geometry import (
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 
-# worst over best axis of the rest, below which leaving out costs more than a wider
-# covariance
+#: Smallest ratio of singular values of the remaining axes for which a channel is left
+#: out on mere suspicion. Below it the loss of accuracy costs more.
 MIN_SPARE_RATIO = 0.1
 
 
 def mask_of(channels: Iterable[int]) -> int:
-    """Set of the given channels."""
+    """Return the set of the given channels."""
     mask = 0
     for i in channels:
         mask |= 1 << int(i)
@@ -41,32 +41,32 @@ def mask_of(channels: Iterable[int]) -> int:
 
 
 def is_in(channel: int, mask: int) -> bool:
-    """Whether a channel is in a set."""
+    """Return whether a channel is in a set."""
     return bool(mask >> channel & 1)
 
 
 def whole_set(n: int) -> int:
-    """Set of all n channels."""
+    """Return the set of all n channels."""
     return (1 << n) - 1
 
 
 def members(mask: int) -> tuple[int, ...]:
-    """Channels of a set."""
+    """Return the channels of a set."""
     return tuple(i for i in range(mask.bit_length()) if is_in(i, mask))
 
 
 def flags_of(mask: int, n: int) -> Mask:
-    """Which of n channels are in a set, (n,)."""
+    """Return for each of n channels whether the set contains it, (n,)."""
     return np.array([is_in(i, mask) for i in range(n)])
 
 
 def single_losses(mask: int) -> list[int]:
-    """Return the sets that are left when one channel of a set is lost."""
+    """Return the sets that remain when one channel of a set is lost."""
     return [mask & ~(1 << i) for i in members(mask)]
 
 
 def all_sets(n: int) -> Mask:
-    """Which channels are in each of the 2^n sets, (2^n, n)."""
+    """Return for each of the 2^n sets whether it contains each channel, (2^n, n)."""
     sets: Mask = (np.arange(1 << n)[:, None] >> np.arange(n) & 1).astype(np.bool_)
     return sets
 
@@ -98,7 +98,10 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
 def prepare_capability(
     subsets: NDArray[Any], geometry: Geometry, can_run: list[bool]
 ) -> None:
-    """Complete subsets with what a method can do with each; can_run (n + 1,): whether it runs on k channels."""
+    """Write into each subset whether a method can run on it, and what it can detect.
+
+    ``can_run`` (n + 1,) states for each number of channels whether the method runs.
+    """
     n = geometry.n
     bits = all_sets(n)
     count = bits.sum(axis=1)
@@ -113,7 +116,7 @@ def prepare_capability(
 
 @compiled
 def number_in(mask: int, n: int) -> int:
-    """Return how many of n channels are in a set."""
+    """Return the number of channels in a set, of n."""
     count = 0
     for i in range(n):
         count += mask >> i & 1
@@ -122,7 +125,7 @@ def number_in(mask: int, n: int) -> int:
 
 @compiled
 def fill_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
-    """Least-squares rate (3,) of the channels in mask, rad/s; NaN where they do not span space."""
+    """Write the least-squares rate (3,) of the channels in mask, rad/s, or NaN."""
     for a in range(3):
         total = 0.0
         for i in range(n):
