@@ -1,18 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bias of each channel: fixed, or averaged over a first time at rest.
+"""Bias of each channel: fixed, or averaged over an initial time at rest.
 
 The average is robust. Values are taken in groups of eight, without the largest and the
 smallest. The means of the groups are averaged over fifteen portions of the time. The
-bias is the mean of the portions without a fifth at either end. So neither single spikes
-nor a few disturbed portions reach it.
+bias is the mean of the portions without the largest and smallest fifth. Thus neither
+single spikes nor a few disturbed portions change the bias.
 
-Whether it was rest is tested for each channel by itself (mean and scatter), and for the
-channels together. A turn lies in the part of all channels that a body rate can explain;
-biases and noise, one channel as good as another, lie as much in each dimension of that
-part as in each of the others. So with C the mean square of the first part per dimension
-(3) and P that of the second (k - 3 of k channels):
+Rest is tested for each channel alone (mean and scatter), and for all channels together.
+A rotation lies in the three-dimensional part of the channels that a body rate explains.
+Biases and noise of equal channels have the same size in each dimension, inside and
+outside that part. C is the mean square per dimension in the part of the rate (3), and P
+the mean square per dimension outside (k - 3 of k channels):
 
 - averages: C / s^2 is F-distributed with 3 and k degrees of freedom. The size of the
   biases is known by a prior alone, scaled inverse chi-square about `USUAL` with 3 degrees
@@ -39,39 +39,38 @@ from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, Val
 from fdi_ros.model.samples import MAX_RATE, Array
 
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
-"""Origin of the bias, or why the last average was refused."""
-# samples that an average takes at least: fewer may be a single group, and show no
-# scatter
+"""Origin of the bias, or reason why the last average was refused."""
+#: Smallest number of samples of an average. Fewer may be a single group without scatter.
 LEAST_ROWS = 10
-# a channel gives at least one value in this many samples: units may be slower than
-# others
+#: A channel must give a value in one of this many samples: units may have lower rates.
 LEAST_GIVEN = 4
-GROUP = 8  # values taken together, of which the largest and the smallest are left out
-# mean square of the middle six of eight normal values about their mean, in variances of
-# one
+#: Values in a group, of which the largest and the smallest are left out.
+GROUP = 8
+#: Mean square of the middle six of eight normal values about their mean, in variances.
 MIDDLE_SQUARE = 0.3995
-# variance of the plain mean over this mean in white noise: 0.934 by groups, 0.88 by
-# portions
+#: Variance of the plain mean in white noise, relative to the variance of this mean:
+#: 0.934 by the groups times 0.88 by the portions.
 EFFICIENCY = 0.82
-USUAL = 0.005  # size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s
-PRIOR = 3  # degrees of freedom of that: it may be half to four times as much
-# probability that biases are taken for a turn: such a vehicle is refused until they are
-# given
+#: Usual residual bias of calibrated MEMS gyros, rad/s: 0.3 deg/s.
+USUAL = 0.005
+#: Degrees of freedom of the prior about `USUAL`, which allows 0.5 to 4 times its size.
+PRIOR = 3
+#: Probability to take biases for a rotation. Such a vehicle needs biases as settings.
 FALSE_TURN = 0.003
-# that noise is taken for motion: less, since it costs another average each time
+#: Probability to take noise for motion. It is lower, since each costs one more average.
 FALSE_SWAY = 0.001
 
 
 def restart_bias(core: NDArray[Any]) -> None:
-    """Begin a new average of the bias; core (1,)."""
+    """Begin a new average of the bias. ``core`` has shape (1,)."""
     bias = core[0]["bias"]
-    # Where the settings give no time, 2 s: white noise then leaves less than a tenth of itself.
+    # Without a setting: 2 s, which reduces white noise to less than a tenth.
     bias["duration"] = bias["duration"] or 2_000_000_000
     bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
 
 
 def prepare_limits(bias: Any) -> None:
-    """Fill in the ratios beyond which a time was not at rest."""
+    """Write the ratios above which the vehicle was not at rest."""
     bias["turn_ratio"], bias["sway_ratio"] = np.inf, np.inf
     for k in range(3, MAX_CHANNELS + 1):
         bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, 3, k - 3 + PRIOR)
@@ -84,7 +83,11 @@ def prepare_limits(bias: Any) -> None:
 
 @functools.cache
 def f_quantile(probability: float, above: int, below: int) -> float:
-    """Value that F exceeds, of degrees of freedom above and below, with a probability, 1e-4 to 0.5; within 0.1 %."""
+    """Return the value that an F-distributed variable exceeds with a probability.
+
+    ``above`` and ``below`` are the degrees of freedom. For probabilities from 1e-4 to
+    0.5 the relative error is at most 0.1 %.
+    """
     # F = (below / above) / tan^2(angle), with the density cos^(above - 1) sin^(below - 1).
     edges = np.linspace(0.0, np.pi / 2, 8001)
     middle = 0.5 * (edges[1:] + edges[:-1])
@@ -100,10 +103,11 @@ def f_quantile(probability: float, above: int, below: int) -> float:
 def update_bias(
     core: Core, subsets: NDArray[Any], stamp: int, good: int, lost: int
 ) -> bool:
-    """Take one sample into the average; return whether it was used: False if with it the bias is learned.
+    """Add one sample to the average, and return whether the sample was used.
 
-    ``good``: bits of the channels that are finite and in range. ``lost``: of those
-    declared faulty or taken out, which are no evidence about rest, and keep their bias.
+    The sample that completes the average is not used. ``good`` is the mask of channels
+    that are finite and in range. ``lost`` is the mask of channels declared faulty or
+    taken out, which are no evidence about rest and keep their bias.
     """
     average, n, z = core.bias, core.settings.n, core.now.aligned
     if average.started and stamp >= average.start + average.duration:
@@ -138,7 +142,7 @@ def begin(average: Bias, n: int, stamp: int) -> None:
 
 @compiled
 def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None:
-    """Take a value of channel i. The last of a group adds the middle of the group to the portion."""
+    """Add a value of channel i to its group. A full group is added to the portion."""
     if group.count == 0:
         group.total = group.squares = 0.0
         group.low = group.high = value
@@ -159,7 +163,10 @@ def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None
 
 @compiled
 def middle_mean(values: Array, count: int) -> float:
-    """Mean of the first values without a fifth at either end. Sorts them in place."""
+    """Return the mean of the first ``count`` values without the outer fifths.
+
+    The values are sorted in place.
+    """
     for k in range(1, count):
         value, j = values[k], k
         while j > 0 and values[j - 1] > value:
@@ -175,7 +182,7 @@ def middle_mean(values: Array, count: int) -> float:
 
 @compiled
 def average_channel(average: Bias, i: int) -> bool:
-    """Average and scatter of one channel; False if it gave no group of values."""
+    """Calculate average and scatter of one channel. Return False without a full group."""
     filled = 0
     for b in range(BIAS_PORTIONS):
         portion = average.portions[b]
@@ -204,7 +211,7 @@ def average_channel(average: Bias, i: int) -> bool:
 
 @compiled
 def begin_in_motion(average: Bias, n: int) -> None:
-    """Go on without an average, as there was no rest: with the biases as given, to be followed from there."""
+    """End the start-up average in motion: begin with the biases of the settings."""
     average.learning, average.outcome = False, IN_MOTION
     for i in range(n):
         average.value[i] = average.centre[i]
@@ -213,7 +220,7 @@ def begin_in_motion(average: Bias, n: int) -> None:
 
 @compiled
 def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
-    """Accept the time as rest and set the bias, or note why not."""
+    """Set the bias if the vehicle was at rest, or else store the reason."""
     average, n = core.bias, core.settings.n
     heard = at_rest = resting = restless = 0
     for i in range(n):
@@ -235,7 +242,7 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
     average.started = False
     average.heard, average.restless = heard, heard & ~at_rest
     moved = moves_together(core, subsets[at_rest], at_rest, resting)
-    # One restless channel is a bad channel. More of them are a moving vehicle.
+    # One restless channel is a bad channel. More than one indicate a moving vehicle.
     if restless <= 1 and resting >= 3 and average.rows >= LEAST_ROWS and not moved:
         for i in range(n):
             if at_rest >> i & 1:
@@ -248,7 +255,10 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
 
 @compiled
 def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
-    """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
+    """Return whether the k channels in mask have turned together.
+
+    The size of the rotation and its limits are stored.
+    """
     average, sensors, parity = core.bias, core.settings.sensors, core.now.parity
     average.common_rate = average.sway = 0.0
     average.max_common_rate = average.max_sway = math.inf
@@ -260,7 +270,7 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
         for j in range(sensors.n):
             parity.weight[i, j] = 0.0
         if mask >> i & 1:
-            # One channel is as good as another, whatever its noise.
+            # All channels have equal weights, whatever their noise.
             parity.weight[i, i] = 1.0
             noise += sensors.noise_std[i] * sensors.noise_std[i] / k
     eliminate_rate(parity, sensors.n, sensors.axes, 0.0)
@@ -283,7 +293,11 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
 
 @compiled
 def split(core: Core, mask: int) -> tuple[float, float, float]:
-    """Length of the rate that explains ``bias.part``; sums of squares of what it explains, and of the rest."""
+    """Split ``bias.part`` into a rate and the rest.
+
+    Return the length of the rate, and the sums of squares of the explained part and of
+    the rest.
+    """
     axes, part, rate = core.settings.sensors.axes, core.bias.part, core.bias.turn
     apply_gain(core.now.parity.gain, core.settings.n, part, rate)
     explained = other = 0.0
@@ -301,7 +315,10 @@ def split(core: Core, mask: int) -> tuple[float, float, float]:
 
 @compiled
 def split_portions(core: Core, mask: int) -> tuple[float, float, int]:
-    """Deviations of the portions from their mean: sums of squares of both parts, and the number of portions."""
+    """Split the deviations of the portions from their mean into a rate and the rest.
+
+    Return the sums of squares of both parts, and the number of portions.
+    """
     average, n, count, explained, other = core.bias, core.settings.n, 0, 0.0, 0.0
     for i in range(n):
         average.middle[i] = 0.0
@@ -328,7 +345,7 @@ def split_portions(core: Core, mask: int) -> tuple[float, float, int]:
 
 @compiled
 def is_filled(portion: Portion, n: int, mask: int) -> bool:
-    """Whether every channel in mask gave a group of values in a portion."""
+    """Return whether every channel in mask gave a group of values in a portion."""
     filled = 0
     for i in range(n):
         if portion.count[i] > 0:

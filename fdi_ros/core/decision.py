@@ -1,11 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From alarms to declarations, and back.
+"""Declaration of faults from alarms, and recovery.
 
-All memory of declarations lives here, and is bounded: the last samples of one window, a
-few figures per channel. A fault after ten hours is declared as fast as one after a
-second.
+The memory of declarations is bounded: the last samples of one window, and a few figures
+per channel. Thus a fault after ten hours is declared as fast as one after a second.
 """
 
 from __future__ import annotations
@@ -18,21 +17,20 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.records import Decision, Evidence, PathSettings
 from fdi_ros.model.samples import MAX_RATE
 
-# noise_std that a channel's mean over the clean time is off by where it returns: else
-# it is a fault
+#: Largest mean error of a recovering channel over the clean time, in its noise_std.
 RETURN_MEAN = 0.5
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
-"""Sets of channels kept for each sample: suspects of the alarm, suspects that count
+"""Sets of channels stored for each sample: suspects of the alarm, suspects that count
 towards a declaration, suspects of an alarm that isolates, and channels whose fault
 would have shown."""
 UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED, INTERMITTENT = range(6)
 WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
-"""Why a channel was declared: numbers, and the words for them in files."""
+"""Reasons of declarations: the numbers, and their words in files."""
 
 
 @compiled
 def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bool:
-    """Take the verdict on one sample; return whether it changed what is declared."""
+    """Process the evidence of one sample. Return whether the declarations changed."""
     suspected = evidence.suspected & ~decision.faulty
     counted = 0 if evidence.held else suspected
     doubtful = suspected | evidence.outliers & ~decision.faulty
@@ -42,15 +40,15 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
         (doubtful, counted, counted if evidence.isolated else 0, evidence.checked),
     )
     decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
-    # The first sample is one after an interruption: a set that was restored stands
-    # until it is clean for long enough.
+    # The first sample counts as interrupted: a restored set stands until it has been
+    # clean for long enough.
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
         decision.last_doubt = evidence.stamp
     faulty, undecided = confirm(decision, settings)
     broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
     faulty |= evidence.certain & ~decision.faulty
     if settings.by_evidence:
-        # A set by evidence ends with the evidence. A set by votes stays.
+        # A set by evidence ends with its evidence, a set by votes stays.
         decision.voted |= undecided
         if evidence.stamp - decision.last_doubt >= settings.clean_time:
             decision.voted = 0
@@ -69,7 +67,7 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
             decision.ambiguous != 0
             and evidence.stamp - decision.last_doubt >= settings.clean_time
         )
-    # A set of which a member is now known to be faulty is explained by it.
+    # A set is explained by a member that is now known to be faulty.
     if clears or decision.ambiguous & (faulty | broken):
         decision.voted = wanted = 0
     after = (decision.faulty | faulty | broken) & ~returns
@@ -90,7 +88,7 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
 
 @compiled
 def reason_for(evidence: Evidence, i: int) -> int:
-    """Why a channel is declared."""
+    """Return the reason why a channel is declared."""
     if evidence.broken >> i & 1:
         return NOT_FINITE
     if evidence.intermittent >> i & 1:
@@ -104,7 +102,7 @@ def reason_for(evidence: Evidence, i: int) -> int:
 def push(
     decision: Decision, settings: PathSettings, sets: tuple[int, int, int, int]
 ) -> None:
-    """Move the window on by one sample with these sets, by kind."""
+    """Add the sets of one sample, by kind, to the window."""
     decision.at = (decision.at + 1) % settings.window
     if sets[COUNTED]:
         decision.alarms += 1
@@ -120,7 +118,7 @@ def push(
 
 @compiled
 def at_least(decision: Decision, settings: PathSettings, kind: int, least: int) -> int:
-    """Bits of the channels in the sets of a kind in at least ``least`` samples of the window."""
+    """Return the channels in the sets of a kind in at least ``least`` samples."""
     mask = 0
     for i in range(settings.n):
         if decision.count[kind, i] >= least:
@@ -130,13 +128,13 @@ def at_least(decision: Decision, settings: PathSettings, kind: int, least: int) 
 
 @compiled
 def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
-    """Channels that the alarms of the window declare faulty, and a set one of which is.
+    """Return the channels that the window declares faulty, and an undecided set.
 
-    A channel is faulty when at least `alarms` of the last `window` samples suspected it
-    and at least half that many suspected nothing but faulty channels with it. When the
-    alarms are as many but do not single it out, the channels that at least half of them
-    suspected are undecided together. The same holds when all alarms of the window
-    disagree.
+    A channel is faulty if at least `alarms` of the last `window` samples suspected the
+    channel, and at least half as many of these alarms isolate their suspects. If the
+    alarms suffice but isolate no channel, the channels that at least half of them
+    suspected form the undecided set. The same holds if all samples of the window have
+    alarms that disagree.
     """
     half = (settings.alarms + 1) // 2
     enough = at_least(decision, settings, COUNTED, settings.alarms)
@@ -147,7 +145,7 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
         if not undecided:
             undecided = at_least(decision, settings, COUNTED, 1)
     if undecided & (undecided - 1) == 0:
-        # Most alarms name this channel alone, though none calls it isolated: no other
+        # Most alarms suspect this channel alone, although none isolates: no other
         # channel is confused with it.
         faulty |= undecided & enough
     return faulty, 0 if faulty else undecided
@@ -157,9 +155,9 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
 def follow_declared(
     settings: PathSettings, decision: Decision, evidence: Evidence
 ) -> None:
-    """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
+    """Update the clean time and the mean error of declared channels that may recover."""
     for i in range(settings.n):
-        # The clean time of a channel begins with its own declaration.
+        # The clean time of a channel begins at its declaration.
         is_declared = decision.faulty >> i & 1 and not settings.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
             decision.last_bad[i] = decision.renewed[i] = evidence.stamp
@@ -172,7 +170,11 @@ def follow_declared(
 
 @compiled
 def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> int:
-    """Bits of the declared channels that have agreed for the clean time, and in the mean over one or two."""
+    """Return the declared channels that recover.
+
+    They have agreed for the clean time, and their mean error over one or two clean
+    times is small.
+    """
     returns = 0
     for i in range(settings.n):
         if (
@@ -199,7 +201,7 @@ def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> in
 
 @compiled
 def forget_kind(decision: Decision, settings: PathSettings, kind: int) -> None:
-    """Forget which channels were in the sets of a kind."""
+    """Clear the sets of a kind."""
     for k in range(settings.window):
         decision.sets[kind, k] = 0
     for i in range(settings.n):
@@ -208,7 +210,7 @@ def forget_kind(decision: Decision, settings: PathSettings, kind: int) -> None:
 
 @compiled
 def forget_alarms(decision: Decision, settings: PathSettings) -> None:
-    """Forget the alarms of the window, but not which channels were checked, the last kind."""
+    """Clear the alarms of the window, but keep the checked channels (the last kind)."""
     decision.alarms = 0
     for kind in range(CHECKED):
         forget_kind(decision, settings, kind)
@@ -216,7 +218,10 @@ def forget_alarms(decision: Decision, settings: PathSettings) -> None:
 
 @compiled
 def clear_declarations(core: NDArray[Any]) -> int:
-    """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
+    """Clear all declarations and suspicions, and return the mask of declared channels.
+
+    ``core`` has shape (1,).
+    """
     decision, settings = core[0].decision, core[0].settings
     declared = decision.faulty | decision.ambiguous
     decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0

@@ -21,14 +21,16 @@ from fdi_ros.core.records import Core, Current, PathSettings, SampleInput
 from fdi_ros.core.repeated import add_stuck, update_stuck
 from fdi_ros.core.sensors import variance_of
 
-# standard deviations by which a bias is beyond its limit: by chance it is so once in 30
-# 000
+#: Standard deviations by which a bias must exceed its limit: by chance 1 in 30 000.
 SURE_DRIFT = 4.0
 
 
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
-    """Fill in the evidence except the suspects of the verdict; return bits of stuck channels."""
+    """Write the evidence except the suspects of the verdict.
+
+    Return the mask of stuck channels.
+    """
     settings, health, now, evidence = (
         core.settings,
         core.health,
@@ -53,8 +55,8 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             clear |= 1 << i
         evidence.error[i] = now.corrected[i] - now.along[i]
         if may_return and now.plain >> i & 1:
-            # The prediction of n - 1 channels is at worst as uncertain as the channel
-            # itself on a sane mounting.
+            # In a usual geometry the prediction by n - 1 channels is at most as
+            # uncertain as the channel itself.
             variance = 2 * variance_of(
                 settings.sensors, i, now.along[i], core.acceleration.value
             )
@@ -69,7 +71,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
 
 @compiled
 def fill_suspects(core: Core, stuck: int) -> None:
-    """Fill in which channels the verdict and their repeated values name."""
+    """Write the channels suspected by the verdict or by repeated values."""
     settings, now, evidence, verdict = (
         core.settings,
         core.now,
@@ -84,8 +86,8 @@ def fill_suspects(core: Core, stuck: int) -> None:
         else:
             evidence.undecided = bits_of(verdict.suspects, n)
     for u in range(settings.units):
-        # All values of a unit are old: its driver or its bus repeats them, and no
-        # channel is worse than the others.
+        # The driver or the bus repeats all values of the unit: no channel is worse than
+        # the others.
         if settings.members[u] & stuck & now.repeated:
             stuck |= settings.members[u]
     update_drifted(settings, core.sample, now)
@@ -101,7 +103,7 @@ def fill_suspects(core: Core, stuck: int) -> None:
 
 @compiled
 def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
-    """Find channels whose bias surely exceeds ``max_drift``, and add them to the suspects of the verdict."""
+    """Find channels whose bias certainly exceeds ``max_drift``, and add them as suspects."""
     now.evidence.drifted, estimate = 0, sample.estimate
     if settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):
@@ -113,7 +115,7 @@ def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) ->
 
 @compiled
 def bits_of(flags: NDArray[np.uint8], n: int) -> int:
-    """Set of the channels whose flag is set."""
+    """Return the mask of the channels whose flag is set."""
     mask = 0
     for i in range(n):
         if flags[i]:
