@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One live message at a time: into the alignment, and through the sample path what it completes.
+"""Live processing: a message enters the alignment, and complete samples the sample path.
 
-Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), made of its
-reading and `receive_stamped` or `receive_arrived`. The samples that are complete then
-go through `process`.
+Each kind of input has a compiled `receive` (`fdi_ros.core.sources`), which reads the
+message and calls `receive_stamped` or `receive_arrived`. Then `process` takes each
+complete sample.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ from fdi_ros.core.records import Aligner, Live
 from fdi_ros.model.samples import Bytes
 
 WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
-"""Bits of what taking and working a message returns: a sample was worked; it has a
-fused rate; it brought events; another is to be worked; the path wants something
-prepared (before the next call, which goes on with the sample if none was worked); the
-message was refused."""
-NEVER = -1  # instead of a stamp
-# ns that a live stamp may be: clocks of two computers differ, and simulators step
+"""Bits of the results of `receive` and `process`: a sample was processed; the sample
+has a fused rate; the sample has events; another sample is ready; something must be
+prepared before the next call (which continues with the same sample if none was
+processed); the message was refused."""
+NEVER = -1  #: In place of a stamp.
+#: Largest time of a live stamp ahead of the clock, ns: clocks of computers differ.
 AHEAD_OF_CLOCK = 1_000_000_000
-# ns; a clock set back by more is followed, less is waited out: NTP slews that within
-# minutes
+#: A clock set back by more than this is followed, ns. Smaller steps are waited out.
 STEP_BACK = 100_000_000
 
 
@@ -44,11 +43,22 @@ STEP_BACK = 100_000_000
 def receive_stamped(
     live: Live, aligner: Aligner, unit: int, stamp: int, now: int
 ) -> int:
-    """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
+    """Process a message of a unit whose rate is in `aligner.rate`.
 
-    ``stamp``: of the message, ns; or what is wrong with it, negative. ``now``: when it
-    arrived, ns; 0: not known. What is ahead of the clock by more than `AHEAD_OF_CLOCK`
-    cannot have been measured yet: it is counted and left.
+    Parameters
+    ----------
+    unit
+        Unit, from 0.
+    stamp
+        Stamp of the message, ns, or a negative code of its error.
+    now
+        Time of arrival, ns. 0: unknown. A message ahead of this time by more than
+        `AHEAD_OF_CLOCK` is counted and dropped.
+
+    Returns
+    -------
+    int
+        `MALFORMED`, `MORE` or 0.
     """
     inlet = live.inlets[unit]
     inlet.received += 1
@@ -70,14 +80,19 @@ def receive_stamped(
 
 @compiled
 def receive_arrived(live: Live, code: int, stamp: int) -> int:
-    """Take what was read of all channels, into `live.sample.z`, stamped on arrival; return `MALFORMED` or `MORE`."""
+    """Process a message of all channels, whose values are in `live.sample.z`.
+
+    ``code`` is `GOOD` or the code of an error, ``stamp`` the time of arrival, ns.
+    Return `MALFORMED` or `MORE`.
+    """
     inlet, sample = live.inlets[0], live.sample
     inlet.received += 1
     inlet.error = code
     if code != GOOD:
         inlet.malformed += 1
         return MALFORMED
-    # A clock set back: the samples go on, and the messages keep the time of the clock.
+    # After a clock was set back, stamps of samples continue to increase, while
+    # published messages follow the clock.
     if stamp + live.clock_shift <= live.last_stamp:
         if live.last_stamp - stamp - live.clock_shift > STEP_BACK:
             live.clock_shift = live.last_stamp - stamp
@@ -96,7 +111,7 @@ def receive_arrived(live: Live, code: int, stamp: int) -> int:
 def fill_accelerometers(
     paths: tuple[Path, Path], live: Live, fused: Bytes, integrity: Bytes
 ) -> None:
-    """Write what the accelerometers gave into the messages about the last sample."""
+    """Write the results of the accelerometers into the messages on the last sample."""
     gyros, core = paths[0].core[0].settings, paths[1].core[0]
     natural = core.settings.natural
     if core.last.valid:
@@ -115,16 +130,24 @@ def process(
     fused: Bytes,
     integrity: Bytes,
 ) -> int:
-    """Work the next sample that is complete: `WORKED` and other bits, 0 if there is none before the next message.
+    """Process the next complete sample. Return `WORKED` and other bits, or 0 if none is ready.
 
-    ``paths``, ``halves``: as for `run`. ``aligner``, ``live``: (1,) records. ``events``
-    takes its events, ``fused`` and ``integrity`` the messages to be published about it.
+    Parameters
+    ----------
+    paths, halves
+        As for `fdi_ros.core.path.run`.
+    aligner, live
+        Records, (1,).
+    events
+        Receives the events of the sample.
+    fused, integrity
+        Receive the messages to publish.
     """
     monitor, main = live[0], paths[0].core[0]
     if not monitor.ready:
         return 0
     sample = monitor.sample
-    # Those of the gyros stand already where the accelerometers waited.
+    # If the accelerometers had to wait, the events of the gyros are already written.
     begun = monitor.events if main.half > 0 else 0
     count, waits = step_halves(paths, halves, sample, 0, events, begun)
     monitor.events = count

@@ -1,16 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Elements of CDR messages: reading and writing what all kinds of messages share, and the messages that are published.
+"""Reading and writing of CDR messages: common elements, and the published messages.
 
-Reading takes only what is needed out of the bytes, whatever else they hold; what is
-special to one kind of message is in its source (`fdi_ros.core.sources`). Writing fills
-a template. Bytes may come from anywhere: every length in them is checked against the
-bytes that are there before it is believed.
+Reading extracts only the required fields. Details of one kind of message are in its
+source (`fdi_ros.core.sources`). Writing fills a template. Messages may come from any
+sender: each length in a message is checked against the bytes present.
 
-Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the
-second of which is 1 for little and 0 for big endian; then the fields, each aligned to
-its own size counted from after the encapsulation.
+Layout (CDR, OMG formal/02-06-51, as sent by ROS 2): 4 bytes of encapsulation, the second
+of which is 1 for little and 0 for big endian. Then follow the fields. Each is aligned to
+its own size, counted from the end of the encapsulation.
 """
 
 from __future__ import annotations
@@ -30,24 +29,22 @@ from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.system.files import NAME
 
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
-"""What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
-ENCAPSULATION = 4  # bytes before the first field
+"""Results of reading a message. From `FIRST_OWN` on each source has its own codes."""
+ENCAPSULATION = 4  #: Bytes before the first field.
 IMU_DOUBLES, IMU_BEFORE_RATE, IMU_BEFORE_FORCE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9, 3 + 9
-"""Doubles of an Imu: all; those before the angular velocity: orientation and its
-covariance; and from there on those before the linear acceleration."""
+"""Number of doubles of an Imu: all, those before the angular velocity (orientation and
+its covariance), and those from there to the linear acceleration."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
-LAST_STAMP = (
-    _SIGN - 1
-) * _NS  # latest time that the header of a message can hold, to the second, ns
-_FULL = np.array(
-    [0, 1, 2, 1, 3, 4, 2, 4, 5]
-)  # elements of a symmetric (3, 3) matrix by rows, in its upper triangle
+#: Latest whole second that the header of a message can hold, ns.
+LAST_STAMP = (_SIGN - 1) * _NS
+# Index in the upper triangle of each element of a symmetric (3, 3) matrix, by rows.
+_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _IN_ORDER = np.arange(MAX_CHANNELS)
 
 
 class MessageError(FdiError):
-    """The bytes are no such message, or not of the length that is expected."""
+    """The bytes are not a message of the expected type or length."""
 
 
 # Bytes
@@ -56,7 +53,7 @@ class MessageError(FdiError):
 
 @compiled
 def read_bits(data: Bytes, at: int, size: int, little: bool) -> int:
-    """Put size bytes together; the compiler makes one load of it, aligned or not."""
+    """Return size bytes as an integer. The compiler makes this a single load."""
     bits = np.int64(0)
     if little:
         for k in range(size):
@@ -69,14 +66,14 @@ def read_bits(data: Bytes, at: int, size: int, little: bool) -> int:
 
 @compiled
 def read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) -> None:
-    """Read count doubles; values takes them, (count,) or longer."""
+    """Read count doubles into values, (count,) or longer."""
     for i in range(count):
         values[i] = np.int64(read_bits(data, at + 8 * i, 8, little)).view(np.float64)
 
 
 @compiled
 def _write_double(out: Bytes, at: int, value: float) -> None:
-    """Write a double, little endian; the compiler makes one store of it, aligned or not."""
+    """Write a double, little endian. The compiler makes this a single store."""
     bits = np.float64(value).view(np.int64)
     for k in range(8):
         out[at + k] = bits >> 8 * k & 255
@@ -86,7 +83,7 @@ def _write_double(out: Bytes, at: int, value: float) -> None:
 def _write_doubles(
     out: Bytes, at: int, values: NDArray[Any], places: Int, count: int
 ) -> None:
-    """Write the values at the first so many places, as `_write_double` does."""
+    """Write the values at the first ``count`` places as doubles."""
     for i in range(count):
         _write_double(out, at + 8 * i, values[places[i]])
 
@@ -97,7 +94,7 @@ def _write_doubles(
 
 @compiled
 def is_cdr(data: Bytes, offset: int, length: int) -> bool:
-    """Whether bytes from offset on begin as plain CDR does."""
+    """Return whether the bytes from offset on begin like plain CDR."""
     return length >= ENCAPSULATION and data[offset] == 0 and data[offset + 1] <= 1
 
 
@@ -105,10 +102,19 @@ def is_cdr(data: Bytes, offset: int, length: int) -> bool:
 def place_after_header(
     data: Bytes, offset: int, length: int, before: int, total: int
 ) -> int:
-    """Return where values stand among the doubles that follow a std_msgs/Header; or what is wrong, negative.
+    """Return the index of values among the doubles after a std_msgs/Header.
 
-    The message lies in ``data`` from ``offset`` on. ``before``, ``total``: doubles
-    before the values, and all that there must be.
+    Parameters
+    ----------
+    data, offset, length
+        The message is data[offset:offset + length].
+    before, total
+        Number of doubles before the values, and of all doubles that must be present.
+
+    Returns
+    -------
+    int
+        Index in ``data``, or the negative code of an error.
     """
     if not is_cdr(data, offset, length):
         return -NO_CDR
@@ -126,10 +132,10 @@ def place_after_header(
 def read_rate(
     data: Bytes, offset: int, length: int, before: int, total: int, rate: Array
 ) -> int:
-    """Read three of the doubles that follow a std_msgs/Header into rate (3,), and return its stamp, ns.
+    """Read three of the doubles after a std_msgs/Header into rate (3,).
 
-    Or what is wrong, negative: then the rate is left as it was. Other parameters as for
-    `place_after_header`.
+    Return the stamp, ns, or the negative code of an error, which leaves the rate
+    unchanged. Other parameters as for `place_after_header`.
     """
     at = place_after_header(data, offset, length, before, total)
     if at < 0:
@@ -146,11 +152,10 @@ def read_rate(
 
 @compiled
 def read_force(data: Bytes, at: int, little: bool, force: Array) -> None:
-    """Read the specific force of an Imu, m/s^2, into force (3,); NaN if the message has none.
+    """Read the specific force of an Imu, m/s^2, into force (3,), or NaN if absent.
 
-    ``at``: where the angular velocity begins, as `place_after_header` returns it. An
-    Imu without an accelerometer has -1 as the first element of the covariance (REP-145),
-    or zeros.
+    ``at`` is the index of the angular velocity from `place_after_header`. An Imu without
+    an accelerometer has -1 as the first element of the covariance (REP-145), or zeros.
     """
     start = at + 8 * IMU_BEFORE_FORCE
     read_doubles(data, start, 3, little, force)
@@ -161,7 +166,10 @@ def read_force(data: Bytes, at: int, little: bool, force: Array) -> None:
 
 
 def frame_of(data: bytes) -> str:
-    """Return the frame_id of a serialised message that begins with a std_msgs/Header; empty: it has none to read."""
+    """Return the frame_id of a serialised message that begins with a std_msgs/Header.
+
+    Empty if the message has none.
+    """
     begin = ENCAPSULATION + 12
     if len(data) < begin:
         return ""
@@ -172,25 +180,25 @@ def frame_of(data: bytes) -> str:
 
 
 def byte_order(data: bytes) -> str:
-    """Byte order of a message as `struct` writes it."""
+    """Return the byte order of a message as a character of `struct`."""
     return "<" if data[1:2] == b"\1" else ">"
 
 
 class Decoded(NamedTuple):
-    """What k messages hold; of one that is malformed: zeros."""
+    """Contents of k messages. Zero for malformed ones."""
 
-    code: Bytes  # (k,) `GOOD`, or what is wrong
-    stamp: Int  # (k,) ns; 0 for messages that carry none
-    values: Array  # (k, c) rad/s; of an Imu from the fourth on m/s^2
+    code: Bytes  #: `GOOD` or the code of an error, (k,).
+    stamp: Int  #: Stamps, ns, (k,). 0 for messages without a stamp.
+    values: Array  #: Values, rad/s, (k, c). From the fourth column of an Imu on, m/s^2.
 
     @property
     def good(self) -> NDArray[np.bool_]:
-        """(k,) whether the message is what it should be."""
+        """Whether each message is well formed, (k,)."""
         return self.code == GOOD
 
 
 def read_only(data: Bytes) -> Bytes:
-    """Return the bytes in the one form for which reading is compiled, that of received bytes."""
+    """Return the bytes as a read-only array, the only type for which reading is compiled."""
     view = np.ascontiguousarray(data).view()
     view.flags.writeable = False
     return view
@@ -211,11 +219,20 @@ def as_batch(data: bytes) -> tuple[Bytes, Int, Int]:
 
 @compiled
 def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) -> None:
-    """Write stamp, ns, rate (3,) rad/s and covariance into one serialised Imu, made from an `ImuTemplate`.
+    """Write a rate into a serialised Imu made from an `ImuTemplate`, little endian.
 
-    ``at``: where the rate begins, as the template says. Of the covariance the upper
-    triangle is given, (6,) (rad/s)^2. The specific force is marked absent: `fill_force`
-    may follow. Little endian.
+    The specific force is marked absent. `fill_force` may follow.
+
+    Parameters
+    ----------
+    out, at
+        Message, and index of the rate in the message.
+    stamp
+        Stamp, ns.
+    rate
+        Rate, rad/s, (3,).
+    covariance
+        Upper triangle of the covariance, (rad/s)^2, (6,).
     """
     seconds, rest = stamp // _NS, stamp % _NS
     for k in range(4):
@@ -233,9 +250,9 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
 def fill_force(
     out: Bytes, at: int, natural: float, force: Array, covariance: Array
 ) -> None:
-    """Write specific force (3,) and covariance (6,) into an Imu that `fill_imu` has filled.
+    """Write specific force (3,) and covariance (6,) into an Imu after `fill_imu`.
 
-    Both are in units of ``natural``, m/s^2, and of its square.
+    Their units are ``natural`` m/s^2 and its square.
     """
     start = at + 8 * IMU_BEFORE_FORCE
     for k in range(3):
@@ -246,7 +263,10 @@ def fill_force(
 
 
 def integrity_labels(names: Sequence[str], n: int) -> list[str]:
-    """Return what each value of the integrity message is; the first n names are of gyros, others of accelerometers."""
+    """Return the label of each value of the integrity message.
+
+    The first n names are those of gyros, the others of accelerometers.
+    """
 
     def half(own: Sequence[str], of: str, unit: str) -> list[str]:
         return [
@@ -263,10 +283,10 @@ def integrity_labels(names: Sequence[str], n: int) -> list[str]:
 
 @compiled
 def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> None:
-    """Write what `integrity_labels` names first, of gyros and stamp, into a Float64MultiArray.
+    """Write the values of the gyros and the stamp into the integrity message.
 
-    ``out``, ``at``: as for `fill_imu`. The stamp is that of the sample less ``shift``,
-    ns.
+    ``out`` and ``at`` are as for `fill_imu`. The stamp is that of the sample less
+    ``shift``, ns.
     """
     end = fill_half(out, at, row, n, 1.0)
     stamp = row.stamp - shift
@@ -276,9 +296,9 @@ def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> N
 
 @compiled
 def fill_half(out: Bytes, at: int, row: OutputRow, n: int, natural: float) -> int:
-    """Write statistic, threshold, states and level of n channels from a byte on, and return the byte behind them.
+    """Write statistic, threshold, states and level of n channels from index ``at`` on.
 
-    ``natural``: unit of the level, rad/s or m/s^2.
+    ``natural`` is the unit of the level in rad/s or m/s^2. Return the next index.
     """
     _write_double(out, at, row.statistic)
     _write_double(out, at + 8, row.threshold)
@@ -289,9 +309,10 @@ def fill_half(out: Bytes, at: int, row: OutputRow, n: int, natural: float) -> in
 
 
 class ImuTemplate:
-    """Serialised sensor_msgs/Imu with a rate and its covariance; orientation and acceleration marked absent.
+    """Serialised sensor_msgs/Imu with a rate and its covariance.
 
-    Absent is told by -1 as the first element of the covariance (REP-145).
+    Orientation and acceleration are marked absent by -1 as the first element of their
+    covariance (REP-145).
     """
 
     def __init__(self, frame_id: str) -> None:
@@ -304,12 +325,12 @@ class ImuTemplate:
             bytearray(head + struct.pack(f"<{IMU_DOUBLES}d", *body)), dtype=np.uint8
         )
         """The message, to be copied or filled in place."""
-        self.at = len(head) + 8 * IMU_BEFORE_RATE  # where the rate begins
+        self.at = len(head) + 8 * IMU_BEFORE_RATE  #: Index of the rate.
 
     def fill(
         self, stamp: int, rate: Sequence[float], covariance: Sequence[float]
     ) -> bytes:
-        """Return the message: stamp ns, rate (3,) rad/s, covariance (9,) by rows, symmetric, (rad/s)^2."""
+        """Return the message with stamp, ns, rate (3,), rad/s, and covariance (9,), (rad/s)^2."""
         upper = np.array([covariance[i] for i in (0, 1, 2, 4, 5, 8)], dtype=np.float64)
         fill_imu(
             self.bytes,
@@ -324,8 +345,8 @@ class ImuTemplate:
 class ChannelsTemplate:
     """Serialised std_msgs/Float64MultiArray of a fixed number of values, at least 1.
 
-    With labels, one for each value and without commas, the array has one dimension: its
-    label holds all of them, separated by commas.
+    With labels, one for each value, the array has one dimension, whose label contains
+    all labels separated by commas.
     """
 
     def __init__(self, count: int, labels: Sequence[str] = ()) -> None:
@@ -339,7 +360,7 @@ class ChannelsTemplate:
         self.count = count
         self.bytes = np.frombuffer(bytearray(head + bytes(8 * count)), dtype=np.uint8)
         """The message, to be copied or filled in place."""
-        self.at = len(head)  # where the values begin
+        self.at = len(head)  #: Index of the values.
 
     def fill(self, values: Iterable[float]) -> bytes:
         """Return the message with these values."""
