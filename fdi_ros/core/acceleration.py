@@ -18,7 +18,7 @@ from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration
 def differentiate_rate(
     acceleration: Acceleration, stamp: int, rate: NDArray[np.float64]
 ) -> None:
-    """Take the rate (3,) of one sample; the acceleration is then in ``acceleration.value``."""
+    """Add the rate (3,) of one sample, and update ``acceleration.value``."""
     here = acceleration.count
     acceleration.count += 1
     newest = acceleration.history[here % ACCELERATION_SAMPLES]
@@ -43,7 +43,7 @@ def differentiate_rate(
 
 @compiled
 def note_known(acceleration: Acceleration, oldest: int) -> None:
-    """Go on to a number of the oldest sample, and remember its rate if it had one."""
+    """Move the oldest sample to a number, and store its rate if it has one."""
     acceleration.oldest, one = (
         oldest,
         acceleration.history[oldest % ACCELERATION_SAMPLES],

@@ -30,7 +30,10 @@ from fdi_ros.core.subsets import fill_rate
 
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Fuse the usable channels without the doubtful ones; with them, or not at all, if too few are left."""
+    """Fuse the usable channels without the doubtful ones.
+
+    If too few remain, doubtful channels are fused as well, or no rate is given.
+    """
     settings, last, now = core.settings, core.last, core.now
     n = settings.n
     now.fused = choose_fused(settings, core.health, now, subsets, doubtful)
@@ -51,8 +54,8 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         if doubtful & now.usable:
             add_units(settings, now, last, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
-        # The rate is stated for the instant of the earliest unit, and the true one lies
-        # anywhere between that and the instant of the latest.
+        # The rate is stated for the instant of the earliest unit. The true instant lies
+        # between those of the earliest and the latest unit.
         for a in range(3):
             now.doubt[a] = core.sample.estimate.spread * core.acceleration.value[a]
         add_square(last.covariance, now.doubt, 1.0 / 3.0)
@@ -64,7 +67,10 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 @compiled
 def update_lag(core: Core) -> None:
-    """Find the instant of the rate, which lies before the stamp where units are late. Instants only increase."""
+    """Calculate the instant of the rate, which is before the stamp if units are late.
+
+    Instants only increase.
+    """
     true = core.now.evidence.stamp - round(1e9 * core.sample.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
@@ -81,7 +87,7 @@ def choose_fused(
     subsets: NDArray[Any],
     doubtful: int,
 ) -> int:
-    """Channels that are to be fused."""
+    """Return the channels to fuse."""
     usable = now.usable
     for i in range(settings.n):
         if health.returning[i] and subsets[usable & ~(1 << i)].spare:
@@ -95,14 +101,14 @@ def choose_fused(
         if doubtful & trusted and not settings.publish_under_doubt:
             now.withheld, trusted = True, 0
     if now.all_repeat and not is_at_rest(settings, now):
-        # A turning vehicle does not repeat values bit for bit: repeated values are old.
+        # A turning vehicle does not repeat values exactly: repeated values are old.
         now.withheld, trusted = True, 0
     return trusted
 
 
 @compiled
 def update_residuals(settings: PathSettings, now: Current, last: OutputRow) -> None:
-    """Differences of the channels from the fused rate, and from that with weights as expected."""
+    """Calculate residuals from the fused rate, and from the rate with expected weights."""
     axes = settings.sensors.axes
     for i in range(settings.n):
         last.residual[i] = now.tested[i] = math.nan
@@ -119,12 +125,12 @@ def update_gain(
     now: Current,
     subset: Subset,
 ) -> None:
-    """Variance of every channel, and the gain of the channels fused."""
+    """Calculate the variance of every channel, and the gain of the fused channels."""
     n, sensors = settings.n, settings.sensors
     for i in range(n):
         now.variance[i] = estimate.variance[i]
         if not estimate.known:
-            # The sample was not judged: the estimate is of an earlier motion.
+            # The sample was not judged: the estimate belongs to an earlier motion.
             rate_along = along(sensors.axes[i], now.plain_rate)
             expected = variance_of(sensors, i, rate_along, acceleration.value)
             now.variance[i] = max(now.variance[i], expected)
@@ -146,7 +152,11 @@ def add_units(
     subsets: NDArray[Any],
     doubtful: int,
 ) -> None:
-    """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
+    """Widen the covariance while whole units are in doubt.
+
+    The rates without each such unit count as equally likely, and the squares of their
+    differences from the fused rate are added.
+    """
     doubted = whole = 0
     for u in range(settings.units):
         inside = now.usable & settings.members[u]
@@ -164,7 +174,7 @@ def add_units(
 
 @compiled
 def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
-    """Add the outer product of an error of the rate (3,) with itself."""
+    """Add a share of the outer product of an error (3,) with itself."""
     k = 0
     for a in range(3):
         for b in range(a, 3):
@@ -174,10 +184,10 @@ def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
 
 @compiled
 def update_common_error(core: Core) -> None:
-    """Split the uncertainty of the errors into the part that passes for rate and the part in the residuals.
+    """Split the uncertainty of the errors into a part in the rate and one in the residuals.
 
-    With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G)
-    C (I - H G)'`` the roots of the diagonal in ``core.remaining``.
+    C is the covariance of the errors. ``B = G C G'`` is written to ``now.common``, and
+    the square roots of the diagonal of ``(I - H G) C (I - H G)'`` to ``core.remaining``.
     """
     n, axes = core.settings.n, core.settings.sensors.axes
     gain, common, shared = core.now.gain, core.now.common, core.now.shared_error

@@ -3,10 +3,10 @@
 
 """The two halves of a sample: gyros, and accelerometers in units of `PathSettings.natural`.
 
-Both pass the same path. A specific force f stands for the rate f / natural, so that one
-set of constants, in rad/s, serves both. Accelerometers come after the gyros, whose rate
-tells what a lever arm adds: a unit at r from the first measures ``alpha x r + omega x
-(omega x r)`` more.
+Both pass the same path. A specific force f enters as the rate f / natural, so that one
+set of constants in rad/s serves both. Accelerometers follow the gyros, because their
+lever arms need the rate: a unit at r from the first measures ``alpha x r + omega x
+(omega x r)`` in addition.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from fdi_ros.model.samples import Array
 
 @compiled
 def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
-    """Fill ``core.given`` with the values of one half of a sample, as the path takes them.
+    """Fill ``core.given`` with the values of one half of a sample, in units of the path.
 
-    ``gyros``: the core of the gyros, which for the accelerometers has worked the sample.
+    ``gyros`` is the core of the gyros. For the accelerometers, the gyros of the same
+    sample must have been processed.
     """
     given, settings = core.given, core.settings
     given.stamp, given.shift = sample.stamp, sample.shift
@@ -41,7 +42,7 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
 
 @compiled
 def take_off_lever_arms(core: Core, gyros: Core, force: Array) -> None:
-    """Subtract what the turning of the body adds at each accelerometer, m/s^2."""
+    """Subtract the accelerations by rotation of the body at each accelerometer, m/s^2."""
     omega, alpha, settings = gyros.last.rate, gyros.acceleration.value, core.settings
     if not math.isfinite(omega[0]):
         return

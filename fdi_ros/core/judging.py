@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The call of a detector: one row of constants and of memory for each set of channels, or one for all."""
+"""Calls of a detector. Constants and memory have one row for each set of channels, or one row."""
 
 from __future__ import annotations
 
@@ -14,18 +14,15 @@ from fdi_ros.compiling.compiled import call, compiled
 from fdi_ros.core.algebra import along
 from fdi_ros.core.records import Bank, Core, Current, SampleInput, SampleVerdict
 
-UNPREPARED, REFUSED = (
-    -1,
-    -2,
-)  # instead of a row: not prepared yet, or refused by the method
-LARGEST_RATE = (
-    1e6  # rad/s; larger finite values are clipped, so that squares stay finite
-)
+UNPREPARED, REFUSED = -1, -2
+"""In place of a row: not prepared yet, or refused by the method."""
+#: Larger finite values are limited to this, so that squares remain finite, rad/s.
+LARGEST_RATE = 1e6
 
 
 @compiled
 def present_in(z: NDArray[np.float64], n: int) -> int:
-    """Bits of the channels whose value is finite."""
+    """Return the mask of channels with a finite value."""
     mask = 0
     for i in range(n):
         if math.isfinite(z[i]):
@@ -35,7 +32,7 @@ def present_in(z: NDArray[np.float64], n: int) -> int:
 
 @compiled
 def clear_verdict(verdict: SampleVerdict, n: int) -> None:
-    """Verdict on a sample that was not judged: not judged is not healthy."""
+    """Write the verdict on a sample that was not judged, which is not a healthy one."""
     verdict.statistic = verdict.threshold = math.nan
     verdict.alarm = verdict.isolated = False
     for i in range(n):
@@ -48,9 +45,10 @@ def clear_verdict(verdict: SampleVerdict, n: int) -> None:
 def judge_sample(
     bank: Bank, sample: SampleInput, z: NDArray[np.float64], verdict: SampleVerdict
 ) -> bool:
-    """Judge a sample by the values z (n,) of the channels in its mask. The other fields must be filled in.
+    """Judge a sample by the values z (n,) of the channels in its mask.
 
-    Return False, without judging, if the constants of the set are unprepared.
+    The other fields of the sample must be filled in. Return False, without judging, if
+    the constants of the set are not prepared.
     """
     mask, judged = sample.mask, bank.judged
     row = 0 if bank.takes_any else bank.row[mask]
@@ -67,7 +65,7 @@ def judge_sample(
                 if math.isfinite(z[i])
                 else 0.0
             )
-            # What a method leaves untouched is no alarm.
+            # Fields that a method does not write must not mean an alarm.
             judged.suspects[k] = judged.outliers[k] = False
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
@@ -103,17 +101,17 @@ def judge_sample(
 
 @compiled
 def is_prepared(bank: Bank, mask: int) -> bool:
-    """Whether the constants for a set of channels are prepared, or the method refuses the set."""
+    """Return whether the constants of a set are prepared, or the method refuses the set."""
     return bank.takes_any or bank.row[mask] != UNPREPARED
 
 
 @compiled
 def judge_corrected(core: Core, bank: Bank) -> None:
-    """Judge the corrected values by another method than the estimator's own, into ``now.verdict``.
+    """Judge the corrected values by another method than the estimator's own.
 
-    The method was prepared for the noise expected. Residuals are divided by the root of
-    the excess of the noise of the moment over it, so the method keeps its false-alarm
-    rate. Noise and outliers stay those of the estimator.
+    The result is in ``now.verdict``. The method was prepared for the expected noise.
+    Residuals are divided by the square root of the excess of the present noise, so that
+    the method keeps its false-alarm rate. Noise and outliers are those of the estimator.
     """
     now, asked, axes = core.now, core.now.asked, core.settings.sensors.axes
     scale = math.sqrt(max(core.sample.estimate.excess, 1.0))
@@ -130,7 +128,7 @@ def judge_corrected(core: Core, bank: Bank) -> None:
 
 @compiled
 def take_verdict(now: Current, n: int) -> None:
-    """Let the verdict of the estimator's own detector be the one that declares."""
+    """Copy the verdict of the estimator's own detector to the one that declares."""
     source, target = now.guard, now.verdict
     target.statistic, target.threshold = source.statistic, source.threshold
     target.alarm, target.isolated = source.alarm, source.isolated

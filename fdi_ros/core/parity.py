@@ -1,17 +1,16 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Information about the errors of channels once the body rate is eliminated.
+"""Information about the errors of channels after elimination of the body rate.
 
-With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate
-w but its prior N(0, K^-1), K = k I:
+With values ``y = H w + d``, errors d of covariance M, and the prior N(0, K^-1) of the
+rate w, K = k I:
 
     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
 
-A is the information about d that the redundancy holds (a projector where M = I and k =
-0), G the weighted least squares. No basis of the null space is needed, and a channel
-that is absent is a row left out: rows and columns of the channels that are not in a set
-are zero.
+A is the information about d from the redundancy (a projector if M = I and k = 0), and G
+is the gain of weighted least squares. No basis of the null space is needed. For an
+absent channel the row is left out: rows and columns of channels outside a set are zero.
 """
 
 from __future__ import annotations
@@ -21,28 +20,13 @@ from fdi_ros.core.algebra import along, dot, invert
 from fdi_ros.core.records import Parity, Sensors
 from fdi_ros.model.samples import MAX_RATE, Array
 
-#
-# With values ``y = H w + d``, the errors d of covariance M, and nothing known of the
-# rate w but its prior N(0, K^-1),
-# K = k I:
-#
-#     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
-#
-# A is the information about d that the redundancy holds (a projector where M = I and k
-# = 0), G the weighted least
-# squares. No basis of the null space is needed, and a channel that is absent is a row
-# left out: rows and columns of the
-# channels that are not in a set are zero.
-
-
-UNKNOWN_RATE = (
-    1.0 / MAX_RATE**2
-)  # k where nothing is known: an axis that no channel measures is no division by zero
+#: k of an unknown rate. It is not zero, so that an unmeasured axis has an inverse.
+UNKNOWN_RATE = 1.0 / MAX_RATE**2
 
 
 @compiled
 def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
-    """Work out W H, and of ``H' W H + K`` the lower triangle."""
+    """Calculate W H, and the lower triangle of ``H' W H + K``."""
     for i in range(n):
         for a in range(3):
             parity.weighted[i, a] = dot(parity.weight[i], axes[:, a], n)
@@ -56,7 +40,7 @@ def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
 
 @compiled
 def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
-    """Work out A and G from W; ``known``: prior information k of the rate, s^2/rad^2."""
+    """Calculate A and G from W. ``known`` is the prior information k, s^2/rad^2."""
     update_normal(parity, n, axes, known)
     invert(parity.normal, 3, parity.inverse)
     for a in range(3):
@@ -72,7 +56,10 @@ def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
 
 @compiled
 def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) -> None:
-    """Work out A and G for independent errors of variances (n,), (rad/s)^2, while nothing is known of the rate."""
+    """Calculate A and G for independent errors of an unknown rate.
+
+    ``variance`` (n,) contains the variances of the errors, (rad/s)^2.
+    """
     n = sensors.n
     for i in range(n):
         for j in range(n):
@@ -86,7 +73,11 @@ def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) ->
 def fill_joint_parity(
     parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float
 ) -> None:
-    """Work out A and G for errors of a covariance (n, n), (rad/s)^2, with prior information k of the rate."""
+    """Calculate A and G for correlated errors.
+
+    ``covariance`` (n, n) is that of the errors, (rad/s)^2, and ``known`` the prior
+    information k of the rate, s^2/rad^2.
+    """
     n, count = sensors.n, 0
     for i in range(n):
         if mask >> i & 1:
@@ -109,7 +100,10 @@ def fill_joint_parity(
 
 @compiled
 def gained_rate(gain: Array, values: Array, n: int) -> float:
-    """Rate about one axis from its gains (n,) and values (n,), rad/s; values without gain may be NaN."""
+    """Return the rate about one axis from its gains (n,) and values (n,), rad/s.
+
+    Values with zero gain may be NaN.
+    """
     total = 0.0
     for i in range(n):
         if gain[i] != 0.0:
@@ -119,7 +113,7 @@ def gained_rate(gain: Array, values: Array, n: int) -> float:
 
 @compiled
 def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
-    """Rate (3,) of values (n,), rad/s: those of channels left out are not read."""
+    """Write the rate (3,) of values (n,), rad/s. Values with zero gain may be NaN."""
     for a in range(3):
         rate[a] = gained_rate(gain[a], values, n)
 
@@ -128,7 +122,10 @@ def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
 def covariance_of(
     gain: Array, n: int, variance: Array, together: Array, out: Symmetric
 ) -> None:
-    """Covariance G (diag(variance) + together) G' (6,) of a rate, upper triangle, (rad/s)^2."""
+    """Write the covariance G (diag(variance) + together) G' of a rate, (rad/s)^2.
+
+    ``out`` (6,) receives the upper triangle.
+    """
     k = 0
     for a in range(3):
         for b in range(a, 3):

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Error model of the channels, as every method needs it."""
+"""Error model of the channels for all methods."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from fdi_ros.model.noise import NoiseModel
 def variance_of(
     sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]
 ) -> float:
-    """Error variance of a channel, (rad/s)^2, from the rate along its own axis, rad/s."""
+    """Return the error variance of a channel, (rad/s)^2, at a rate along its axis, rad/s."""
     scale = sensors.scale_std[i] * rate_along
     timing = sensors.timing_std[i] * along(sensors.axes[i], acceleration)
     return sensors.noise_std[i] * sensors.noise_std[i] + scale * scale + timing * timing
 
 
 def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> None:
-    """Fill a record of `Sensors`; noise with one value per channel."""
+    """Fill a record of `Sensors` from noise with one value per channel."""
     n = geometry.n
     sensors["n"], sensors["constant"] = n, noise.constant
     sensors["axes"][:n], sensors["gain"][:n] = geometry.axes, geometry.least_squares.T
