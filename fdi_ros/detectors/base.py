@@ -1,16 +1,14 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The contract of a detector: samples in, verdicts out; it never votes, logs, or holds on to what has ended.
+"""Interface of detectors: samples in, verdicts out, without votes or logs.
 
-A method is a class that prepares constants, once, from geometry and noise, and a
-compiled function that judges one sample with them. Both stand in the method's own
-module:
+A method is a class that prepares constants once from geometry and noise, and a compiled
+function that judges one sample with them. The module of the method contains
 
-- ``Constants``: a record whose first field is ``sensors: Sensors``; filled by the class, in NumPy.
-- ``State``: a record of what the method remembers between samples; all zero is a fresh one.
-- ``judge(constants, state, sample, verdict)``: compiled, called for each sample through
-  its address.
+- ``Constants``: a record with first field ``sensors: Sensors``, filled by the class;
+- ``State``: a record of the memory between samples, initially zero;
+- ``judge(constants, state, sample, verdict)``: compiled, called by address.
 """
 
 from __future__ import annotations
@@ -42,42 +40,42 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 
-MOST_ROWS = 512  # sets of channels for which constants are kept at most
+MOST_ROWS = 512  #: Largest number of sets of channels with stored constants.
 
 
 class Verdict(NamedTuple):
     """Verdicts of a detector on N samples of n channels.
 
-    A sample it could not judge (too few channels present for this method) has a NaN
-    statistic and threshold and no alarm: not judged is not healthy.
+    A sample that could not be judged (too few channels for the method) has NaN as
+    statistic and threshold, and no alarm. Such a sample is not healthy, but unknown.
     """
 
-    statistic: Array  #: (N,) the figure compared with the threshold
-    threshold: Array  #: (N,) alarm where the statistic reaches it
-    alarm: Mask  #: (N,) at least one channel is faulty
-    suspects: Mask  #: (N, n) the channels that may be faulty; none without alarm
+    statistic: Array  #: Figure compared with the threshold, (N,).
+    threshold: Array  #: Statistic from which on the method alarms, (N,).
+    alarm: Mask  #: At least one channel is faulty, (N,).
+    suspects: Mask  #: Channels that may be faulty, (N, n). None without an alarm.
     isolated: Mask
-    """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the
-    evidence cannot tell which."""
-    error: Array  #: (N, n) estimated error of each suspect, rad/s; 0 elsewhere
+    """Every suspect is faulty, (N,). With an alarm that is not isolated, at least one
+    suspect is faulty, and the evidence does not show which."""
+    error: Array  #: Estimated error of each suspect, rad/s, otherwise 0, (N, n).
     scores: Array
-    """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a
-    channel not judged."""
+    """The method's figure per channel, as tabulated in its paper, (N, n). NaN for a
+    channel that was not judged."""
 
 
 @record
 class NoState:
-    """Memory of a method that has none."""
+    """Memory of a method without memory."""
 
     unused: Whole
 
 
 class Detector(ABC):
-    """Base of all detectors: checks the shape, and judges a sample with absent channels by the channels left.
+    """Base of all detectors. Samples with absent channels are judged by those present.
 
     A channel whose value is NaN or infinite is absent from that sample. For each set of
-    channels present constants of the same method and options are prepared once, and a
-    memory of its own is kept.
+    present channels, the constants of the method are prepared once, and a separate
+    memory is kept.
 
     Parameters
     ----------
@@ -86,7 +84,7 @@ class Detector(ABC):
     noise
         Error model of a healthy channel.
     options
-        Options of the method, as given; passed on to the detectors of fewer channels.
+        Options of the method, also for its detectors on fewer channels.
     """
 
     name: ClassVar[str]
@@ -94,9 +92,9 @@ class Detector(ABC):
     State: type = NoState
     judge: Callback
     takes_any: ClassVar[bool] = False
-    """One row of constants and one memory serve all sets of channels; else each set has
-    its own."""
-    sample_rate = 100.0  #: Hz, of samples without stamps
+    """One row of constants and one memory serve all sets of channels. Otherwise each
+    set has its own."""
+    sample_rate = 100.0  #: Rate of samples without stamps, Hz.
 
     def __init__(
         self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]
@@ -117,20 +115,20 @@ class Detector(ABC):
 
     @classmethod
     def refuses(cls, n: int) -> str:
-        """Why the method cannot run on n channels that span space; empty if it can."""
+        """Return why the method cannot run on n channels that span space, or ""."""
         return ""
 
     @property
     def isolable(self) -> Mask:
-        """Channels whose fault this method names without another one beside it, (n,)."""
+        """Channels whose single fault this method isolates, (n,)."""
         return self.geometry.isolable
 
     def reset(self) -> None:
-        """Forget all samples seen; only methods with a memory of their own have something to forget."""
+        """Clear the memory of all samples."""
         self.states[:] = 0
 
     def clear(self, declared: int = 0) -> None:
-        """Forget all suspicion of channels, some of which were declared; what a method has learned of others stays."""
+        """Clear all suspicions. Estimates of channels that were not declared are kept."""
         self.reset()
 
     @cached_property
@@ -139,26 +137,26 @@ class Detector(ABC):
 
     @property
     def bank(self) -> NDArray[Any]:
-        """Where compiled code finds constants and memory for each set of channels, (1,)."""
+        """Addresses of constants and memory for each set of channels, (1,)."""
         return self._rows.bank
 
     @property
     def states(self) -> NDArray[Any]:
-        """Memories of the method, one row for each set of channels prepared; row 0 is that of all channels."""
+        """Memory of the method, one row for each prepared set. Row 0 is for all channels."""
         return self._rows.states
 
     @property
     def memory(self) -> NDArray[np.uint8]:
-        """The bytes of `states`: setting all to zero forgets all samples."""
+        """The bytes of `states`. Zeros clear the memory."""
         return self.states.view(np.ndarray).view(np.uint8)
 
     def prepare(self, mask: int) -> None:
-        """Prepare the constants for the channels whose bits are set, unless that was done before."""
+        """Prepare the constants for a set of channels, if not yet prepared."""
         if not self.takes_any and self.bank["row"][0, mask] == UNPREPARED:
             self._rows.add(mask, self.fewer(mask))
 
     def fewer(self, mask: int) -> Detector | None:
-        """Return the same method on the channels whose bits are set, None where it cannot run on them."""
+        """Return the same method on a set of channels, or None if it cannot run on them."""
         n = self.geometry.n
         if mask == whole_set(n):
             return self
@@ -169,12 +167,12 @@ class Detector(ABC):
                     self.geometry.subset(kept), self.noise.subset(kept), **self.options
                 )
             except (FdiError, ValueError, np.linalg.LinAlgError) as error:
-                # Of near-parallel axes some methods cannot be built at all.
+                # With nearly parallel axes some methods cannot be built.
                 self._fewer[mask] = None
                 self.refusals[mask] = str(error)
             if len(self._fewer) > MOST_ROWS:
-                # A stream of random absences must not fill the memory: the oldest set
-                # is built again if it comes.
+                # Random absences must not fill the memory. The oldest set is built
+                # again when needed.
                 self._fewer.pop(next(iter(self._fewer)))
         return self._fewer[mask]
 
@@ -184,15 +182,17 @@ class Detector(ABC):
         Parameters
         ----------
         z
-            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A
-            finite value beyond `LARGEST_RATE` counts as that.
+            Measured channels, (N, n), rad/s. NaN or infinite: absent from that sample.
+            Finite values are limited to `LARGEST_RATE`.
         acceleration
-            Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing
-            term; None is zero.
+            Body angular acceleration, (N, 3), rad/s^2, for noise models with a timing
+            term. None: zero.
 
         Returns
         -------
-        Verdict on each sample. How a stream is cut into blocks changes nothing.
+        Verdict
+            Verdict on each sample. Verdicts do not depend on the division of a stream
+            into blocks.
 
         Raises
         ------
@@ -230,10 +230,10 @@ class Detector(ABC):
 
 
 class _Rows:
-    """Constants and memories of a detector and of its kin on fewer channels, one row each.
+    """Constants and memory of a detector and of its variants on fewer channels.
 
-    Compiled code reaches them by their address: they never move. Room for all rows
-    costs no memory until it is used.
+    Compiled code has their addresses, so the arrays never move. The operating system
+    provides memory for rows only when they are used.
     """
 
     def __init__(self, detector: Detector) -> None:
@@ -263,7 +263,7 @@ class _Rows:
         self.constants[0] = detector.constants[0]
 
     def add(self, mask: int, detector: Detector | None) -> None:
-        """Take in the constants for a set of channels."""
+        """Add the constants for a set of channels."""
         if detector is None:
             self.bank["row"][0, mask] = REFUSED
             return
@@ -292,9 +292,9 @@ def judge_rows(
     verdicts: NDArray[Any],
     start: int,
 ) -> int:
-    """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
+    """Judge samples z (N, n) from row `start` on, with acceleration (N, 3) or (1, 3).
 
-    Returned is the first row whose channels present are unprepared; N if all are judged.
+    Return the first row whose set of channels is not prepared, or N at the end.
     """
     for k in range(start, len(z)):
         sample[0].mask, sample[0].stamp = present_in(z[k], bank[0].n), bank[0].clock
@@ -310,7 +310,7 @@ def judge_rows(
 
 
 def as_verdict(verdicts: NDArray[Any], n: int) -> Verdict:
-    """Verdict on N samples of n channels from their records, (N,)."""
+    """Return the verdict on N samples of n channels from their records, (N,)."""
     flags = np.dtype(np.bool_)
     return Verdict(
         verdicts["statistic"],
@@ -324,7 +324,7 @@ def as_verdict(verdicts: NDArray[Any], n: int) -> Verdict:
 
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:
-    """Names of the options that a detector class takes."""
+    """Return the names of the options of a detector class."""
     names: list[str] = []
     for kind in method.__mro__:
         parameters = inspect.signature(kind).parameters.values()
@@ -333,7 +333,7 @@ def accepted_options(method: type[Detector]) -> tuple[str, ...]:
             for one in parameters
             if one.kind == one.KEYWORD_ONLY and one.name not in names
         ]
-        # What a class does not name it passes on to its base.
+        # Options that a class does not name go to its base.
         if all(one.kind != one.VAR_KEYWORD for one in parameters):
             break
     return tuple(names)
@@ -342,7 +342,11 @@ def accepted_options(method: type[Detector]) -> tuple[str, ...]:
 def built(
     method: Any, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]
 ) -> Any:
-    """Build a method; `DetectorError` if it does not take an option, or cannot run on this geometry."""
+    """Build a method.
+
+    Raise `DetectorError` for an unknown option, or if the method cannot run on this
+    geometry.
+    """
     for option in options:
         if option not in accepted_options(method):
             known = ", ".join(accepted_options(method)) or "none"

@@ -23,19 +23,18 @@ from fdi_ros.system.text import html_table, listed
 
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
-# |rho| above which two channels have one parity direction for every practical purpose
+#: |rho| above which two channels have, in practice, the same parity direction.
 SAME_DIRECTION = 0.999
-# relative: double precision leaves 1e-16 of values, which products of matrices multiply
+#: Relative bound of rounding errors: 1e-16, multiplied by products of matrices.
 ROUNDING = 1e-9
-# axes whose smallest singular value is a smaller share of the largest do not span space
+#: Smallest ratio of the singular values of axes that span space.
 MIN_SINGULAR_RATIO = 0.02
-MIN_SENSITIVITY = (
-    0.03  # sqrt(S_ii) below which a fault of channel i does not reach the parity vector
-)
+#: sqrt(S_ii) below which a fault of channel i does not reach the parity vector.
+MIN_SENSITIVITY = 0.03
 
 
 def spans_space(axes: Array) -> bool:
-    """Whether axes (k, 3) determine all three components of a body rate."""
+    """Return whether axes (k, 3) determine all three components of a body rate."""
     if len(axes) < 3:
         return False
     singular = np.linalg.svd(axes, compute_uv=False)
@@ -43,7 +42,7 @@ def spans_space(axes: Array) -> bool:
 
 
 class Geometry:
-    """The sensitivity axes of 4 to 12 gyro channels and what follows from them.
+    """The sensitivity axes of 4 to 12 gyro channels and derived quantities.
 
     Parameters
     ----------
@@ -53,9 +52,8 @@ class Geometry:
     channel_names
         One name per channel; default g1, g2, ...
     units
-        Name of the unit that each channel belongs to, (n,): channels of one housing,
-        which may fail together. Default: by the part of their names before the last
-        point.
+        Name of the unit of each channel, (n,): channels of one housing, which may fail
+        together. Default: the part of the channel's name before the last point.
 
     Raises
     ------
@@ -80,7 +78,7 @@ class Geometry:
             if units is None
             else tuple(units)
         )
-        """Unit of each channel; empty for one that belongs to none."""
+        """Unit of each channel, or "" without a unit."""
         for count, called in (
             (len(names), "channel names"),
             (len(self.unit_of), "names of units"),
@@ -184,12 +182,12 @@ class Geometry:
 
     @cached_property
     def sensitivity(self) -> Array:
-        """sqrt(S_ii), (n,): how much of a unit fault in channel i reaches the parity vector, 0 to 1."""
+        """sqrt(S_ii), (n,): share of a fault of channel i in the parity vector, 0 to 1."""
         return np.sqrt(np.clip(np.diag(self.S), 0, None))
 
     @cached_property
     def rho(self) -> Array:
-        """Correlation of the normalised residuals, (n, n); 0 in rows of channels no fault of which is seen."""
+        """Correlation of the normalised residuals, (n, n), 0 for undetectable channels."""
         scale = np.where(self.detectable, self.sensitivity, np.inf)
         correlation = self.S / np.outer(scale, scale)
         np.fill_diagonal(correlation, 1.0)
@@ -202,7 +200,7 @@ class Geometry:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Channels that cannot be told apart (``|rho| > 0.999``), every channel in exactly one group."""
+        """Groups of indistinguishable channels (``|rho| > 0.999``), each channel in one."""
         same = np.abs(self.rho) > SAME_DIRECTION
         left, groups = list(range(self.n)), []
         while left:
@@ -213,7 +211,7 @@ class Geometry:
 
     @cached_property
     def group_matrix(self) -> NDArray[np.bool_]:
-        """(n, n): row i marks the channels that cannot be told apart from channel i, itself included."""
+        """(n, n): row i marks channel i and all channels indistinguishable from it."""
         number = np.array(
             [
                 next(k for k, group in enumerate(self.groups) if i in group)
@@ -224,13 +222,13 @@ class Geometry:
 
     @cached_property
     def isolable(self) -> NDArray[np.bool_]:
-        """(n,): whether a single fault of the channel is seen and can be told from all others."""
+        """(n,): whether a single fault of the channel is detectable and distinguishable."""
         alone: NDArray[np.bool_] = self.group_matrix.sum(axis=1) == 1
         return alone & self.detectable
 
     @cached_property
     def units(self) -> tuple[tuple[int, ...], ...]:
-        """Channels of each unit; units of one channel left out."""
+        """Channels of each unit with at least two channels."""
         names = dict.fromkeys(filter(None, self.unit_of))
         members = (
             tuple(i for i in range(self.n) if self.unit_of[i] == name) for name in names
@@ -238,7 +236,10 @@ class Geometry:
         return tuple(unit for unit in members if len(unit) > 1)
 
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
-        """Covariance (3, 3) of the least-squares rate for channel variances, scalar or (n,), (rad/s)^2."""
+        """Return the covariance (3, 3) of the least-squares rate, (rad/s)^2.
+
+        ``variance`` is that of the channels, scalar or (n,), (rad/s)^2.
+        """
         gain = self.least_squares
         return (
             gain * np.broadcast_to(np.asarray(variance, dtype=np.float64), self.n)
@@ -250,7 +251,10 @@ class Geometry:
         return float(np.sqrt(np.trace(self.covariance())))
 
     def subset(self, mask: ArrayLike) -> Geometry:
-        """Geometry of the channels marked in mask (n,) bool; `GeometryError` if they are too few, or in a plane."""
+        """Return the geometry of the channels marked in mask, (n,) bool.
+
+        Raise `GeometryError` if they are too few, or in a plane.
+        """
         kept = np.flatnonzero(np.asarray(mask, dtype=bool))
         return Geometry(
             self.axes[kept],
@@ -306,21 +310,24 @@ def _rotation(mount: ArrayLike, index: int) -> Array:
 # ------------------------------------------------------------------------------------------------------
 
 
-PARALLEL = 0.985  # cosine of the angle from which on two channels measure the same axis: 10 deg
-# names that are told one by one; of more it is said how many they are, or which few are
-# not among them
+#: Cosine of the largest angle between channels that measure the same axis: 10 deg.
+PARALLEL = 0.985
+#: Largest number of names listed one by one.
 _FEW = 3
 
 
 def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
-    """Whether channels, two at least, all measure one axis, with either sign."""
+    """Return whether two or more channels all measure one axis, with either sign."""
     axes = geometry.axes[list(channels)]
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     return len(channels) > 1 and bool((np.abs(axes @ axes[0]) >= PARALLEL).all())
 
 
 def lone_pairs(geometry: Geometry) -> list[tuple[int, int]]:
-    """Pairs of channels that alone measure one axis: of these no evidence tells which is wrong."""
+    """Return pairs of channels that alone measure one axis.
+
+    No evidence shows which of such a pair is faulty.
+    """
     pairs = [
         pair
         for pair in combinations(range(geometry.n), 2)
@@ -331,7 +338,10 @@ def lone_pairs(geometry: Geometry) -> list[tuple[int, int]]:
 
 
 def whole_units(geometry: Geometry, channels: Sequence[int]) -> list[str]:
-    """Names of the units that a set of channels consists of; empty if it consists of other than whole units."""
+    """Return the names of the units that form a set of channels.
+
+    Empty if the set does not consist of whole units.
+    """
     inside = [unit for unit in geometry.units if set(channels).issuperset(unit)]
     whole = sum(map(len, inside)) == len(channels)
     return (
@@ -342,7 +352,7 @@ def whole_units(geometry: Geometry, channels: Sequence[int]) -> list[str]:
 
 
 def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
-    """Say which channels one is of: `the x axis of imu_1 or imu_2`, `imu_1 or imu_2`, `imu_1.x or imu_2.y`."""
+    """Return words for one channel of a set, such as `the x axis of imu_1 or imu_2`."""
     names = [geometry.channel_names[i] for i in channels]
     if len(names) == geometry.n:
         return f"any of the {geometry.n} channels"
@@ -367,7 +377,7 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
 
 
 def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
-    """Say which channels all are meant: `imu_2.y`, `imu_2`, `imu_2.x and imu_2.y`."""
+    """Return words for all channels of a set: `imu_2.y`, `imu_2`, `imu_2.x and imu_2.y`."""
     names = whole_units(geometry, channels) or [
         geometry.channel_names[i] for i in channels
     ]
@@ -375,7 +385,7 @@ def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
 
 
 def axis_words(geometry: Geometry, channel: int) -> str:
-    """Say what axis of the body a channel measures: `-y`, or its direction."""
+    """Return the body axis of a channel, such as `-y`, or its direction."""
     axis = geometry.axes[channel] / np.linalg.norm(geometry.axes[channel])
     largest = int(np.abs(axis).argmax())
     if abs(axis[largest]) >= PARALLEL:

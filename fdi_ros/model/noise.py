@@ -1,9 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The errors of a healthy channel; from a false-alarm rate to a threshold, and to the faults that show at one.
+"""Errors of a healthy channel, false-alarm rates, thresholds and detectable faults.
 
-NumPy and the standard library only: chi-square tails of whole degrees of freedom are finite sums.
+Chi-square tails with a whole number of degrees of freedom are finite sums, so NumPy and
+the standard library suffice.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ class NoiseModel:
     """Error of a healthy channel in one sample.
 
     The variance of channel i is ``noise_std^2 + (scale_std * rate_i)^2 + (timing_std *
-    accel_i)^2`` with rate_i and accel_i the body rate and angular acceleration along
-    the channel's axis.
+    accel_i)^2``, where rate_i and accel_i are the body rate and the angular acceleration
+    along the channel's axis.
 
     Parameters
     ----------
@@ -36,15 +37,14 @@ class NoiseModel:
     scale_std
         Standard deviation of the scale-factor error, dimensionless, 0 to 1 (sigma_k).
     timing_std
-        Standard deviation of the sampling instant, s, 0 to 1; it multiplies the angular
+        Standard deviation of the sampling instant, s, 0 to 1, multiplied by the angular
         acceleration.
     bound
-        Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma);
-        needed by `guaranteed` alone.
-
+        Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma).
+        Only `guaranteed` needs this.
     bias_std
-        Standard deviation of the bias left after its correction, rad/s, >= 0; it does
-        not average out, so only methods that accumulate count it.
+        Standard deviation of the bias left after its correction, rad/s, >= 0. A bias
+        does not average out, so only methods that accumulate use this.
 
     Each is a scalar, or (n,) with one value per channel.
 
@@ -79,7 +79,10 @@ class NoiseModel:
         return not (self.scale_std.any() or self.timing_std.any())
 
     def for_channels(self, n: int) -> NoiseModel:
-        """Return the same model with one value per channel; `ConfigError` if one has them for another number than n."""
+        """Return the same model with one value per channel.
+
+        Raise `ConfigError` if a value exists for another number of channels than n.
+        """
         return NoiseModel(
             **{
                 name: _spread(name, v, n)
@@ -99,10 +102,16 @@ class NoiseModel:
     def variance(
         self, geometry: Geometry, rate: Array, acceleration: Array | None = None
     ) -> Array:
-        """Error variance of every channel, (N, n) (rad/s)^2.
+        """Return the error variance of every channel, (N, n), (rad/s)^2.
 
-        ``rate``: of the body, (N, 3) rad/s; ``acceleration``: angular, (N, 3) rad/s^2,
-        None is zero.
+        Parameters
+        ----------
+        geometry
+            Sensitivity axes of the n channels.
+        rate
+            Body rate, (N, 3), rad/s.
+        acceleration
+            Angular acceleration, (N, 3), rad/s^2. None: zero.
         """
         total = (rate @ geometry.axes.T * self.scale_std) ** 2 + self.noise_std**2
         if acceleration is not None:
@@ -121,7 +130,7 @@ def _spread(name: str, value: Array, n: int) -> Array:
 def _checked(
     name: str, value: ArrayLike, unit: str, high: float = np.inf, above: bool = False
 ) -> Array:
-    """Return a value from 0 on, or above 0, up to a limit."""
+    """Return a value that is at least 0, or above 0, and at most a limit."""
     array = np.array(value, dtype=np.float64)
     within = (array > 0 if above else array >= 0) & (array <= high) & np.isfinite(array)
     if array.ndim > 1 or array.size == 0 or not within.all():
@@ -136,18 +145,26 @@ def _checked(
     return array
 
 
-# times all channels of other units. Body vibration makes up to sqrt(3) in any mounting
+#: Ratio to all channels of other units. Vibration of the body gives at most sqrt(3).
 MUCH_NOISIER = 3.0
 
 
 def much_noisier(
     noise: Array, units: Sequence[Sequence[int]]
 ) -> list[tuple[int, float]]:
-    """Find channels that are much noisier than every channel of all other units, with the noisiest of these, rad/s.
+    """Find channels that are much noisier than every channel of all other units.
 
-    ``noise`` (n,) of each channel, rad/s; what is not finite is not compared.
-    ``units``: numbers of the channels of each; channels that fail alone are units of
-    one.
+    Parameters
+    ----------
+    noise
+        Noise of each channel, rad/s, (n,). Values that are not finite are ignored.
+    units
+        Channels of each unit. A channel that fails alone is a unit of its own.
+
+    Returns
+    -------
+    list
+        Channel, and the largest noise in all other units, rad/s.
     """
     found = []
     for k, unit in enumerate(units):
@@ -168,10 +185,16 @@ def noisier_words(
     unit: str = "rad/s",
     factor: float = 1.0,
 ) -> str:
-    """Say which channels are much noisier than the others, with figures; empty: none is.
+    """Return words about channels that are much noisier than the others, or "".
 
-    ``noise``, ``units`` as `much_noisier` takes them. ``unit``, ``factor``: unit of
-    rates in the words, and how many of it are 1 rad/s.
+    Parameters
+    ----------
+    names
+        Names of the channels.
+    noise, units
+        As for `much_noisier`.
+    unit, factor
+        Unit of rates in the words, and 1 rad/s in this unit.
     """
     found = much_noisier(noise, units)
     if not found:
@@ -185,24 +208,27 @@ def noisier_words(
 # ----------------------------------------------------------------------------------------------------
 
 
-DEFAULT_PROBABILITY = 1e-6  # per sample
+DEFAULT_PROBABILITY = 1e-6  #: Per sample.
 DEFAULT_RUN_LENGTH, MIN_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 2.0, 1e15
-"""Samples; the default is one false alarm in 1000 hours at 100 Hz."""
+"""Samples. The default is one false alarm in 1000 hours at 100 Hz."""
 BY_PROBABILITY = ("false_alarm_probability", "false_alarms_per_hour", "sample_rate")
-"""Options of a detector that judges each sample by itself."""
+"""Options of a detector that judges each sample alone."""
 
 
 @dataclass(frozen=True)
 class FalseAlarmRate:
-    """A false-alarm rate as it is asked for, by options of a detector; stated in no way, each reading has its default.
+    """A false-alarm rate, stated by one option of a detector or by none (default).
 
-    `ConfigError` if it is stated in two ways, or a value is out of its range.
+    Raises
+    ------
+    ConfigError
+        If the rate is stated in two ways, or a value is out of range.
     """
 
-    run_length: float | None = None  # mean samples to a false alarm
-    false_alarm_probability: float | None = None  # per sample, between 0 and 1
-    false_alarms_per_hour: float | None = None  # expected, > 0; needs the sample rate
-    sample_rate: float | None = None  # Hz, > 0
+    run_length: float | None = None  #: Mean number of samples to a false alarm.
+    false_alarm_probability: float | None = None  #: Per sample, between 0 and 1.
+    false_alarms_per_hour: float | None = None  #: > 0. Needs the sample rate.
+    sample_rate: float | None = None  #: Hz, > 0.
 
     def __post_init__(self) -> None:
         given = [
@@ -229,7 +255,10 @@ class FalseAlarmRate:
                 )
 
     def per_sample(self) -> float:
-        """Probability of a false alarm in one sample; `ConfigError` if it is not between 0 and 1."""
+        """Return the probability of a false alarm in one sample.
+
+        Raise `ConfigError` if the result is not between 0 and 1.
+        """
         probability = (
             DEFAULT_PROBABILITY
             if self.false_alarm_probability is None
@@ -246,7 +275,10 @@ class FalseAlarmRate:
         return probability
 
     def mean_run_length(self) -> float:
-        """Mean samples to a false alarm; `ConfigError` if it is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`."""
+        """Return the mean number of samples to a false alarm.
+
+        Raise `ConfigError` if the result is not `MIN_RUN_LENGTH` to `MAX_RUN_LENGTH`.
+        """
         samples = DEFAULT_RUN_LENGTH if self.run_length is None else self.run_length
         if (
             self.false_alarms_per_hour is not None
@@ -262,9 +294,9 @@ class FalseAlarmRate:
     def as_options(
         self, accepted: Collection[str] = BY_PROBABILITY
     ) -> dict[str, float]:
-        """Return those of the options accepted, of a detector, that state the same.
+        """Return the options, among those accepted by a detector, that state this rate.
 
-        One that takes a run length and no probability gets the run length.
+        For a detector that accepts only a run length, a probability is converted.
         """
         options, probability = dict(vars(self)), self.false_alarm_probability
         if (
@@ -281,7 +313,7 @@ class FalseAlarmRate:
 
 
 def erfc(x: Array) -> Array:
-    """Complementary error function, elementwise."""
+    """Return the complementary error function, elementwise."""
     return np.asarray(np.frompyfunc(math.erfc, 1, 1)(x), dtype=np.float64)
 
 
@@ -290,12 +322,15 @@ def erfc(x: Array) -> Array:
 
 
 def normal_isf(probability: float) -> float:
-    """Upper quantile of the standard normal."""
+    """Return the upper quantile of the standard normal distribution."""
     return -NormalDist().inv_cdf(probability)
 
 
 def chi2_sf(x: Array | float, dof: int) -> Array:
-    """P(chi-square with whole dof > x), elementwise; the closed sums of Abramowitz and Stegun 26.4.4-5."""
+    """Return P(chi-square with whole dof > x), elementwise.
+
+    These are the finite sums of Abramowitz and Stegun 26.4.4-5.
+    """
     half = np.asarray(x, dtype=np.float64) / 2
     if dof % 2 == 0:
         terms = [half**k / math.factorial(k) for k in range(dof // 2)]
@@ -307,23 +342,23 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
 
 
 def chi2_isf(probability: float, dof: int) -> float:
-    """Threshold that a chi-square with whole dof exceeds with the given probability."""
+    """Return the threshold that a chi-square with whole dof exceeds with a probability."""
     start = max(normal_isf(probability), 0.0) ** 2 + dof
     return solve_log(lambda x: float(chi2_sf(x, dof)), probability, start)
 
 
 def max_normal_threshold(directions: Array, probability: float) -> float:
-    """Exact threshold of ``max_i |w_i|`` for standard normal w_i = directions_i . p, p white in m dimensions.
+    """Return the threshold that ``max_i |directions_i . p|`` exceeds with a probability.
 
-    The threshold is exceeded with a probability, 0 to 1; directions (n, m) are unit
-    vectors. Up to m = 3 the chi-square tail of ``(t / M(u))^2``, ``M(u) = max_i
-    |directions_i . u|``, is averaged over the unit sphere by quadrature. Above, over
-    samples drawn beyond the threshold along each direction in turn (Naiman and Priebe
-    2001), which keeps its relative accuracy far into the tail.
+    p is white in m dimensions, and directions (n, m) are unit vectors. Up to m = 3 the
+    chi-square tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged
+    over the unit sphere by quadrature. For larger m the average is over samples drawn
+    beyond the threshold along each direction in turn (Naiman and Priebe 2001), which
+    keeps the relative accuracy far into the tail.
     """
     kept: list[int] = []
     for i, direction in enumerate(directions):
-        # Twins but for rounding count once.
+        # Equal directions, except for rounding, count once.
         if all(abs(direction @ directions[j]) < 1 - ROUNDING for j in kept):
             kept.append(i)
     unique = directions[kept]
@@ -342,10 +377,10 @@ def _sphere_tail(directions: Array) -> Callable[[float], float]:
 
 
 def _half_sphere(m: int) -> tuple[Array, Array]:
-    """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
+    """Return directions (D, m) on half the unit sphere and their weights (D,), m = 1 to 3.
 
-    In a plane there are 360 of them; in space 128 at each of 48 heights, which are
-    those of Gauss and Legendre.
+    In a plane these are 360 directions, in space 128 at each of 48 heights, which are
+    nodes of Gauss-Legendre quadrature.
     """
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
@@ -364,11 +399,10 @@ def _half_sphere(m: int) -> tuple[Array, Array]:
 
 
 def _union_tail(directions: Array) -> Callable[[float], float]:
-    # Seeded once: the threshold is a function of the geometry, the same in every run.
+    # A fixed seed makes the threshold a function of the geometry alone.
     rng = np.random.default_rng(20190101)
     n, m = directions.shape
-    # The more directions share in the estimate, the fewer draws each needs: the cost
-    # grows with n squared, not cubed.
+    # With more directions each needs fewer draws. Thus the cost grows with n squared.
     draws = min(4096, 16 * 4096 // n)
     white = rng.standard_normal((draws, m)) @ directions.T
     log_levels = np.log((rng.permutation(draws) + 0.5) / draws)
@@ -377,7 +411,7 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
 
     def tail(t: float) -> float:
         single = math.erfc(t / math.sqrt(2))
-        # 257 quantiles and straight lines between them: within 1e-5, and all draws at once.
+        # Linear interpolation between 257 quantiles has an error below 1e-5.
         along = np.interp(
             log_levels,
             nodes,
@@ -387,8 +421,7 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
         for i in range(n):
             w = (along - white[:, i])[:, None] * correlation[i]
             w += white
-            # Comparing i's own value, rounded, with t would lose the one exceedance
-            # that is certain.
+            # The own value of i exceeds t by construction. Rounding must not change this.
             w[:, i] = 0.0
             others = (np.abs(w, out=w) > t).sum(axis=1)
             total += single * float(np.mean(1 / (1 + others)))
@@ -398,7 +431,10 @@ def _union_tail(directions: Array) -> Callable[[float], float]:
 
 
 def solve_log(tail: Callable[[float], float], level: float, start: float) -> float:
-    """Root of log tail(t) = log level, t > 0, by secant: tails and run lengths are nearly exponential in t."""
+    """Return the root t > 0 of log tail(t) = log level by the secant method.
+
+    Tails and run lengths are nearly exponential in t.
+    """
     target = math.log(level)
     older, newer = start, start + 0.05
     f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
@@ -412,23 +448,21 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
     return newer
 
 
-DETECTION = (
-    0.99  # probability with which the smallest detectable error is seen in one sample
-)
-# third singular value below which directions are in one plane: mounts are known no
-# better
+#: Probability with which one sample shows the smallest detectable error.
+DETECTION = 0.99
+#: Third singular value below which directions are in one plane, since mounts are uncertain.
 IN_PLANE = 0.1
-MOST_SETS = 4  # sets of channels that are listed
+MOST_SETS = 4  #: Largest number of listed sets of channels.
 
 
 def smallest_detectable(
     geometry: Geometry, noise: NoiseModel, probability: float
 ) -> Array:
-    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
+    """Return the error (n,), rad/s, of each channel that one sample at rest shows.
 
-    The test is the largest normalised residual at a false-alarm probability. A
-    channel's own residual, whitened, is ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0,
-    1)``; that some other one passes the threshold first is left out.
+    The probability of detection is `DETECTION`. The test is the largest normalised
+    residual at a false-alarm probability. The whitened residual of a channel is ``w_i =
+    error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``. Alarms by other channels are neglected.
     """
     V = geometry.parity
     inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
@@ -445,10 +479,9 @@ def smallest_detectable(
 
 
 def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
-    """Channels of which two that fail in step look like a fault of a third, set by set.
+    """Return sets of channels in which two equal faults look like a fault of a third.
 
-    Their directions in parity space lie in a plane: three parallel gyros, for one,
-    which have two differences.
+    Their directions in parity space are in one plane, as those of three parallel gyros.
     """
     directions = geometry.parity / np.maximum(
         np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY
@@ -459,7 +492,7 @@ def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
     ).reshape(-1, 3)
     third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
     for triple in triples[third < IN_PLANE].tolist():
-        # Two directions make a plane.
+        # Two directions define the plane.
         known = next((found for found in sets if len(found & set(triple)) == 2), None)
         if known is None:
             sets.append(set(triple))
@@ -469,7 +502,10 @@ def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
 
 
 def assumption_words(geometry: Geometry) -> str:
-    """Say what no data can tell and every name rests on (docs/integrity.md); empty: nothing of this kind."""
+    """Return the assumption behind every name that no data can check, or "".
+
+    See docs/integrity.md.
+    """
     names = geometry.channel_names
     sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
     shown = ", ".join(sets[:MOST_SETS]) + (
@@ -490,11 +526,19 @@ def summary_line(
     factor: float = 1.0,
     agree: bool = True,
 ) -> str:
-    """Return what a mounting can do, in one line: for the log of a node.
+    """Return one line on the capability of a mounting, for the log of a node.
 
-    ``probability``: of a false alarm per sample. ``unit``, ``factor``: unit of the
-    errors, and how much of it is 1 rad/s. ``agree``: the channels are not known to
-    contradict each other; else nothing is said of what can be named.
+    Parameters
+    ----------
+    geometry, noise
+        Sensitivity axes, and errors of healthy channels.
+    probability
+        Probability of a false alarm per sample.
+    unit, factor
+        Unit of the errors in the line, and 1 rad/s in this unit.
+    agree
+        The channels are not known to contradict each other. Otherwise the line does
+        not state which faults can be isolated.
     """
     smallest = smallest_detectable(
         geometry, noise.for_channels(geometry.n), probability
