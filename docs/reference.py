@@ -31,6 +31,7 @@ WHEN = {
     "excluded_channels": "A channel is known to be bad, or is being tested.",
     "publish_under_doubt": "A wrong rate is worse for you than none.",
     "channels.topic": "Always, with this input.",
+    "channels.acceleration_topic": "The accelerometers of a redundant unit are to be judged, too.",
     "channels.names": "Names in tables and diagnostics are to be those of your drawing.",
     "channels.units": "Gyros of the array share a chip or a housing, and neither preset nor names say which.",
     "imus.topics": "Always, with this input.",
@@ -88,6 +89,7 @@ WHEN = {
     "accelerometers.turn_on_std": "They are calibrated, or from the works.",
     "accelerometers.max_drift": "You know what a healthy bias may do.",
     "accelerometers.max_acceleration": "Their range is another one.",
+    "accelerometers.axes": "The accelerometers of an array point elsewhere than its gyros.",
     "accelerometers.positions": "The units are more than a few centimetres apart.",
 }
 """When one would change a parameter."""

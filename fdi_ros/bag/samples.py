@@ -21,7 +21,7 @@ from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.sources import source_of
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.accelerometers import varies
+from fdi_ros.monitor.accelerometers import places, possible_units, varies
 from fdi_ros.monitor.building import build_geometry
 
 #: messages handed on together: enough that calls do not count, little enough for the
@@ -71,10 +71,13 @@ class Samples:
         self.source = source_of(config)
         recording.require(self.topics, self.source.type)
         self.alignment = Alignment(*self.source.alignment)
-        first = self.source.channels_of(0, build_geometry(config).n)
-        self._width = first.stop - first.start  # channels in a message
-        is_felt = config.has_units and config.accelerometers.enabled != "off"
-        self._values = 6 if is_felt else self._width  # read of a message
+        n = build_geometry(config).n
+        m = len(places(config, possible_units(config, n)))
+        brought = [self.source.brought(k, n, m) for k in range(len(self.topics))]
+        self._brought = np.array([one.size for one in brought])
+        """Number of values that a message of each topic brings."""
+        self._gyros, self._forces = n, m
+        self._values = max(self._brought)
         columns = [
             ("topic", "i8"),
             ("log_time", "i8"),
@@ -83,8 +86,10 @@ class Samples:
         ]
         self._row = np.dtype(columns)
         """Decoded message: index of the topic, times, ns (without a stamp the time of
-        recording), rates, rad/s, and accelerations, m/s^2.
+        recording), rates, rad/s, and accelerations, m/s^2; NaN behind fewer.
         """
+        self._waiting: Array | None = None
+        """(m,) accelerations of an array that the next sample takes, m/s^2."""
         self._span = (start, end)
         self._taps = taps
         self.period = period
@@ -132,11 +137,10 @@ class Samples:
         self._check_rate(None)
 
     def _felt_in(self, messages: Rows) -> tuple[int, ...]:
-        if self._values == self._width:
+        if not (self.source.units and self._forces):
             return ()
         units = range(len(self.topics))
-        of_units = [messages["values"][messages["topic"] == unit] for unit in units]
-        forces = [values[:, self._width :] for values in of_units]
+        forces = [messages["values"][messages["topic"] == u, 3:] for u in units]
         if not any(map(varies, forces)):
             return ()
         return tuple(
@@ -190,7 +194,8 @@ class Samples:
         wrong = sum(self.malformed.values())
         if wrong:
             words = "rates" if self.source.units else "values"
-            return f" ({wrong} malformed, expected {self._width} {words} in each)"
+            expected = 3 if self.source.units else self._gyros
+            return f" ({wrong} malformed, expected {expected} {words} in each)"
         return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
 
     def _block(self, messages: Rows) -> Block:
@@ -202,12 +207,36 @@ class Samples:
                 np.ascontiguousarray(messages["topic"]), stamp, values
             )
         # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
-        count = np.arange(len(messages))
-        free = stamp - count
-        free[0] = max(free[0], self._last + 1)
+        rows = np.flatnonzero(messages["topic"] == 0)
+        count = np.arange(len(rows))
+        free = stamp[rows] - count
+        free[:1] = np.maximum(free[:1], self._last + 1)
         stamp = np.maximum.accumulate(free) + count
-        self._last = int(stamp[-1])
-        return Block(stamp, values)
+        self._last = int(stamp[-1]) if len(rows) else self._last
+        block = Block(stamp, values[rows, : self._gyros])
+        if not self._forces:
+            return block
+        return replace(block, acceleration=self._forces_of(block, values, rows))
+
+    def _forces_of(self, block: Block, values: Array, gyros: Int) -> Block:
+        """Return the accelerations of the samples of an array, whose messages stand in rows ``gyros``.
+
+        Each takes the last ones that came after the sample before.
+        """
+        force = np.full((len(block), self._forces), np.nan)
+        before = np.concatenate([[-1], gyros[:-1]])
+        newest = gyros - 1
+        found = newest > before
+        force[found] = values[newest[found], : self._forces]
+        if len(gyros) and not found[0] and self._waiting is not None:
+            force[0], found[0] = self._waiting, True
+        last = gyros[-1] if len(gyros) else -1
+        if last < len(values) - 1:
+            self._waiting = values[-1, : self._forces].copy()
+        elif len(gyros):
+            self._waiting = None
+        received = np.repeat(found[:, np.newaxis], self._forces, axis=1)
+        return Block(block.stamp, force, received)
 
     def _ordered(self) -> Iterator[Rows]:
         """Put the messages into the order of recording, as a player would publish them."""
@@ -241,11 +270,20 @@ class Samples:
 
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages and those outside the span are left out."""
-        decoded = self.source.decode(
-            batch.buffer, batch.offset, batch.length, self._values
-        )
-        stamp = decoded.stamp if self.source.stamped else batch.log_time
-        keep = decoded.good
+        messages = np.empty(len(batch), self._row)
+        messages["topic"], messages["log_time"] = batch.topic, batch.log_time
+        messages["stamp"], messages["values"] = batch.log_time, np.nan
+        keep = np.zeros(len(batch), dtype=bool)
+        for count in np.unique(self._brought).tolist():
+            rows = np.flatnonzero(self._brought[batch.topic] == count)
+            decoded = self.source.decode(
+                batch.buffer, batch.offset[rows], batch.length[rows], count
+            )
+            keep[rows] = decoded.good
+            messages["values"][rows, :count] = decoded.values
+            if self.source.stamped:
+                messages["stamp"][rows] = decoded.stamp
+        stamp = messages["stamp"]
         for topic in batch.topic[~keep].tolist():
             self.malformed[self.topics[topic]] += 1
         if self.origin is None and keep.any():
@@ -255,9 +293,6 @@ class Samples:
             keep = keep & (seconds >= self._span[0]) & (seconds < self._span[1])
         for tap in self._taps:
             tap(batch, np.flatnonzero(keep))
-        messages = np.empty(len(batch), self._row)
-        messages["topic"], messages["log_time"] = batch.topic, batch.log_time
-        messages["stamp"], messages["values"] = stamp, decoded.values
         return messages[keep]
 
 

@@ -198,8 +198,18 @@ class Config:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The input topics."""
-        return self.imus.topics if self.has_units else (self.channels.topic,)
+        """The input topics: of the units, or of the array of gyros and that of accelerometers."""
+        if self.has_units:
+            return self.imus.topics
+        array = self.channels
+        forces = (array.acceleration_topic,) if self.has_force_array else ()
+        return (array.topic, *forces)
+
+    @property
+    def has_force_array(self) -> bool:
+        """Whether accelerometers that are judged arrive as an array of their own."""
+        given = bool(self.channels.acceleration_topic) and not self.has_units
+        return given and self.accelerometers.enabled != "off"
 
 
 _SECTIONS: dict[str, Callable[..., Any]] = {
@@ -261,10 +271,7 @@ def _check_consistency(config: Config) -> None:
         raise ConfigError(
             f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel"
         )
-    if config.accelerometers.enabled == "on" and not config.has_units:
-        raise ConfigError(
-            f"accelerometers.enabled is 'on', but input is {config.input!r}: expected input 'imus'"
-        )
+    _check_accelerometers(config)
     learned = config.bias.startup_bias_duration * config.sample_rate
     if 0 < learned < MIN_LEARNED:
         raise ConfigError(
@@ -288,6 +295,28 @@ def _check_consistency(config: Config) -> None:
     ):
         raise ConfigError(
             "detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one"
+        )
+
+
+def _check_accelerometers(config: Config) -> None:
+    own, topic = config.accelerometers, config.channels.acceleration_topic
+    if own.enabled == "on" and not (config.has_units or topic):
+        raise ConfigError(
+            f"accelerometers.enabled is 'on', but input is {config.input!r} without channels.acceleration_topic"
+        )
+    of_array = {"channels.acceleration_topic": topic, "accelerometers.axes": own.axes}
+    for name, value in of_array.items():
+        if value and config.has_units:
+            raise ConfigError(
+                f"{name} is given, but input is {config.input!r}: expected input 'channels'"
+            )
+    if len(own.axes) % 3:
+        raise ConfigError(
+            f"accelerometers.axes has {len(own.axes)} numbers, expected 3 per accelerometer"
+        )
+    if topic and topic == config.channels.topic:
+        raise ConfigError(
+            f"channels.topic and channels.acceleration_topic are both {topic!r}, expected two topics"
         )
 
 

@@ -151,6 +151,11 @@ def _per_channel(*about: Any, lengths: tuple[int, ...] = (1,)) -> Any:
     return setting(*about, per="channel", other_lengths=lengths)
 
 
+def _per_accelerometer(*about: Any) -> Any:
+    """Declare a list with one value per accelerometer, or one value for all."""
+    return setting(*about, per="accelerometer", other_lengths=(1,))
+
+
 def _per_triad(*about: Any, each: int = 1) -> Any:
     """Declare a list with a fixed number of values per triad, or none."""
     return setting(*about, per="triad", each=each, other_lengths=(0,))
@@ -186,6 +191,10 @@ class ChannelsConfig:
     topic: str = setting(
         "gyro_channels",
         "topic of the channels, one std_msgs/Float64MultiArray a sample",
+    )
+    acceleration_topic: str = setting(
+        "",
+        "topic of 4 to 12 accelerometers, one std_msgs/Float64MultiArray a sample, m/s^2; empty: there are none",
     )
     names: tuple[str, ...] = setting(
         (), "name of each channel; empty: g1, g2, ... or imu_1.x, ..."
@@ -490,25 +499,25 @@ class IntegrityConfig:
 
 @dataclass(frozen=True)
 class AccelerometersConfig:
-    """The accelerometers of the units, judged beside the gyros; values of one channel, or one per channel."""
+    """The accelerometers, judged beside the gyros; one value for all, or one per accelerometer."""
 
     enabled: str = setting(
         "auto",
-        "judge the accelerometers; auto: of units whose messages carry accelerations (not -1 in the covariance, not all"
-        " zero), if these are two or more",
+        "judge the accelerometers; auto: those of channels.acceleration_topic, or of units whose messages carry"
+        " accelerations (not -1 in the covariance, not all zero), if these are two or more",
         choices=("auto", "on", "off"),
     )
-    noise_std: tuple[float, ...] = _per_channel(
+    noise_std: tuple[float, ...] = _per_accelerometer(
         (0.2,),
         "standard deviation of the additive error in one sample",
         "m/s^2",
         1e-6,
         1e3,
     )
-    scale_std: tuple[float, ...] = _per_channel(
+    scale_std: tuple[float, ...] = _per_accelerometer(
         (0.01,), "standard deviation of the scale factor", "", 0.0, 1.0
     )
-    bias_walk: tuple[float, ...] = _per_channel(
+    bias_walk: tuple[float, ...] = _per_accelerometer(
         (0.0075,),
         "random walk of the bias of an accelerometer in flight",
         "m/s^2/sqrt(s)",
@@ -529,20 +538,30 @@ class AccelerometersConfig:
         0.0,
         1000.0,
     )
-    max_acceleration: tuple[float, ...] = _per_channel(
+    max_acceleration: tuple[float, ...] = _per_accelerometer(
         (156.9,),
         "a value beyond this is out of range (saturated)",
         "m/s^2",
         1.0,
         1e5,
     )
-    positions: tuple[float, ...] = _per_triad(
+    axes: tuple[float, ...] = setting(
         (),
-        "position of each triad in the body frame, from the first, 3 numbers per triad; empty: all at one place",
+        "sensitivity axes of the accelerometers of an array, 3 numbers each, norm 0.5 to 2; empty: those of the gyros",
+        "",
+        -2.0,
+        2.0,
+    )
+    positions: tuple[float, ...] = setting(
+        (),
+        "position of each triad, or accelerometer of an array, in the body frame, from the first, 3 numbers each;"
+        " empty: all at one place",
         "m",
         -10.0,
         10.0,
+        per="place",
         each=3,
+        other_lengths=(0,),
     )
 
 

@@ -10,6 +10,7 @@ complete sample.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from fdi_ros.core.messages import (
     fill_integrity,
 )
 from fdi_ros.core.path import Path, step_halves, wants_supply
-from fdi_ros.core.records import Aligner, Live
+from fdi_ros.core.records import Aligner, Inlet, Live
 from fdi_ros.model.samples import Bytes
 
 WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
@@ -80,16 +81,14 @@ def receive_stamped(
 
 @compiled
 def receive_arrived(live: Live, code: int, stamp: int) -> int:
-    """Process a message of all channels, whose values are in `live.sample.z`.
+    """Process a message of all gyros, whose values are in `live.sample.z`.
 
-    ``code`` is `GOOD` or the code of an error, ``stamp`` the time of arrival, ns.
-    Return `MALFORMED` or `MORE`.
+    ``code`` is `GOOD` or the code of an error, ``stamp`` the time of arrival, ns. The
+    sample takes the accelerations that arrived after the sample before. Return
+    `MALFORMED` or `MORE`.
     """
-    inlet, sample = live.inlets[0], live.sample
-    inlet.received += 1
-    inlet.error = code
-    if code != GOOD:
-        inlet.malformed += 1
+    sample = live.sample
+    if count_message(live.inlets[0], code) == MALFORMED:
         return MALFORMED
     # After a clock was set back, stamps of samples continue to increase, while
     # published messages follow the clock.
@@ -102,9 +101,35 @@ def receive_arrived(live: Live, code: int, stamp: int) -> int:
     sample.shift = live.clock_shift
     for i in range(live.channels):
         sample.received[i] = True
-        sample.felt[i] = False
+    for i in range(live.accelerometers):
+        sample.force[i] = live.force[i] if live.has_force else math.nan
+        sample.felt[i] = live.has_force
+    live.has_force = False
     live.ready = True
     return MORE
+
+
+@compiled
+def receive_force(live: Live, code: int) -> int:
+    """Keep the values of all accelerometers, in `live.force`, for the next sample.
+
+    ``code`` is `GOOD` or the code of an error. Return `MALFORMED` or 0.
+    """
+    if count_message(live.inlets[1], code) == MALFORMED:
+        return MALFORMED
+    live.has_force = True
+    return 0
+
+
+@compiled
+def count_message(inlet: Inlet, code: int) -> int:
+    """Count a message; ``code`` is `GOOD` or the code of an error. Return `MALFORMED` or 0."""
+    inlet.received += 1
+    inlet.error = code
+    if code == GOOD:
+        return 0
+    inlet.malformed += 1
+    return MALFORMED
 
 
 @compiled

@@ -667,7 +667,10 @@ class Live:
 
     fused_at: Whole  # offset of the rate in the fused message, bytes
     integrity_at: Whole  # offset of the values in the integrity message, bytes
-    channels: Whole  # of all inputs
+    channels: Whole  # gyros of all inputs
+    accelerometers: Whole  # values of a message of accelerometers
+    force: Channels  # last such values, m/s^2
+    has_force: Flag  # they arrived after the last sample
     ready: Flag  # a sample is ready for the pipeline
     sample: Sample
     events: Whole  # of the last sample

@@ -15,7 +15,7 @@ import math
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import MAX_CHANNELS, MAX_UNITS, compiled
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import INPUTS
-from fdi_ros.core.live import receive_arrived, receive_stamped
+from fdi_ros.core.live import receive_arrived, receive_force, receive_stamped
 from fdi_ros.core.messages import (
     CUT_VALUES,
     ENCAPSULATION,
@@ -49,6 +49,18 @@ from fdi_ros.core.messages import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
+
+
+class Brought(NamedTuple):
+    """Which channels of a sample the messages of one topic bring."""
+
+    gyros: slice
+    accelerometers: slice  #: their values stand behind those of the gyros
+
+    @property
+    def size(self) -> int:
+        """Number of values in a message."""
+        return sum(part.stop - part.start for part in self)
 
 
 class Source(ABC):
@@ -192,9 +204,9 @@ class Source(ABC):
                 f" for {len(self.units)} imus.topics"
             )
 
-    def channels_of(self, topic: int, n: int) -> slice:
-        """Return which of the n channels a topic brings."""
-        return slice(3 * topic, 3 * topic + 3) if self.units else slice(0, n)
+    @abstractmethod
+    def brought(self, topic: int, n: int, m: int) -> Brought:
+        """Return which of n gyros and m accelerometers a topic brings."""
 
     def chip_of(self, channel: int) -> int:
         """Return a number that is the same for channels that surely share a chip."""
@@ -217,9 +229,17 @@ class UnitSource(Source):
             np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3))
         )
 
+    def brought(self, topic: int, n: int, m: int) -> Brought:
+        """Return the channels of the unit."""
+        own = slice(3 * topic, 3 * topic + 3)
+        return Brought(own, own if m else slice(0, 0))
+
 
 class ArraySource(Source):
-    """One topic: messages of all channels, stamped when they arrive; settings ``channels``."""
+    """One topic: messages of all gyros, stamped when they arrive; settings ``channels``.
+
+    A second topic may bring the accelerometers.
+    """
 
     stamped = False
     topic_counts, value_counts = range(1, 2), range(MIN_CHANNELS, MAX_CHANNELS + 1)
@@ -227,6 +247,11 @@ class ArraySource(Source):
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.names, self.timeout = config.topics, config.stale_timeout
+
+    def brought(self, topic: int, n: int, m: int) -> Brought:
+        """Return all gyros, or of the second topic all accelerometers."""
+        gyros, accelerometers = (n, 0) if topic == 0 else (0, m)
+        return Brought(slice(0, gyros), slice(0, accelerometers))
 
 
 # sensor_msgs/Imu
@@ -401,6 +426,11 @@ def _array_receive(
     monitor = live[0]
     if not 0 <= inlet < aligner[0].n:
         return 0
+    if inlet == 1:
+        count = monitor.accelerometers
+        return receive_force(
+            monitor, _array_read(data, 0, len(data), count, monitor.force)
+        )
     return receive_arrived(
         monitor,
         _array_read(data, 0, len(data), monitor.channels, monitor.sample.z),

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import PARAMETERS, Config, check_lengths
 from fdi_ros.config.settings import Value
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Block
@@ -27,28 +27,88 @@ FORETOLD_FORCE, FORETOLD_CHANGE = 20.0, 200.0
 NO_AVERAGE: dict[str, Value] = {"bias.startup_bias_duration": 0.0, "bias.fixed": ()}
 
 
+def possible_units(config: Config, gyros: int) -> range:
+    """Numbers of all units whose accelerometers may be judged, beside a number of gyros.
+
+    An accelerometer of an array is a unit by itself.
+    """
+    if config.accelerometers.enabled == "off":
+        return range(0)
+    if config.has_units:
+        return range(len(config.topics))
+    count = len(config.accelerometers.axes) // 3 or gyros
+    return range(count if config.has_force_array else 0)
+
+
+def places(config: Config, units: Sequence[int]) -> list[int]:
+    """Return the number of each accelerometer of some units among all of a sample."""
+    each = 3 if config.has_units else 1
+    return [each * unit + k for unit in units for k in range(each)]
+
+
 def accelerometer_names(config: Config, units: Sequence[int]) -> tuple[str, ...]:
-    """Names of the accelerometers of some units: ``imu_1.accel_x``."""
+    """Names of the accelerometers of some units: ``imu_1.accel_x``; of an array ``a1``."""
+    if not config.has_units:
+        return tuple(f"a{unit + 1}" for unit in units)
     names = config.imu_names
     return tuple(f"{names[unit]}.accel_{axis}" for unit in units for axis in "xyz")
 
 
 def possible_names(config: Config, gyros: Sequence[str]) -> tuple[str, ...]:
     """Names of the gyros and of all accelerometers that the settings allow."""
-    if not config.has_units or config.accelerometers.enabled == "off":
-        return tuple(gyros)
-    return (*gyros, *accelerometer_names(config, range(len(config.topics))))
+    units = possible_units(config, len(gyros))
+    return (*gyros, *accelerometer_names(config, units))
+
+
+def check_accelerometers(config: Config, gyros: int) -> None:
+    """Check the lengths of lists with values per accelerometer (`ConfigError`)."""
+    units = possible_units(config, gyros)
+    if units:
+        check_lengths(config, "accelerometer", len(places(config, units)))
+        check_lengths(config, "place", len(units))
 
 
 def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
     """Return the settings of the accelerometers of some units, numbers from 0, in units of `FORCE.natural`."""
-    own, imus = config.accelerometers, config.imus
-    channels = [3 * unit + axis for unit in units for axis in range(3)]
+    own, chosen = config.accelerometers, places(config, units)
 
     def of_channels(values: Sequence[Any]) -> tuple[Any, ...]:
         """Pick the values of the channels, where there is one for each."""
-        several = len(values) == 3 * len(imus.topics)
-        return tuple(values[i] for i in channels) if several else tuple(values)
+        return tuple(values[i] for i in chosen) if len(values) > 1 else tuple(values)
+
+    def scaled(values: Sequence[float]) -> tuple[float, ...]:
+        return tuple(value / FORCE.natural for value in of_channels(values))
+
+    own_section = (n for n in PARAMETERS if n.startswith("accelerometers."))
+    names = accelerometer_names(config, units)
+    changes: dict[str, Value] = {
+        **{name: PARAMETERS[name].default for name in own_section},
+        "accelerometers.enabled": "off",
+        "excluded_channels": tuple(
+            name for name in config.excluded_channels if name in names
+        ),
+        "channels.names": names,
+        "noise.noise_std": scaled(own.noise_std),
+        "noise.scale_std": of_channels(own.scale_std),
+        "noise.bias_walk": scaled(own.bias_walk),
+        "noise.bound": (),
+        "bias.turn_on_std": own.turn_on_std / FORCE.natural,
+        "bias.max_drift": own.max_drift / FORCE.natural,
+        "health.max_rate": scaled(own.max_acceleration),
+        "integrity.max_rate": FORETOLD_FORCE / FORCE.natural,
+        "integrity.max_acceleration": FORETOLD_CHANGE / FORCE.natural,
+        **NO_AVERAGE,
+        **(_unit_settings if config.has_units else _array_settings)(config, units),
+    }
+    return config.replaced(changes)
+
+
+def _unit_settings(config: Config, units: Sequence[int]) -> dict[str, Value]:
+    """Return what the accelerometers have in common with the gyros of their units."""
+    imus, noise, chosen = config.imus, config.noise, places(config, units)
+
+    def of_channels(values: Sequence[float]) -> tuple[float, ...]:
+        return tuple(values[i] for i in chosen) if len(values) > 1 else tuple(values)
 
     def of_units(values: Sequence[Any], each: int = 1) -> tuple[Any, ...]:
         """Pick the values of the units, where there are any."""
@@ -56,42 +116,42 @@ def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
             return ()
         return tuple(x for u in units for x in values[each * u : each * (u + 1)])
 
-    def scaled(values: Sequence[float]) -> tuple[float, ...]:
-        return tuple(value / FORCE.natural for value in of_channels(values))
-
-    names = accelerometer_names(config, units)
-    changes: dict[str, Value] = {
-        "excluded_channels": tuple(
-            name for name in config.excluded_channels if name in names
-        ),
-        "channels.names": names,
+    return {
         "imus.topics": of_units(imus.topics),
         "imus.names": of_units(config.imu_names),
         "imus.mounts": of_units(imus.mounts, 9),
         "imus.delays": of_units(imus.delays),
         "geometry.axes": of_units(config.geometry.axes, 9),
-        "noise.noise_std": scaled(own.noise_std),
-        "noise.scale_std": of_channels(own.scale_std),
-        "noise.bias_walk": scaled(own.bias_walk),
-        "noise.timing_std": of_channels(config.noise.timing_std),
-        "noise.bound": (),
-        "bias.turn_on_std": own.turn_on_std / FORCE.natural,
-        "bias.max_drift": own.max_drift / FORCE.natural,
-        "health.max_rate": scaled(own.max_acceleration),
+        "noise.timing_std": of_channels(noise.timing_std),
         "integrity.fault_rate": of_channels(config.integrity.fault_rate),
-        "integrity.max_rate": FORETOLD_FORCE / FORCE.natural,
-        "integrity.max_acceleration": FORETOLD_CHANGE / FORCE.natural,
-        "accelerometers.enabled": "off",
-        **NO_AVERAGE,
     }
-    return config.replaced(changes)
+
+
+def _array_settings(config: Config, units: Sequence[int]) -> dict[str, Value]:
+    """Return the settings of an array of accelerometers; those without axes of their own stand as the gyros do."""
+    axes = config.accelerometers.axes
+    changes: dict[str, Value] = {
+        "channels.topic": config.channels.acceleration_topic,
+        "channels.acceleration_topic": "",
+        "noise.timing_std": (max(config.noise.timing_std),),
+        "integrity.fault_rate": (max(config.integrity.fault_rate),),
+    }
+    if axes:
+        changes |= {
+            "geometry.preset": "axes",
+            "geometry.axes": axes,
+            "channels.units": (),
+        }
+    return changes
 
 
 def lever_arms(config: Config, units: Sequence[int]) -> Array:
     """Position of each accelerometer of some units from the first unit, (m, 3) m."""
-    count = len(config.imus.topics)
-    positions = config.accelerometers.positions or (0.0,) * 3 * count
-    return np.repeat(np.reshape(positions, (count, 3))[list(units)], 3, axis=0)
+    each = 3 if config.has_units else 1
+    positions = np.reshape(config.accelerometers.positions, (-1, 3))
+    if not len(positions):
+        return np.zeros((each * len(units), 3))
+    return np.repeat(positions[list(units)], each, axis=0)
 
 
 def felt_units(block: Block) -> tuple[int, ...]:

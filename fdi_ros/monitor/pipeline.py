@@ -28,15 +28,18 @@ from fdi_ros.core.subsets import (
     single_losses,
 )
 from fdi_ros.detectors.base import Detector
-from fdi_ros.errors import ConfigError, FdiError
+from fdi_ros.errors import ConfigError, FdiError, GeometryError
 from fdi_ros.model.geometry import spans_space
 from fdi_ros.model.quantity import FORCE, RATE, Quantity
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.accelerometers import (
     accelerometer_config,
+    check_accelerometers,
     felt_units,
     lever_arms,
+    places,
     possible_names,
+    possible_units,
 )
 from fdi_ros.monitor.building import (
     GUARD,
@@ -87,7 +90,7 @@ class Pipeline:
         self.undecided = config.has_units and config.accelerometers.enabled == "auto"
         """Whether the first samples are to show which units have accelerometers."""
         self.felt: tuple[int, ...] = ()
-        """Numbers of the units whose accelerometers are judged."""
+        """Numbers of the units whose accelerometers are judged; of an array those of the accelerometers."""
         self._built: dict[tuple[int, ...], Pipeline] = {}
         self.core = build_core(config, self.geometry, self.noise)
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
@@ -103,8 +106,9 @@ class Pipeline:
         """Detector whose alarms declare: the guard, or another method on the corrected values."""
         self.integrity: Integrity
         self._equip(config, None)
-        if config.has_units and config.accelerometers.enabled == "on":
-            self.sense(range(len(config.topics)))
+        check_accelerometers(config, self.geometry.n)
+        if not self.undecided:
+            self.sense(possible_units(config, self.geometry.n))
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -142,12 +146,11 @@ class Pipeline:
             self.sense(felt_units(block))
         if self.accelerometers is None:
             return replace(block, acceleration=None)
-        given, n = block.acceleration, 3 * len(self.felt)
+        given, columns = block.acceleration, places(self.config, self.felt)
         if given is None:
-            nothing = np.full((len(block), n), np.nan)
-            given = Block(block.stamp, nothing, np.zeros((len(block), n), dtype=bool))
-        elif given.z.shape[1] == 3 * len(self.config.topics):
-            columns = [3 * unit + axis for unit in self.felt for axis in range(3)]
+            nothing = np.full((len(block), len(columns)), np.nan)
+            given = Block(block.stamp, nothing, np.zeros(nothing.shape, dtype=bool))
+        elif self.config.has_units and given.z.shape[1] == 3 * len(self.config.topics):
             received = None if given.received is None else given.received[:, columns]
             given = Block(given.stamp, given.z[:, columns], received)
         return replace(block, acceleration=given)
@@ -304,14 +307,14 @@ class Pipeline:
         """Return the monitor of the accelerometers of some units, built once."""
         units = tuple(numbers)
         if units not in self._built:
-            other = Pipeline(accelerometer_config(self.config, units), FORCE)
+            try:
+                other = Pipeline(accelerometer_config(self.config, units), FORCE)
+            except GeometryError as error:
+                raise ConfigError(f"accelerometers: {error}") from None
             settings = other.core["settings"][0]
             settings["first"], settings["natural"] = self.geometry.n, FORCE.natural
-            places = [
-                3 * unit + axis for unit in range(len(units)) for axis in range(3)
-            ]
-            settings["places"][: len(places)] = places
             arms = lever_arms(self.config, units)
+            settings["places"][: len(arms)] = places(self.config, units)
             settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
             if self._in_flight:
                 other.prepare()
@@ -444,7 +447,11 @@ class Pipeline:
         samples["stamp"], samples["z"][:, :n] = stamp, z
         samples["received"][:, :n] = True if block.received is None else block.received
         if block.acceleration is not None:
-            m = block.acceleration.z.shape[1]
-            samples["force"][:, :m] = block.acceleration.z
-            samples["felt"][:, :m] = block.acceleration.delivered
+            force, columns = block.acceleration, places(self.config, self.felt)
+            if force.z.shape[1] != len(columns):
+                raise ConfigError(
+                    f"accelerations have shape {force.z.shape}, expected (N, {len(columns)})"
+                )
+            samples["force"][:, columns] = force.z
+            samples["felt"][:, columns] = force.delivered
         return samples

@@ -147,6 +147,7 @@ class Receiver:
             self.source.topics
         )  # why the last malformed message of each topic was refused
         self.live["channels"] = n
+        self.live["accelerometers"] = len(pipeline.channel_names) - n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         if pipeline.undecided:
             # Built now: no sample is to wait for that.
@@ -219,7 +220,9 @@ class Receiver:
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""
         code = int(self.live["inlets"]["error"][0, unit])
-        self.errors[unit] = self.source.explain(code, data, self.pipeline.geometry.n)
+        n, m = self.live["channels"][0], self.live["accelerometers"][0]
+        expected = self.source.brought(unit, int(n), int(m)).size
+        self.errors[unit] = self.source.explain(code, data, expected)
 
     def message(self, output: SampleOutput) -> bytes:
         """Return the message of an output about the last sample."""

@@ -10,6 +10,7 @@ from the parameter file of the monitor, so that both have the same channels.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -123,26 +124,29 @@ class InjectorNode(CheckedNode):
 
     def _strike(self, k: int, data: bytes) -> bytes | None:
         """Return the message with the faults, None if a fault drops the message."""
-        n, is_whole = self._n, len(self._names) > self._n
-        channels = self._source.channels_of(k, n)
-        width = channels.stop - channels.start
-        measured, values = self._source.parse(data, 2 * width if is_whole else width)
+        n, m = self._n, len(self._names) - self._n
+        gyros, felt = brought = self._source.brought(k, n, m)
+        measured, values = self._source.parse(data, brought.size)
         stamp = measured if self._source.stamped else self.get_clock().now().nanoseconds
         if self._origin is None:
             self._origin = stamp
         self._injectors[k].start_stamp = self._origin
 
-        def block(own: Sequence[float], other: Block | None = None) -> Block:
-            z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
-            z[0, channels], received[0, channels] = own, True
-            return Block(np.array([stamp], dtype=np.int64), z, received, other)
+        def block(size: int, own: slice, given: Sequence[float]) -> Block:
+            z, received = np.full((1, size), np.nan), np.zeros((1, size), dtype=bool)
+            z[0, own], received[0, own] = given, True
+            return Block(np.array([stamp], dtype=np.int64), z, received)
 
-        force = block(values[width:]) if is_whole else None
-        out = self._injectors[k].apply(block(values[:width], force))
-        after = out.z[0, channels].tolist()
+        width = gyros.stop - gyros.start
+        force = block(m, felt, values[width:]) if m else None
+        whole = replace(block(n, gyros, values[:width]), acceleration=force)
+        out = self._injectors[k].apply(whole)
+        after, judged = out.z[0, gyros].tolist(), out.delivered[0, gyros]
+        if out.acceleration is not None and not width:
+            judged = out.acceleration.delivered[0, felt]
         if out.acceleration is not None and not np.isnan(values[width:]).all():
-            after += out.acceleration.z[0, channels].tolist()
-        lost = not out.delivered[0, channels].any()
+            after += out.acceleration.z[0, felt].tolist()
+        lost = not judged.any()
         self._struck += lost or after != list(values[: len(after)])
         return None if lost else self._source.patch(data, after)
 

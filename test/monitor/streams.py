@@ -81,12 +81,14 @@ def parallel(count: int, **changes: object) -> Config:
     return config(input="imus", imus__topics=topics, **changes)
 
 
-def mounted(axes: NDArray[np.float64], **changes: object) -> Config:
-    """Settings of channels along these axes (n, 3), whatever housings they are in, judged by `sequential`."""
+def mounted(
+    axes: NDArray[np.float64], detector: str = "sequential", **changes: object
+) -> Config:
+    """Settings of channels along these axes (n, 3), whatever housings they are in, judged by a detector."""
     axis = {
         "geometry.preset": "axes",
         "geometry.axes": axes.ravel().tolist(),
-        "detector.name": "sequential",
+        "detector.name": detector,
     }
     return config(input="channels", **axis, **changes)
 

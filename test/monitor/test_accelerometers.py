@@ -1,21 +1,25 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The accelerometers of the units, judged beside the gyros."""
+"""Accelerometers of units and of arrays, judged beside the gyros."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
-from bag.recordings import imu
-from monitor.streams import RATE, SIGMA, START, parallel, struck
+from bag.recordings import array, imu
+from monitor.streams import RATE, SIGMA, START, mounted, parallel, struck
 from monitor.test_receiver import Ear
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import integrity_labels
 from fdi_ros.core.sources import ChannelsSource, ImuSource
-from fdi_ros.errors import ConfigError
+from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.errors import ConfigError, FdiError
+from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.state_file import StateFile
 
@@ -227,6 +231,203 @@ def test_the_state_file_keeps_the_gyros(tmp_path):
     assert StateFile(tmp_path / "state", 60.0).restore(again)
 
 
-def test_an_array_of_gyros_has_no_accelerometers():
-    with pytest.raises(ConfigError, match="input is 'channels': expected input 'imus'"):
-        Config.from_parameters({"accelerometers.enabled": "on"})
+def test_live_a_unit_without_accelerations_leaves_those_of_the_others_in_place():
+    ear, (block, force) = Ear(Pipeline(settings())), flight(100)
+    for unit, data in sent(block, absent=(1,)):
+        ear.take(unit, data)
+    last = np.array(ImuSource.parse(ear.fused[-1], 6)[1][3:])
+    assert np.abs(last - force[-len(force) + len(ear.fused) - 1]).max() < 1.0
+    assert len(ear.receiver.pipeline.channel_names) == 9 + 6
+
+
+# An array of accelerometers
+# ------------------------------------------------------------------------------------------------------
+
+
+C, S = 1 / np.sqrt(3), np.sqrt(2 / 3) / 2
+H = S * np.sqrt(3)
+CONE = np.array(
+    [[-C, -2 * S, 0], [C, S, -H], [-C, S, H], [C, -2 * S, 0], [-C, S, -H], [C, S, H]]
+)
+"""Sensitivity axes of six channels on the cone of the paper on guaranteed bounds."""
+FIVE = Geometry.cone(5).axes
+
+
+def array_settings(gyros=CONE, **changes):
+    """Settings of a unit of gyros with these axes (n, 3) and of as many accelerometers."""
+    given = {
+        "channels__acceleration_topic": "accelerations",
+        "accelerometers__noise_std": NOISE,
+    }
+    return mounted(gyros, **given | changes)
+
+
+def array_flight(samples, gyros=CONE, forces=CONE, seed=0):
+    """Samples of gyros and accelerometers with these axes, and the true specific force.
+
+    Errors of the accelerometers are within four standard deviations.
+    """
+    block, force = flight(samples, seed=seed)
+    rng = np.random.default_rng(seed + 1)
+    omega = block.z[:, :3]
+    z = omega @ gyros.T + rng.normal(0, SIGMA, (samples, len(gyros)))
+    error = rng.normal(0, NOISE, (samples, len(forces)))
+    felt = force @ forces.T + np.clip(error, -4 * NOISE, 4 * NOISE)
+    return Block(block.stamp, z, None, Block(block.stamp, felt)), force
+
+
+def arrays(block):
+    """The messages of a block: topic, and bytes; accelerations come before the rates of their sample."""
+    for rates, forces in zip(block.z, block.acceleration.z, strict=True):
+        yield 1, array(forces.tolist())
+        yield 0, array(rates.tolist())
+
+
+def test_of_six_accelerometers_on_a_cone_two_simultaneous_faults_are_guaranteed():
+    pipeline, (block, _) = (
+        Pipeline(array_settings(detector="guaranteed")),
+        array_flight(150),
+    )
+    for pair in combinations(range(6, 12), 2):
+        pipeline.restart()
+        names = [pipeline.channel_names[i] for i in pair]
+        faults = [
+            f"channel={name} kind=bias size={size} start=1"
+            for name, size in zip(names, (20, -50), strict=True)
+        ]
+        output = pipeline.process(struck(block, faults, pipeline.channel_names))
+        declared = [event for event in output.events if event.declares]
+        assert [event.channel for event in declared] == list(pair)
+        assert {event.after.name for event in declared} == {"FAULTY"}
+        assert [event.error for event in declared] == pytest.approx([20, -50], abs=2.74)
+        assert {event.row for event in declared} == {103}  # the fourth alarm
+
+
+def test_the_worked_example_of_the_paper_holds_for_accelerometers():
+    z = np.tile([-393.04, 1055.35, -562.73, -593.11, 1254.79, -761.19], (12, 1))
+    z[4:] += [0, 20, -50, 0, 0, 0]
+    known = ("turn_on_std", "scale_std", "bias_walk")
+    pipeline = Pipeline(
+        array_settings(
+            detector="guaranteed",
+            accelerometers__max_acceleration=1e4,
+            **{f"accelerometers__{name}": 0.0 for name in known},
+            accelerometers__noise_std=0.25,  # a bound of 1 m/s^2
+        )
+    )
+    stamp = START + np.arange(12) * 10_000_000
+    still = np.random.default_rng(0).normal(0, SIGMA, z.shape)
+    output = pipeline.process(Block(stamp, still, None, Block(stamp, z)))
+    found = {
+        output.channel_names[event.channel]: (event.after.name, round(event.error, 2))
+        for event in output.events
+        if event.declares
+    }
+    assert found == {"a2": ("FAULTY", 20.89), "a3": ("FAULTY", -51.35)}
+
+
+@pytest.mark.parametrize("name", sorted(DETECTORS))
+def test_every_detector_judges_accelerometers_as_gyros(name):
+    """A bias of 0.2 rad/s, and one of 30 m/s^2, which is 150 times as large in noise that is, too."""
+    axes = FIVE if detector_class(name).refuses(6) else CONE
+    known = ("turn_on_std", "scale_std", "bias_walk")
+    pipeline = Pipeline(
+        array_settings(
+            axes,
+            detector=name,
+            noise__noise_std=NOISE / 150,
+            noise__bias_walk=0.0,
+            bias__turn_on_std=0.0,
+            bias__max_drift=5.0 / 150,
+            **{f"accelerometers__{key}": 0.0 for key in known},
+        )
+    )
+    block, _ = array_flight(300)
+    rng = np.random.default_rng(3)
+    felt = rng.normal(0, 20, 3) @ axes.T + rng.normal(0, NOISE, (300, len(axes)))
+    felt[150:, 2] += 30.0
+    output = pipeline.process(
+        Block(block.stamp, felt / 150, None, Block(block.stamp, felt))
+    )
+    gyros, accelerometers = np.split(output.state, 2, axis=1)
+    assert np.array_equal(gyros, accelerometers)
+    assert accelerometers[-1, 2] in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+
+
+def test_an_array_of_accelerometers_has_axes_of_its_own():
+    changes = {"accelerometers__axes": FIVE.ravel().tolist()}
+    block, force = array_flight(300, forces=FIVE)
+    output = Pipeline(array_settings(**changes)).process(block)
+    assert output.channel_names[6:] == ("a1", "a2", "a3", "a4", "a5")
+    error = output.acceleration.rate[50:] - force[50:]
+    assert np.abs(error).max() < 1.0
+    assert (np.abs(error) < output.acceleration.level[50:]).all()
+    with pytest.raises(ConfigError, match="accelerations have shape"):
+        Pipeline(array_settings(**changes)).process(array_flight(3)[0])
+
+
+def test_arrays_message_by_message_equal_the_block():
+    pipeline = Pipeline(array_settings())
+    block, _ = array_flight(300)
+    fault = "channel=a4 kind=bias size=5 start=2"
+    block = struck(block, [fault], pipeline.channel_names)
+    ear, offline = Ear(pipeline), Pipeline(array_settings())
+    for k, (topic, data) in enumerate(arrays(block)):
+        ear.take(topic, data, int(block.stamp[k // 2]))
+    output = offline.process(block)
+    read = np.array([ImuSource.parse(data, 6)[1] for data in ear.fused])
+    np.testing.assert_allclose(
+        read[:, 3:], output.acceleration.rate, rtol=0, atol=1e-12
+    )
+    assert ear.events == list(output.events)
+    assert "a4" in {
+        ear.receiver.pipeline.channel_names[one.channel] for one in ear.events
+    }
+
+
+def test_a_sample_takes_the_accelerations_since_the_sample_before_and_none_twice():
+    ear, (block, _) = Ear(Pipeline(array_settings())), array_flight(6)
+    sample = ear.receiver.live["sample"][0]
+    for k, count in enumerate((1, 0, 2, 1, 0, 0)):
+        expected = np.full(6, np.nan)
+        for extra in range(count):
+            expected = block.acceleration.z[k] + extra
+            ear.take(1, array(expected.tolist()))
+        ear.take(0, array(block.z[k].tolist()), int(block.stamp[k]))
+        assert np.array_equal(sample["force"][:6], expected, equal_nan=True)
+        assert sample["felt"][:6].tolist() == [count > 0] * 6
+    short = array([1.0] * 5)
+    ear.take(1, short)
+    assert ear.receiver.counts(1) == {"malformed": 1}
+    ear.receiver.refused(1, short)
+    assert ear.receiver.errors == ["", "array has 5 values, expected 6"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"accelerometers.enabled": "on"}, "without channels.acceleration_topic"),
+        ({"channels.acceleration_topic": "gyro_channels"}, "expected two topics"),
+        ({"channels.acceleration_topic": "a b"}, "is no ROS name"),
+        (
+            {"accelerometers.axes": [1.0, 0.0, 0.0] * 3},
+            "accelerometers: 3 channels, expected 4 to 12",
+        ),
+        ({"accelerometers.axes": [1.0, 0.0]}, "expected 3 per accelerometer"),
+        ({"accelerometers.noise_std": [0.1, 0.2]}, "expected 1 or 6"),
+        ({"accelerometers.positions": [0.1] * 3}, "expected 0 or 18"),
+        ({"excluded_channels": ["a7"]}, "expected some of: g1"),
+        (
+            {"input": "imus", "imus.topics": ["a", "b"]},
+            "is given, but input is 'imus'",
+        ),
+    ],
+)
+def test_settings_of_accelerometers_that_do_not_fit_are_refused(changes, words):
+    topic = (
+        {}
+        if "accelerometers.enabled" in changes
+        else {"channels.acceleration_topic": "acc"}
+    )
+    with pytest.raises(FdiError, match=words):
+        Pipeline(Config.from_parameters(topic | changes))

@@ -7,9 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag.recordings import imu, write_bag
-from monitor.test_accelerometers import flight, settings
+from bag.recordings import ARRAY, array, imu, write_bag
+from monitor.test_accelerometers import (
+    array_flight,
+    array_settings,
+    arrays,
+    flight,
+    settings,
+)
 
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import read_block
+from fdi_ros.replay.outputs import OutputBag
 from fdi_ros.replay.run import replay
 from fdi_ros.replay.words import summary_text
 
@@ -81,3 +90,52 @@ def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path)
     assert "rad/s" not in episode.words
     lost = replay(path, config, ["channel=imu_3 kind=triad_loss start=4"])
     assert len(lost.scores.faults[0].channels) == 6
+
+
+def test_arrays_of_a_recording_are_judged_as_their_block_is(tmp_path):
+    block, _ = array_flight(800)
+    config = array_settings()
+    topics = ("gyro_channels", "accelerations")
+    messages = [
+        (topics[topic], int(block.stamp[k // 2]) - 1000 * topic, data)
+        for k, (topic, data) in enumerate(arrays(block))
+    ]
+    types = dict.fromkeys(topics, ARRAY)
+    path = write_bag(tmp_path / "flight", messages, types=types)
+    fault = "channel=a3 kind=bias size=2 start=4"
+    with OutputBag(tmp_path / "output", config) as out:
+        summary = replay(path, config, [fault], sinks=[out])
+    (outcome,) = summary.scores.faults
+    assert (outcome.outcome, outcome.channels) == ("named", ("a3",))
+    (episode,) = summary.story.episodes
+    assert (episode.measured_in, episode.channels) == ("m/s^2", ("a3",))
+    read = read_block(path, config)
+    np.testing.assert_array_equal(read.z, block.z)
+    np.testing.assert_array_equal(read.acceleration.z, block.acceleration.z)
+    assert read.acceleration.delivered.all()
+    with Recording(tmp_path / "output") as recording:
+        assert set(topics) <= {topic.name.lstrip("/") for topic in recording.topics}
+
+
+def test_a_sample_of_a_recording_takes_the_accelerations_since_the_sample_before(
+    tmp_path,
+):
+    """In whatever blocks the recording is read: 20 000 samples are several."""
+    block, _ = array_flight(20_000)
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 3, len(block))
+    messages = []
+    expected = np.full(block.acceleration.z.shape, np.nan)
+    for k, stamp in enumerate(block.stamp.tolist()):
+        for j in range(counts[k]):
+            expected[k] = block.acceleration.z[k] + j
+            at = stamp - 2000 + 1000 * j
+            messages.append(("accelerations", at, array(expected[k].tolist())))
+        messages.append(("gyro_channels", stamp, array(block.z[k].tolist())))
+    types = dict.fromkeys(("gyro_channels", "accelerations"), ARRAY)
+    path = write_bag(tmp_path / "flight", messages, types=types)
+    read = read_block(path, array_settings())
+    np.testing.assert_array_equal(read.acceleration.z, expected)
+    np.testing.assert_array_equal(
+        read.acceleration.delivered, np.repeat(counts[:, np.newaxis] > 0, 6, axis=1)
+    )
