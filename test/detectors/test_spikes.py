@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from monitor.streams import RATE, SIGMA, parallel, swing
 
 from fdi_ros import Block, Config, Pipeline, replay
 from fdi_ros.experiments.flight import regular_stamps
@@ -77,6 +78,38 @@ def test_a_lasting_step_is_no_spike():
     assert sum(one.counts["spikes"] for one in pipeline.status().channels) == 0
     error = output.rate - flight.truth_at((output.instant - START) * 1e-9)
     assert np.abs(error[3000:3100]).max() < 0.03
+
+
+def spikes_counted(pipeline, stamps, z):
+    """Spikes of each channel, of a stream in which nothing is declared."""
+    output = pipeline.process(Block(stamps, z))
+    assert not any(event.declares for event in output.events)
+    return [one.counts["spikes"] for one in pipeline.status().channels]
+
+
+def test_a_spike_that_delays_spread_over_several_samples_is_counted_once():
+    """Values of a unit that is in time are interpolated where another one is 8 ms late."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    time = np.arange(3000) / RATE
+    z = np.hstack([swing(time, 2.0), swing(time - 0.008, 2.0), swing(time, 2.0)])
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    z[[2500, 2600, 2700, 2800], 1] += 1.0
+    counts = spikes_counted(pipeline, START + np.arange(3000) * 10_000_000, z)
+    assert counts == [0, 4, *[0] * 7]
+
+
+@pytest.mark.parametrize(("hole", "counted"), [(0, 1), (3_000_000_000, 0)])
+def test_of_two_units_a_spike_is_counted_only_where_the_rate_before_is_known(
+    hole, counted
+):
+    """Just after a hole in the stream the spike may be of either unit."""
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    z = np.tile(swing(np.arange(700) / RATE), 2)
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    z[600, 4] += 1.0
+    stamps = START + np.arange(700) * 10_000_000
+    stamps[600:] += hole
+    assert spikes_counted(pipeline, stamps, z) == [0, 0, 0, 0, counted, 0]
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="needs the cases beside the project")

@@ -167,6 +167,20 @@ def test_over_a_poor_link_losses_are_counted_and_no_stamp_goes_back(
     assert talk.vehicle.clock.restarts == 0
 
 
+@pytest.mark.parametrize(("ahead", "taken"), [(0.5, 1), (3.0, 0)])
+def test_a_sample_from_the_future_is_taken_as_far_as_clocks_may_be_apart(
+    ahead: float, taken: int
+) -> None:
+    one = Autopilot("ardupilot")
+    talk = Conversation(one).run(6.0)
+    time = round((talk.now - one.boot) * 1e-6 + 1000 * ahead)
+    values = (0, 0, 1000, 10, 20, 30, 0, 0, 0)
+    message = mavlink.MAVLink_scaled_imu_message(time, *values)
+    before = len(talk.samples)
+    talk.inject(bytes(message.pack(one.mav)))
+    assert len(talk.samples) == before + taken
+
+
 def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> None:
     one, other = Autopilot("px4", system=3), Autopilot("px4", system=7, seed=9)
     talk = Conversation(one, other, kind="")

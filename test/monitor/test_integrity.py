@@ -383,3 +383,55 @@ def test_what_no_hypothesis_explains_is_in_the_covariance(seed: int) -> None:
         / 3
     )
     assert nees.mean() < 3.0
+
+
+def parity_of(pipeline, mask):
+    """Information, gain and covariance of the rate of the channels in mask, with the uncertainty of this sample."""
+    n, used = pipeline.geometry.n, list(np.flatnonzero(mask))
+    axes = pipeline.geometry.axes[used]
+    weight = np.diag(1.0 / pipeline.core["now"]["uncertainty"][0, used])
+    covariance = np.linalg.inv(axes.T @ weight @ axes)
+    information, gain = np.zeros((n, n)), np.zeros((3, n))
+    gain[:, used] = covariance @ axes.T @ weight
+    information[np.ix_(used, used)] = weight - weight @ axes @ gain[:, used]
+    return information, gain, covariance
+
+
+def level_if_another_is_faulty(pipeline, rate, named, prior, risk):
+    """Level (3,) in the last sample if the channel named is healthy, and one or two others are not."""
+    z = pipeline.core["now"]["corrected"][0, : pipeline.geometry.n]
+    others = np.arange(len(z)) != named
+    chi = z @ parity_of(pipeline, others)[0] @ z
+    information, gain, covariance = parity_of(pipeline, np.full(len(z), True))
+    fused, level = np.flatnonzero(others), np.zeros(3)
+    for rival in [*combinations(fused, 1), *combinations(fused, 2)]:
+        index = list(rival)
+        spread = np.linalg.inv(information[np.ix_(index, index)])
+        error = spread @ (information @ z)[index]
+        left = z @ information @ z - (information @ z)[index] @ error
+        odds = 2 * prior if len(index) == 2 else 1.0
+        log_odds = 0.5 * (chi - left) + math.log(odds * len(fused) ** 2 / risk)
+        apart = np.abs(rate - gain @ z + gain[:, index] @ error)
+        variance = np.diag(covariance + gain[:, index] @ spread @ gain[:, index].T)
+        if log_odds > 0.0:
+            level = np.maximum(level, apart + np.sqrt(2.0 * log_odds * variance))
+    return level
+
+
+@pytest.mark.parametrize(("fault_rate", "whole"), [(1e-5, False), (1e-12, True)])
+def test_beside_a_named_channel_the_level_holds_if_others_are_faulty_instead(
+    fault_rate, whole
+):
+    """Where two faults are rare it is that level on every axis, else on one at least."""
+    settings = config(integrity__fault_rate=fault_rate, bias__turn_on_std=0.0)
+    pipeline = Pipeline(settings)
+    z = np.random.default_rng(1).normal(0.0, 0.0025, (500, 6))
+    z[200:, 4] += 6 * 0.0025 / math.sqrt(pipeline.geometry.S[4, 4])
+    output = pipeline.process(block(z))
+    assert output.state[-1].tolist().count(ChannelState.FAULTY) == 1
+    prior = fault_rate * settings.integrity.exposure
+    risk = settings.integrity.risk
+    level = level_if_another_is_faulty(pipeline, output.rate[-1], 4, prior, risk)
+    ratio = output.level[-1] / level
+    assert ratio.min() == pytest.approx(1.0, rel=1e-6)
+    assert ratio.max() < 1.0 + 1e-6 if whole else ratio.max() < 1.8

@@ -154,3 +154,31 @@ def test_the_level_of_healthy_gyros_is_little_more_than_the_quantile_of_their_no
     ratio = (output.level / std)[round(5 * RATE) :]
     assert ratio.min() >= 5.33
     assert ratio.max() < 8.0
+
+
+@pytest.mark.parametrize(("turn_on_std", "checked"), [(SIGMA, True), (0.02, False)])
+def test_a_channel_whose_bias_may_be_far_larger_than_its_noise_is_checked_only_once_it_is_known(
+    turn_on_std, checked
+):
+    """Before, a bias of that size would hide a fault of ten times the noise."""
+    settings = parallel(3, detector__name="sequential", bias__turn_on_std=turn_on_std)
+    pipeline = Pipeline(settings)
+    state = pipeline.process(stream(pipeline.geometry, round(2 * RATE))).state
+    assert ((state[5] == ChannelState.OK) == checked).all()
+    assert ((state[5] == ChannelState.UNCHECKED) != checked).all()
+    assert (state[-1] == ChannelState.OK).all()
+
+
+def test_a_unit_that_repeated_its_values_is_a_set_until_it_was_clean_for_long_enough():
+    """Values of one second again and again, while the body turns; `clean_time` after them all is as before."""
+    clean = 5.0
+    settings = parallel(
+        2, detector__name="sequential", decision__clean_time=clean, decision__latch=True
+    )
+    pipeline = Pipeline(settings)
+    block = stream(pipeline.geometry, round(13 * RATE), size=2.0)
+    block.z[500:600, 3:] = block.z[500, 3:]
+    state = pipeline.process(block).state
+    last = 600 + round(clean * RATE)
+    assert (state[580 : last - 5, 3:] == ChannelState.AMBIGUOUS).all()
+    assert (state[last + 100 :] == ChannelState.OK).all()
