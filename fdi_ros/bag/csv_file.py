@@ -119,7 +119,7 @@ class CsvLog(FlightLog):
     settings = (
         f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"
     )
-    one_imu = "this table has one IMU ({}): nothing to compare it with"
+    one_imu = "one IMU cannot be checked: this table has no other ({})"
     slowest = 5.0
     #: number of the first IMU
     first = 0
@@ -282,7 +282,7 @@ def _columns(
         for x, _, _ in forces
     ]
     said = "; ".join(
-        f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus, first)
+        f"/imu_{k} = {', '.join(imu)}" for k, imu in enumerate(imus, first)
     )
     stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
     unit = (
@@ -290,10 +290,10 @@ def _columns(
         if _DEGREES in rates
         else ""
         if stated
-        else "; no unit is named: taken as rad/s"
+        else "; no unit in the names: rad/s assumed"
     )
     note(
-        f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{unit}"
+        f"columns, by {'their names' if 'imus' not in told else COLUMNS}: time = {time}; {said}{unit}"
     )
     if forces:
         listed = "; ".join(", ".join(force) for force in forces)

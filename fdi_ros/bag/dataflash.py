@@ -218,8 +218,8 @@ class DataflashLog(FlightLog):
         "or INS_RAW_LOG_OPT bit 1, all gyros"
     )
     one_imu = (
-        "this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
-        " INS_ENABLE_MASK names"
+        "one IMU cannot be checked: this autopilot logged no other ({})."
+        " If the board has more, check INS_ENABLE_MASK"
     )
     counted_by = "IMU"
 

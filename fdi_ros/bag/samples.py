@@ -196,7 +196,14 @@ class Samples:
             words = "rates" if self.source.units else "values"
             expected = 3 if self.source.units else self._gyros
             return f" ({wrong} malformed, expected {expected} {words} in each)"
-        return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
+        if self.recording.damage:
+            return f" ({self.recording.damage.lines[0]})"
+        start, end = self._span
+        if self.origin is not None:
+            # Messages were read, but none within the part that was asked for.
+            to = "its end" if math.isinf(end) else f"{end:g} s"
+            return f" from {start:g} s to {to}"
+        return ""
 
     def _block(self, messages: Rows) -> Block:
         stamp, values = (
@@ -313,7 +320,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     off = np.array([usual, mean]) / configured
     if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
         raise BagError(
-            f"{path}: sample_rate is {configured:g} Hz in the config, the recording has {usual:.4g} Hz: set"
+            f"{path}: sample_rate is {configured:g} Hz in the config and {usual:.4g} Hz in the recording: set"
             f" sample_rate to {usual:.4g}"
         )
 

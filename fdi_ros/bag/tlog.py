@@ -75,8 +75,8 @@ class Tlog(LibraryLog):
     kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
     settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
     one_imu = (
-        "this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
-        " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names"
+        "one IMU cannot be checked: this autopilot sent no other ({}). If the board has more, it should send"
+        " SCALED_IMU2 and SCALED_IMU3; for ArduPilot, check INS_ENABLE_MASK"
     )
     #: many ground stations ask for no more than 10 Hz
     slowest = 5.0

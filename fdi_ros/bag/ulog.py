@@ -111,8 +111,9 @@ class Ulog(LibraryLog):
     kinds = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo")
     settings = "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"
     one_imu = (
-        "this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
-        f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n"
+        "one IMU cannot be checked: this autopilot logged no other ({}). If the board has more, add the line"
+        f" vehicle_imu to etc/logging/logger_topics.txt on the SD card ({SETTINGS}), and check that CAL_GYROn_PRIO"
+        " is not 0"
     )
     coarse = _STATUS
     selected = _SELECTED

@@ -75,9 +75,17 @@ SHARED: Mapping[str, Options] = {
         _CONFIG.format(""), type=resolve, action="append", required=True
     ),
     "--start": takes(
-        "from here, seconds from the start", type=float, default=0.0, metavar="S"
+        "start of the part to use, s from the first message",
+        type=float,
+        default=0.0,
+        metavar="S",
     ),
-    "--end": takes("up to here", type=float, default=math.inf, metavar="S"),
+    "--end": takes(
+        "end of the part to use, s from the first message",
+        type=float,
+        default=math.inf,
+        metavar="S",
+    ),
     "--fault": {"action": "append", "default": [], "metavar": "'KEY=VALUE ...'"},
     "--detector": takes(
         f"use this detector instead of the configured one: {DETECTOR_NAMES}",
@@ -86,20 +94,20 @@ SHARED: Mapping[str, Options] = {
     "--csv": takes_path(),
     "--report": takes_path("write a page with tables and plots", metavar="FILE.html"),
     "--json": takes_path(
-        "write all figures as JSON, in SI units; - is standard output, tables then go to standard error"
+        "write all figures as JSON, in SI units; - writes to standard output, and tables to standard error"
     ),
     "--force": takes("overwrite files that exist", action="store_true"),
-    "--quiet": takes("print nothing but errors; no progress", action="store_true"),
+    "--quiet": takes("print errors only, and no progress", action="store_true"),
     "--degrees": takes(
-        "print angular rates in deg/s; what is read and written stays in rad/s",
+        "print angular rates in deg/s; files stay in rad/s",
         action="store_true",
     ),
     "--workers": takes(
-        "processes; default: as many as there are cores", type=int, metavar="N"
+        "number of processes; default: one for each core", type=int, metavar="N"
     ),
     "--scheduler": takes(
-        "Dask scheduler to work instead: tls://host:port (certificates: Dask's configuration), or where nobody"
-        " else reaches it tcp://host:port",
+        "Dask scheduler to run the work on, instead of local processes: tls://host:port (certificates:"
+        " see Dask's configuration), or tcp://host:port in a network that nobody else reaches",
         metavar="ADDRESS",
     ),
 }
@@ -115,12 +123,13 @@ _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
     **PART,
     "--reference": takes(
-        "triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike",
+        "trust the configured axes of this triad, or of three channels 'a,b,c';"
+        " default: all triads share the deviation equally",
         default="",
         metavar="NAME",
     ),
     "--proof": takes_path(
-        "prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
+        "test the settings on this recording; default: on the last quarter of BAG, which is then not used for fitting",
         type=resolve,
         metavar="RECORDING",
     ),
@@ -128,7 +137,7 @@ _SETTINGS: Mapping[str, Options] = {
 """What settings are made of, and where they are written."""
 VERBS = {
     "setup": Verb(
-        "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+        "make a config from a recording: topics, mounts, delays, biases, noise; with a page of the results",
         (
             "fdi setup my_flight --output my_gyros.yaml",
             "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
@@ -137,7 +146,7 @@ VERBS = {
             "bag": {},
             **_SETTINGS,
             "--report": takes(
-                "page of what was found; default: beside the parameter file"
+                "page with the results; default: beside the parameter file"
             ),
             **RESULTS,
             "--degrees": {},
@@ -157,7 +166,7 @@ VERBS = {
             "bag": {},
             "--config": takes(
                 _CONFIG.format(
-                    "; default: what fdi inspect writes, where units are mounted alike"
+                    "; default: the config that fdi inspect writes, if all units are mounted alike"
                 ),
                 required=False,
                 default=[],
@@ -172,17 +181,19 @@ VERBS = {
             "--detector": {},
             **PART,
             "--check": takes(
-                "exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
-                " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
-                " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
-                " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
-                " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
+                "exit with 1 and the reasons unless all conditions hold. For every injected fault: detected, delay<S,"
+                " isolated, isolated<S (S in s). Number of declarations without an injected fault: false=N, false<N."
+                " Number of episodes: declared=N, declared<N. State of a channel: 'CHANNEL faulty' (or ambiguous,"
+                " stale, ok). Share of judged samples: judged>SHARE (default 0.5). Number of channels that end STALE or"
+                " UNCHECKED: unchecked=N, unchecked<N (default 0). <= and >= also work. Examples:"
+                " 'delay<1 isolated false=0'; without injected faults 'declared=0' or 'imu_2.y faulty'",
                 metavar="'TERM ...'",
             ),
             "--csv": takes("write a line for every sample"),
-            "--report": takes("write a report to be looked at"),
+            "--report": takes("write a page with tables and plots"),
             "--output": takes_path(
-                "write a bag of what the node would have published", metavar="DIR"
+                "write a bag with the messages that the node would have published",
+                metavar="DIR",
             ),
             **RESULTS,
             "--force": takes("overwrite outputs that exist"),
@@ -192,7 +203,7 @@ VERBS = {
         (*BAGS, *PROGRESS),
     ),
     "inspect": Verb(
-        "say what is in a recording, and write a config to start from",
+        "list the content of a recording, and write a config to start from",
         ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
         {
             "bag": {},
@@ -236,7 +247,7 @@ VERBS = {
         (*BAGS, *POOL, "scipy"),
     ),
     "geometry": Verb(
-        "say what a mounting can detect and isolate, before it flies",
+        "state which faults a mounting can detect and isolate, before it flies",
         (
             "fdi geometry two_triads.yaml",
             "fdi geometry my_gyros.yaml --degrees --report mounting.html",
@@ -259,14 +270,18 @@ VERBS = {
         ("fdi montecarlo power.yaml --trials 200 --report power.html",),
         {
             "study": takes_path(
-                f"what to run; shipped: {shipped('studies')}",
+                f"study to run; shipped: {shipped('studies')}",
                 type=resolve,
                 metavar="STUDY.yaml",
             ),
             "--trials": takes(
-                "trials per cell, instead of the file's", type=int, metavar="N"
+                "trials per cell; default: the number in the file",
+                type=int,
+                metavar="N",
             ),
-            "--seed": takes("seed, instead of the file's", type=int, metavar="S"),
+            "--seed": takes(
+                "seed; default: the one in the file", type=int, metavar="S"
+            ),
             **WORKERS,
             "--report": takes("write curves and tables as one page"),
             **RESULTS,
@@ -275,7 +290,7 @@ VERBS = {
         POOL,
     ),
     "sweep": Verb(
-        "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
+        "inject faults of many sizes into every channel of a recording, and state which are detected, and how soon",
         (
             "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
             "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"
@@ -285,35 +300,35 @@ VERBS = {
             "bag": {},
             "--config": {},
             "--fault": takes(
-                "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases,"
-                " drifts, noise, scale factors, stuck, dropout"
+                "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: bias,"
+                " drift, noise, scale, stuck, dropout"
             ),
             "--times": takes(
-                "times per channel and fault; default 10",
+                "number of start times per channel and fault; default 10",
                 type=int,
                 default=10,
                 metavar="N",
             ),
             "--within": takes(
-                "watch a fault for so long; default 5",
+                "time to detect a fault, s; default 5",
                 type=float,
                 default=5.0,
                 metavar="S",
             ),
             "--detector": {},
             "--compare": takes(
-                "other detectors (as of --detector) or parameter files beside it",
+                "detectors or parameter files to compare with",
                 nargs="+",
                 default=[],
                 metavar="NAME",
             ),
             "--seed": takes(
-                "of signs and random faults; default 1",
+                "seed for the signs and the random faults; default 1",
                 type=int,
                 default=1,
                 metavar="S",
             ),
-            "--workers": takes("processes; default 1", default=1),
+            "--workers": takes("number of processes; default 1", default=1),
             **PART,
             "--csv": takes("write a line for every fault"),
             "--report": {},
@@ -323,7 +338,8 @@ VERBS = {
         (*BAGS, *POOL),
     ),
     "fleet": Verb(
-        "judge many recordings: tables of flights and episodes, and a page of what needs a person",
+        "pass many recordings through the monitor: tables of flights and episodes, and a page of the"
+        " flights that need attention",
         (
             "fdi fleet logs --output fleet",
             "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet",
@@ -334,7 +350,7 @@ VERBS = {
             ),
             "--config": takes(
                 _CONFIG.format(
-                    "; default: of each recording what fdi inspect writes for it"
+                    "; default: the config that fdi inspect writes for each recording"
                 ),
                 required=False,
                 default=[],
@@ -343,50 +359,49 @@ VERBS = {
                 "folder for the tables and the page", metavar="DIR", required=True
             ),
             "--reports": takes(
-                "write the page of each replay too, linked from the page of the fleet",
+                "also write the page of each replay, linked from the page of the fleet",
                 action="store_true",
             ),
             "--calibrate": takes(
-                "each: calibrate each recording on itself, where it allows that; default none",
+                "each: calibrate each recording on itself, if possible; default: none",
                 choices=("none", "each"),
                 default="none",
             ),
             **WORKERS,
             **RESULTS,
             "--force": takes(
-                "begin anew where the folder holds a run with other settings"
+                "start over if the folder holds a run with other settings"
             ),
         },
         "replay:run_fleet",
         (*BAGS, *POOL, "pyarrow", "scipy"),
     ),
     "watch": Verb(
-        "show a running monitor: residuals, states, rates and events as they come",
+        "show a running monitor: residuals, states, rates and events",
         ("fdi watch", "fdi watch --node /drone/fdi_node --plain"),
         {
             "--node": takes(
-                "the monitor; default: the only one running",
+                "full name of the monitor; default: the only one that runs",
                 default="",
                 metavar="/NS/NAME",
             ),
-            "--plain": takes(
-                "line by line, as where the output is no terminal", action="store_true"
-            ),
+            "--plain": takes("print line by line, as in a file", action="store_true"),
         },
         "command_line:run_watch",
     ),
     "shipped": Verb(
-        "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
+        "list the files that come with fdi_ros: parameters, scenarios, studies, layouts",
         ("fdi shipped", "fdi shipped two_imus.yaml"),
         {
             "name": takes(
-                "only this file, such as two_imus.yaml",
+                "list only this file, for example two_imus.yaml",
                 nargs="?",
                 default="",
                 metavar="NAME",
             ),
             "--node": takes(
-                "print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
+                "print diagnostics.yaml for a monitor with this full name, for example"
+                " /drone/fdi_node; may be repeated",
                 action="append",
                 default=[],
                 metavar="NAME",
@@ -396,11 +411,11 @@ VERBS = {
         "settings:run_shipped",
     ),
     "compile": Verb(
-        "compile now what else is compiled when it is first used, for images and CI",
+        "compile the code now instead of at first use (for images and CI)",
         ("fdi compile", "fdi compile --detector sequential"),
         {
             "--detector": takes(
-                f"for these detectors; default: for all: {DETECTOR_NAMES}", nargs="+"
+                f"detectors to compile; default: all: {DETECTOR_NAMES}", nargs="+"
             ),
             **RESULTS,
         },
@@ -413,9 +428,9 @@ FIRST = ("inspect", "setup", "replay", "watch")  # what one needs first
 
 DEFECT = 70  # EX_SOFTWARE of sysexits.h
 EXIT_CODES = (
-    "Exit codes: 0 done, and a verdict that is good; 1 a replay that does not meet its --check; 2 something asked for"
-    " or read is wrong, said in one line; 3 a verdict that somebody must act on; 4 one that leaves something open;"
-    f" {DEFECT} a defect of fdi itself, with a traceback to report; {STOPPED} stopped from outside."
+    "Exit codes: 0 done, and the verdict is good; 1 a replay does not meet its --check; 2 wrong arguments or input"
+    " (one line on standard error); 3 a verdict that needs action; 4 a verdict that leaves a question open;"
+    f" {DEFECT} a defect of fdi itself (please report the traceback); {STOPPED} stopped by a signal."
 )
 
 
@@ -661,8 +676,11 @@ def _overview() -> str:
             VERBS[name].meaning, width, initial_indent=first, subsequent_indent=others
         )
 
-    lines = ["Gyro fault detection and isolation, offline.", "\nfirst:"]
+    lines = [
+        "Detects and isolates faults of redundant gyros and accelerometers.",
+        "\nfirst:",
+    ]
     for name in FIRST:
         lines += [line(name), f"{' ' * (wide + 4)}{VERBS[name].examples[0]}"]
     lines += ["\nthen:", *(line(name) for name in VERBS if name not in FIRST)]
-    return "\n".join([*lines, "\nfdi VERB --help says more of each, with examples."])
+    return "\n".join([*lines, "\nfdi VERB --help describes a verb, with examples."])

@@ -79,15 +79,12 @@ def progress(
                 bar.refresh()
                 continue
             spent, share = clock() - begun, done
-            words = (
-                f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left"
-                if share > 0
-                else "at work"
-            )
+            words = f"{spent:.0f} s so far"
+            if share > 0:
+                left = spent * (1 / share - 1)
+                words = f"{share:.0%} done after {spent:.0f} s, about {left:.0f} s left"
             with suppress(OSError, ValueError):
-                stream.write(
-                    f"fdi: {what}{': ' if what else ''}{words} after {spent:.0f} s\n"
-                )
+                stream.write(f"fdi: {what}{', ' if what else ''}{words}\n")
                 stream.flush()
 
     def show(share: float) -> None:
@@ -153,11 +150,11 @@ class Outputs:
         self.targets: dict[str, Path] = {
             name: path for name in names if (path := getattr(arguments, name))
         }
-        kinds = {**_KINDS, "output": output}
+        self._kinds = {**_KINDS, "output": output}
         wanted = [
             (path, kind)
             for name, path in self.targets.items()
-            if (kind := kinds[name]) is not None
+            if (kind := self._kinds[name]) is not None
         ]
         folders = [path for path, kind in wanted if kind is Kind.FOLDER]
         taken: set[Path] = set()
@@ -232,9 +229,13 @@ class Outputs:
             if figures is not None:
                 write_json(self.targets.get("json"), figures)
         self.say(text, severity)
-        for target in self.targets.values():
+        for name, target in self.targets.items():
             if target != STANDARD_OUTPUT:
-                self.say(f"wrote {shown(target, LINE)}\n")
+                refused = (
+                    severity is Severity.BAD and self._kinds[name] is Kind.PARAMETERS
+                )
+                warning = " (NOT FOR FLIGHT)" if refused else ""
+                self.say(f"wrote {shown(target, LINE)}{warning}\n")
         return 0 if severity is None else severity.exit_code
 
 

@@ -90,9 +90,7 @@ def run_setup(arguments: Namespace) -> int:
     check_part(arguments)
     arguments.report = arguments.report or arguments.output.with_suffix(".html")
     outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag])
-    with progress(
-        sys.stderr, arguments.quiet, "looking into the recording", timed=True
-    ):
+    with progress(sys.stderr, arguments.quiet, "reading the recording", timed=True):
         found = set_up(
             arguments.bag,
             arguments.start,

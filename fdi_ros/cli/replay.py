@@ -25,7 +25,7 @@ from fdi_ros.cli.outputs import (
 )
 from fdi_ros.cli.settings import compile_for_workers
 from fdi_ros.config.config import Config, with_parameters
-from fdi_ros.detectors import DETECTORS
+from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.inspection.fitness import not_configured, refuse_unfit
@@ -39,7 +39,7 @@ from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary, as_json
-from fdi_ros.replay.words import sample_rate_notes, summary_text
+from fdi_ros.replay.words import AUTOPILOT_LOGS, sample_rate_notes, summary_text
 from fdi_ros.report.layout import unit_of
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text
@@ -51,16 +51,16 @@ if TYPE_CHECKING:
 
 def run_replay(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
-    assumed = None if arguments.config else assumed_config(arguments.bag)
-    config = assumed.config if assumed else Config.from_file(arguments.config)
-    config = (
-        config.replaced({"detector.name": arguments.detector})
-        if arguments.detector
-        else config
-    )
+    # Arguments that are wrong by themselves are refused before the recording is read.
     faults = [parse_fault(text) for text in arguments.fault]
     faults += [] if arguments.scenario is None else load_scenario(arguments.scenario)
     check_part(arguments)
+    if arguments.detector:
+        detector_class(arguments.detector)
+    assumed = None if arguments.config else assumed_config(arguments.bag)
+    config = assumed.config if assumed else Config.from_file(arguments.config)
+    if arguments.detector:
+        config = config.replaced({"detector.name": arguments.detector})
     geometry = build_geometry(config)
     required = (
         []
@@ -110,7 +110,7 @@ def run_replay(arguments: Namespace) -> int:
             )
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
-    if arguments.bag.suffix.lower() in (".bin", ".tlog"):
+    if arguments.bag.suffix.lower() in AUTOPILOT_LOGS:
         changes = [
             Change(one.at_s, one.channel, one.state, one.error or 0.0)
             for one in summary.scores.events
@@ -118,7 +118,7 @@ def run_replay(arguments: Namespace) -> int:
         ]
         words += f"{failover_text(changes, geometry.channel_names)}\n"
     if assumed:
-        words += f"note: no --config, so assumed: {assumed.words}\n"
+        words += f"note: no --config: assumed {assumed.words}\n"
     else:
         unused = not_configured(arguments.bag, config)
         words += "".join(f"note: {line}\n" for line in unused)

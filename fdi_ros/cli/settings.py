@@ -161,9 +161,9 @@ def run_compile(arguments: Namespace) -> int:
     new = compile_now(names)
     took = time.perf_counter() - begun
     what = (
-        f"compiled in {took:.1f} s, kept in"
+        f"compiled in {took:.1f} s, results in"
         if new
-        else "nothing to do: all is there, in"
+        else "nothing to compile: all results are in"
     )
     figures = {
         "detectors": names,

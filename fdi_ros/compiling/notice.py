@@ -22,7 +22,7 @@ from fdi_ros.compiling.compiled import missing, name_of
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
-WORDS = "compiling the code that every sample passes through, once (fdi compile does it beforehand)"
+WORDS = "compiling for the first use; later runs find the result"
 YOUNG_OBJECTS = 7000
 """Young objects that start a garbage collection while the compiler runs. Python's default is a tenth of this. The
 compiler makes millions of objects that last, and the default costs a seventh of its time."""

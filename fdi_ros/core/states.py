@@ -47,7 +47,7 @@ class Reason(str, Enum):
     FROZEN = "frozen: has repeated one value for long"
     NO_DATA = "gives no data"
     TOO_FEW = "too few channels left to check it"
-    LATELY = "too few of its last samples could be checked"
+    LATELY = "most of its recent samples could not be checked"
     CANNOT_RUN = "the detector cannot run on the channels left"
     BIAS = "bias not learned yet"
     OPERATOR = "taken out by the operator"

@@ -256,8 +256,8 @@ class Injector:
 
     def refuse_between(self, low: float, high: float, why: str) -> None:
         """Refuse faults that begin between two times, s (`FaultError`)."""
-        allowed = [f"at most {low:.12g} s"] if low >= 0 else []
-        allowed += [f"at least {high:.12g} s"] if high < math.inf else []
+        allowed = [f"at most {low:.6g} s"] if low >= 0 else []
+        allowed += [f"at least {high:.6g} s"] if high < math.inf else []
         for fault in self.faults:
             if low < fault.start < high:
                 raise FaultError(

@@ -119,18 +119,18 @@ def assumed_config(path: Path) -> AssumedConfig:
     config = Config.from_parameters(found.parameters)
     if not config.imus.topics:
         raise BagError(
-            f"{refused}: the axes of an array of channels are in no message; --config says them"
+            f"{refused}: no message states the axes of an array of channels; give them with --config"
         )
     if turned := _turned_units(path, config):
         raise BagError(
-            f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes"
+            f"{refused}: {turned}. `fdi setup` measures the mounts and writes a config for --config"
         )
     low, high = min(config.noise.noise_std), max(config.noise.noise_std)
     copies = f"{found.look}; " if found.look else ""
     words = (
         f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
         f" noise {low:.2g} to {high:.2g} rad/s,"
-        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
+        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures these"
     )
     return AssumedConfig(config, words, found.unused)
 

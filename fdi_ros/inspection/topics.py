@@ -343,14 +343,14 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column(
             "quiet_noise",
             [one and one.quiet for one in gyros],
-            ("noise, quietest",),
+            ("noise at its lowest",),
             noise,
         ),
         Column(
             "moving_noise", [one and one.moving for one in gyros], ("in motion",), noise
         ),
         Column("moving_share", [one and one.share for one in gyros]),
-        Column("", [_gyros(report, unit) for report in reports], ("gyros?",)),
+        Column("", [_gyros(report, unit) for report in reports], ("content",)),
     ]
 
 
@@ -361,7 +361,10 @@ def topics_text(
     notes = [f"note: {line}\n" for line in damage]
     units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
-        units += f"; noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out"
+        units += (
+            f"; noise: standard deviation of one sample of each channel, {unit.name};"
+        )
+        units += " vibration is included, slow motion is not"
     return (
         indented(table(*told(topic_columns(reports, unit)), figures=False))
         + f"{units}\n"
@@ -375,17 +378,17 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
         return "no"
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
     words = [
-        f"{report.channels} values",
-        largest if math.isfinite(report.largest) else "none of them a rate",
+        f"{report.channels} gyros",
+        largest if math.isfinite(report.largest) else "none with a rate",
     ]
     words += (
-        ["never all of them usable"]
+        ["never all usable at once"]
         if math.isfinite(report.largest) and not report.complete
         else []
     )
     words += [report.copied] if report.copy_of else []
     words += (
-        [f"in motion for {report.segments.noise().share:.0%}"]
+        [f"moving {report.segments.noise().share:.0%} of the time"]
         if report.complete
         else []
     )

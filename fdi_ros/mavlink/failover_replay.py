@@ -100,7 +100,10 @@ def failover_text(changes: Sequence[Change], channels: Sequence[str]) -> str:
                 at = (time - _BEGIN) / NS
                 done.append(f"{imu_name(k, channels)} {words} at {at:.1f} s")
             use[k] = in_use
-    return f"failover, if armed: {'; '.join(done) or 'nothing to do'}"
+    nothing = (
+        f"no IMU would be taken out (failover_min_size {settings.min_size:g} rad/s)"
+    )
+    return f"failover, if armed: {'; '.join(done) or nothing}"
 
 
 def _times(changes: Sequence[Change]) -> Iterator[int]:

@@ -199,7 +199,7 @@ _STATES = {
 }  # severity and words by state
 _QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
-NOTHING_SEEN = "no further fault would be seen"
+NOTHING_SEEN = "no further fault would be detected"
 
 
 def _format_whole(line: StatusLine) -> str:

@@ -551,7 +551,10 @@ def summary_line(
     )
     span = f"{' to '.join(ends)} {unit}" if ends else "none"
     isolable, n = int(geometry.isolable.sum()), geometry.n
-    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    smallest_words = f"smallest error detected in one sample at rest with probability {DETECTION:.0%}: {span}"
+    if len(ends) > 1:
+        smallest_words += ", depending on the channel"
+    words = f"{n} channels, GDOP {geometry.gdop:.2f}; {smallest_words}"
     if not agree:
         return f"{words}; which faults can be isolated is not known: channels contradict each other"
     groups = [group for group in geometry.groups if len(group) > 1]
@@ -560,4 +563,5 @@ def summary_line(
     alike = "; ".join(
         " or ".join(geometry.channel_names[i] for i in group) for group in groups
     )
-    return f"{words}; {isolable} of {n} single faults can be isolated, not told apart: {alike or 'faults never seen'}"
+    others = f"indistinguishable: {alike}" if alike else "the others are never detected"
+    return f"{words}; {isolable} of {n} single faults can be isolated; {others}"

@@ -122,12 +122,13 @@ _TIMES = (
 )  # name, seconds, upper end of the use in s, and decimals
 ODD = {
     "malformed": "malformed messages",
-    "duplicate": "stamps repeated",
+    "duplicate": "repeated stamps",
     "backward": "stamps going back",
     "ahead": "stamps ahead of the clock, refused",
     "jumped": "stamps far ahead of all others, refused",
     "late": "messages too late for their sample",
-}  # names of the counters, with words for messages not taken as they came
+}
+"""Counters of messages that were not used as they came, with words for each."""
 
 
 def describe(
@@ -245,14 +246,16 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
         times = (
             f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
         )
-        words.append(f"noise {times} times noise_std and above the other units'")
+        words.append(
+            f"noise {times} times noise_std, and larger than in the other units"
+        )
     if abs(channel.drift) > NEARLY * own > 0:
         limit = f"a fault beyond {own:g} ({section}.max_drift)"
         words.append(f"bias has drifted by {_figure(channel.drift)} {unit}, {limit}")
     if status.is_far(channel):
         words.append(
-            f"began with a bias of {_figure(channel.start_bias)} rad/s, bias.turn_on_std is"
-            f" {bias.turn_on_std:g}: learned, as a fault from before the start would be"
+            f"bias of {_figure(channel.start_bias)} rad/s at the start, far above bias.turn_on_std"
+            f" ({bias.turn_on_std:g}): perhaps a fault from before the start"
         )
     return words
 
@@ -315,7 +318,7 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
     late = [unit for unit in status.units if unit.name in worse]
     words = [
         f"{first} and {second} give the same values: one sensor, no redundancy; the second is left out;"
-        " look at topics and remappings"
+        " check topics and remappings"
         for first, second in status.copies
     ]
     words += [_format_frozen(unit) for unit in status.units if unit.frozen]
@@ -345,7 +348,7 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
 
 
 def _format_frozen(unit: UnitStatus) -> str:
-    return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
+    return f"{unit.name} frozen: all values have repeated for {_seconds(unit.frozen)} while the others measure motion"
 
 
 def _format_unit_set(group: Sequence[str], units: Sequence[UnitStatus]) -> str:
@@ -354,14 +357,14 @@ def _format_unit_set(group: Sequence[str], units: Sequence[UnitStatus]) -> str:
     if not inside or sum(len(unit.channels) for unit in inside) != len(group):
         return ""
     who = f"{'one of ' if len(inside) > 1 else ''}{', '.join(unit.name for unit in inside)}"
-    return f"{who} is faulty as a whole or in part, the evidence cannot tell {'which' if len(inside) > 1 else 'more'}"
+    return f"{who} is faulty, as a whole or in part: undecided"
 
 
 def _why_no_rate(status: Status) -> str:
     if status.withheld and status.all_repeat:
-        return "withheld, as all channels repeat their values in motion: what feeds them stands; "
+        return "withheld, because all channels repeat their values in motion: the data source has stalled; "
     if status.withheld:
-        return "withheld, as channels under doubt cannot be left out; "
+        return "withheld, because suspect channels cannot be left out; "
     if status.bias_state == "learning":
         return "the biases are being learned, at rest; "
     return (
@@ -375,17 +378,15 @@ def _reach(status: Status) -> str:
     detect, isolate = len(status.can_detect), len(status.can_isolate)
     alive = sum(not channel.is_left_out for channel in status.channels)
     if not detect:
-        return "no further fault would be seen"
+        return "no further fault would be detected"
     if any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels):
-        return (
-            "while it is undecided which is faulty, no further fault would be isolated"
-        )
+        return "no further fault would be isolated until this set is decided"
     if isolate == alive:
         return "a further fault would be isolated"
     seen = (
-        "a further fault would be seen"
+        "a further fault would be detected"
         if detect == alive
-        else f"a fault would be seen on {detect} of {alive}"
+        else f"a fault would be detected on {detect} of {alive}"
     )
     return f"{seen} " + (
         f"and isolated on {isolate} of {alive}" if isolate else "but not isolated"
@@ -467,34 +468,35 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
         if not channel.since
         else f"for {_seconds(ago)}"
         if ago
-        else "from this sample on"
+        else "now"
     )
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
-        return f"{_format_set(channel, status)}; {lasting}"
+        return f"{_format_set(channel, status)}, {lasting}"
     words = channel.reason.value or channel.state.name.lower()
-    if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
-        words = f"{words} by {_figure(abs(channel.error))} {channel.unit}"
+    size = f"{_figure(abs(channel.error))} {channel.unit}" if channel.error else ""
+    if channel.reason == Reason.DISAGREES and size:
+        words = f"{words} by {size}"
+    if channel.reason == Reason.DRIFTED and size:
+        words = f"{words} ({size})"
     if channel.reason == Reason.INTERMITTENT:
         words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
     ending = {
-        ChannelState.SUSPECT: "under suspicion, left out for now",
-        ChannelState.FAULTY: "isolated and left out",
-        ChannelState.UNCHECKED: "left out" if channel.is_left_out else "used unchecked",
+        ChannelState.SUSPECT: "suspected, left out for now",
+        ChannelState.FAULTY: "declared faulty and left out",
+        ChannelState.UNCHECKED: "left out" if channel.is_left_out else "still used",
     }
-    return f"{words} {lasting}; {ending.get(channel.state, 'left out')}"
+    return f"{words}, {lasting}; {ending.get(channel.state, 'left out')}"
 
 
 def _format_set(channel: ChannelStatus, status: Status) -> str:
     pair = status.apart
     if pair is not None and set(pair.channels) == set(channel.group):
-        return f"{pair}: one of the two is faulty, the evidence cannot tell which"
+        return f"{pair}: one of the two is faulty, undecided"
     if len(channel.group) == 1:
-        return "most likely faulty, the only one left in question: to be confirmed"
-    one_of = (
-        f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
-    )
+        return "probably faulty; confirmation pending"
+    one_of = f"one of {', '.join(channel.group)} is faulty, undecided"
     return (_format_unit_set(channel.group, status.units) or one_of) + (
         f"; seen on {pair}" if pair else ""
     )
@@ -569,20 +571,20 @@ def _input_values(line: InputStatus) -> Values:
 
 def frame_words(first: str, now: str) -> str:
     """Return a warning about a topic whose frame_id has changed."""
-    return f"frame_id was {shown(first)!r} in the first message and is {shown(now)!r}: another sensor?"
+    return f"frame_id changed from {shown(first)!r} to {shown(now)!r}: another sensor?"
 
 
 def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
     odd = [*more]
     odd += [
-        f"{kind_in_words} ({line.recent[kind]})"
+        f"{kind_in_words}: {line.recent[kind]}"
         for kind, kind_in_words in ODD.items()
         if line.recent.get(kind)
     ]
     if line.recent.get("malformed") and line.error:
         odd.append(line.error)
     if line.lag > line.max_lag:
-        odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
+        odd.append(f"stamps are {_seconds(line.lag)} behind those of the other inputs")
     if line.unstamped:
         odd.append("stamps are not set")
     elif line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
@@ -591,7 +593,7 @@ def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
         odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")
     if line.parted:
         odd.append(
-            "the clocks of the two inputs went apart, and nothing tells which is right: neither is used"
+            "the clocks of the two inputs differ, and it is unknown which is right: neither is used"
         )
     if line.frame_now != line.frame:
         odd.append(frame_words(line.frame, line.frame_now))
@@ -601,7 +603,7 @@ def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
         silence = (
-            "gives nothing that can be used"
+            "gives no usable message"
             if line.arrives
             else f"silent for {_seconds(line.silent)}"
         )

@@ -24,6 +24,7 @@ from fdi_ros.monitor.soundness import (
     LEAST_DELIVERED,
     ChannelHealth,
     Concern,
+    RateHealth,
     UnitHealth,
     concerns_of,
     is_declared,
@@ -61,6 +62,8 @@ class _Reading(NamedTuple):
     """(n,) residuals of the channels that are OK, rad/s; NaN for the others."""
     received: Int
     """(u,) messages of each input topic."""
+    has_rate: bool
+    """Whether a fused rate was published."""
 
 
 class RecentHealth:
@@ -80,7 +83,8 @@ class RecentHealth:
                 self._readings.clear()
         self._readings.append(reading)
         units = list(self._units(status, inputs))
-        self._concerns = concerns_of(list(self._channels(status)), units)
+        channels = list(self._channels(status))
+        self._concerns = concerns_of(channels, units, rate=self._rate_health())
 
     @property
     def concerns(self) -> list[Concern]:
@@ -111,6 +115,15 @@ class RecentHealth:
                 residual_rms_rad_s=rms[i],
                 measured_in=one.unit,
             )
+
+    def _rate_health(self) -> RateHealth:
+        """Return how long the fused rate was missing, to a second."""
+        published = [one.has_rate for one in self._readings]
+        if True not in published:
+            return RateHealth()
+        published = published[published.index(True) :]
+        missing = published.count(False)
+        return RateHealth(float(missing), None, 1.0 - missing / len(published))
 
     def _residual_rms(self, status: Status) -> list[float | None]:
         """Return the root mean square of each channel's residual, rad/s; None: not compared.
@@ -175,4 +188,5 @@ def _reading(status: Status, inputs: Sequence[InputStatus], at: float) -> _Readi
             ]
         ),
         received=np.array([line.received for line in inputs]),
+        has_rate=status.has_rate,
     )

@@ -28,6 +28,8 @@ LEAST_CHECKED = 0.5
 """Share of its samples in which the others must have checked a healthy channel."""
 LEAST_DELIVERED = 0.9
 """Share of its messages that a healthy unit delivers."""
+LEAST_MISSING_S = 1.0
+"""Time without a fused rate that is reported, s; shorter outages are in the notes."""
 LEAST_SPIKES = 3
 """Single wrong samples from which on a channel has spikes; fewer may be chance."""
 
@@ -67,7 +69,7 @@ class ChannelHealth:
     measured_in: str = "rad/s"
     """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
     doubt: str = ""
-    """What is wrong with it at the end: ``under suspicion from 16.5 s on``; empty: nothing."""
+    """Why it is not used at the end, as it continues the name: ``remained suspected``. Empty: used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,24 +100,54 @@ class UnitHealth:
     """Lowest and highest temperature, degrees Celsius; None: not recorded."""
 
 
+@dataclass(frozen=True)
+class RateHealth:
+    """How the fused rate was published, from its first sample on."""
+
+    missing_s: float = 0.0
+    """Time without a fused rate, s."""
+    missing_from_s: float | None = None
+    """Start of the first time without it, s; None: not known, or no such time."""
+    share: float = 1.0
+    """Share of the samples with a fused rate."""
+
+
 class Concern(NamedTuple):
     """One reason not to call channels healthy."""
 
     word: Word
     """The verdict it leads to: LOOK or CANNOT TELL."""
     who: tuple[str, ...]
-    """Channels, units or topics."""
+    """Channels, units or topics, or the fused rate."""
     words: str
     """What is wrong, as it continues the names: ``has 24 spikes``."""
 
     def __str__(self) -> str:
-        return f"{listed(self.who)} {self.words}"
+        return f"{listed(short_names(self.who))} {self.words}"
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Replace the three axes of a gyro or accelerometer by one name, in the order of the names.
+
+    ``imu_0.x, imu_0.y, imu_0.z`` become ``imu_0``, and those of its accelerometer
+    ``imu_0.accel``.
+    """
+    axes: dict[str, list[str]] = {}
+    for name in names:
+        axes.setdefault(name[:-1], []).append(name[-1:])
+    found: dict[str, None] = {}
+    for name in names:
+        stem = name[:-1]
+        whole = stem.endswith((".", "accel_")) and axes[stem] == ["x", "y", "z"]
+        found[stem[:-1] if whole else name] = None
+    return list(found)
 
 
 def concerns_of(
     channels: Sequence[ChannelHealth],
     units: Sequence[UnitHealth] = (),
     unused: Sequence[tuple[str, str]] = (),
+    rate: RateHealth | None = None,
 ) -> list[Concern]:
     """Return all reasons not to call channels and units healthy, the worst first.
 
@@ -125,6 +157,8 @@ def concerns_of(
         What was measured, over a flight or over the last seconds.
     unused
         Topics of gyros that are left out, and why.
+    rate
+        How the fused rate was published; None: not measured.
     """
     slow = [unit for unit in units if _is_slow(unit)]
     by_unit = {unit.name for unit in slow}
@@ -134,7 +168,7 @@ def concerns_of(
             [one for one in channels if one.checked < LEAST_CHECKED],
             Word.CANNOT_TELL,
             lambda some: (
-                f"{_was(some)} checked in only"
+                "could be checked in only"
                 f" {100 * min(one.checked for one in some):.0f} % of the samples"
             ),
         ),
@@ -162,10 +196,11 @@ def concerns_of(
             [one for one in channels if one.saturated_s > 0.0],
             Word.LOOK,
             lambda some: (
-                f"{_was(some)} at the end of the range for"
+                "measured the end of the range for"
                 f" {max(one.saturated_s for one in some):.2g} s"
             ),
         ),
+        *_rate_concerns(rate),
         *(
             Concern(Word.LOOK, (one.name,), f"has {one.spikes} spikes of one sample")
             for one in channels
@@ -211,6 +246,16 @@ def is_declared(channel: ChannelStatus) -> bool:
     return channel.state in declared
 
 
+def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
+    if rate is None or rate.missing_s < LEAST_MISSING_S:
+        return []
+    word = Word.CANNOT_TELL if rate.share < LEAST_CHECKED else Word.LOOK
+    since = rate.missing_from_s
+    when = "" if since is None else f", first at {since:.1f} s"
+    words = f"was not published for {rate.missing_s:.3g} s{when}"
+    return [Concern(word, ("the fused rate",), words)]
+
+
 def _is_slow(unit: UnitHealth) -> bool:
     return unit.delivered < LEAST_DELIVERED or unit.slow_from_s is not None
 
@@ -226,10 +271,6 @@ def _slow_words(unit: UnitHealth) -> str:
         f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz from"
         f" {unit.slow_from_s:.0f} s {until})"
     )
-
-
-def _was(some: Sequence[ChannelHealth]) -> str:
-    return "was" if len(some) == 1 else "were"
 
 
 def _alike(
@@ -249,12 +290,7 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     for one in some:
         by_words.setdefault(one.doubt, []).append(one.name)
     return [
-        Concern(
-            Word.LOOK,
-            tuple(names),
-            f"{'is' if len(names) == 1 else 'are'} {words}",
-        )
-        for words, names in by_words.items()
+        Concern(Word.LOOK, tuple(names), words) for words, names in by_words.items()
     ]
 
 

@@ -150,8 +150,8 @@ class Status:
     has_rate: bool  #: Whether the last sample gave a fused rate.
     withheld: bool  #: Whether a rate was withheld because of old values or doubted channels (``publish_under_doubt``).
     all_repeat: bool  #: Whether all channels repeat their values.
-    can_detect: tuple[str, ...]  #: Channels whose fault would be seen.
-    can_isolate: tuple[str, ...]  #: Channels whose fault would be seen and named.
+    can_detect: tuple[str, ...]  #: Channels whose fault would be detected.
+    can_isolate: tuple[str, ...]  #: Channels whose fault would be detected and named.
     bias: tuple[
         float, ...
     ]  #: Subtracted from each channel, in its unit: the bias of the start, and its drift in flight.
@@ -329,7 +329,10 @@ def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
 
 
 def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
-    """Return the channels whose fault would be seen, and isolated, (n,), with the limits and assumptions in words."""
+    """Return whether a fault of each channel would be detected, and isolated, (n,).
+
+    Also limits and assumptions in words.
+    """
     detectable, isolable = np.zeros((2, len(mask)), dtype=bool)
     try:
         reduced = detector.geometry.subset(mask)
@@ -356,11 +359,14 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
 def _too_little(left: int) -> str:
     """Return why this number of channels checks nothing."""
     if left >= MIN_CHANNELS:
-        return f"the axes of the {left} channels left do not span three dimensions: a fault of one would not be seen"
+        return (
+            f"the axes of the {left} channels left do not span three dimensions: a fault of one"
+            " would not be detected"
+        )
     if left == 0:
         return f"no channel is left: {MIN_CHANNELS} are needed to see a fault"
     plural = "s are" if left > 1 else " is"
-    return f"only {left} channel{plural} left: a fault of one would not be seen, {MIN_CHANNELS} are needed"
+    return f"only {left} channel{plural} left: a fault of one would not be detected, {MIN_CHANNELS} are needed"
 
 
 def _unit_names(geometry: Geometry) -> list[str]:

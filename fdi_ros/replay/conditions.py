@@ -229,7 +229,8 @@ def _on_quantity(part: str) -> Condition:
     name, sign, number = match[1], match[2] or "", match[3]
     if name not in _QUANTITIES:
         raise ConfigError(
-            f"--check: {part!r} begins with {name!r}, {did_you_mean(name, tuple(_QUANTITIES))}"
+            f"--check: unknown condition {part!r}, {did_you_mean(name, tuple(_QUANTITIES))};"
+            " or a channel and its state: 'imu_2.y faulty'"
         )
     if sign not in _QUANTITIES[name]:
         expected = " or ".join(

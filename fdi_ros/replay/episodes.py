@@ -219,7 +219,7 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
         return f"varying, {figure} rms"
     figure = f"{'-' if value < 0 else '+'}{figure}" if abs(value) > std else TOO_SMALL
     if size.course == "gone":
-        return f"{figure}, gone from {size.gone_s:.3f} s on"
+        return f"{figure}, until {size.gone_s:.3f} s"
     if size.course == "growing":
         return f"{figure}, growing to {size.last_rad_s * unit.factor:+.3g} {unit.name}"
     return figure if size.course == "steady" else f"{figure}, {size.course}"
@@ -252,7 +252,7 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
         about = f", {where}{about}"
     elif about:
         about = f" ({about})"
-    return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{f'; {before}' if before else ''}"
+    return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{f'; before that {before}' if before else ''}"
 
 
 def _about(one: Episode, unit: Unit) -> str:
@@ -304,23 +304,18 @@ def _about(one: Episode, unit: Unit) -> str:
         if known
         else ""
     )
-    return f"{span}, by which of them it is" if span else ""
+    return f"{span}, depending on the channel" if span else ""
 
 
 def _before(one: Episode) -> str:
-    """Say what it was before it came to what it is, which is called `it`: the first step and the last."""
-    # A channel that was the only one left, and not yet surely it, is the one that it came to.
+    """Return the candidates of earlier steps: those of the first, and of the last if few and others."""
+    # A channel that was the only candidate, but not yet confirmed, is no step of its own.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
-    words, alone = [], one.state == "FAULTY" and len(one.channels) == 1
-    for step in [
-        *earlier[:1],
-        *(step for step in earlier[1:][-1:] if len(step.channels) <= 1 + FEW_CHANNELS),
-    ]:
-        others = [name for name in step.channels if name not in one.channels]
-        few = alone and len(others) <= FEW_CHANNELS and len(others) < len(step.channels)
-        who = f"it or {' or '.join(others)}" if few else step.who
-        words.append(f"{who} from {step.at_s:.3f} s")
-    return ", ".join(words)
+    chosen = earlier[:1]
+    for step in earlier[1:][-1:]:
+        if len(step.channels) <= 1 + FEW_CHANNELS and step.who != chosen[0].who:
+            chosen.append(step)
+    return ", ".join(f"{step.who} from {step.at_s:.3f} s" for step in chosen)
 
 
 def detail_words(
@@ -329,7 +324,7 @@ def detail_words(
     """Tell the rest of an episode, each line under its title; scored: faults were injected."""
     unit = unit_for(one, unit)
     injected = (
-        [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+        [("injected faults", ", ".join(one.injected) or "nothing")] if scored else []
     )
     lines = [
         ("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")
@@ -345,10 +340,10 @@ def detail_words(
             lines.append(("size", "; ".join(growing)))
         lines += [
             ("evidence", _evidence(one)),
-            ("what else explains it", _rivals(one, unit)),
+            ("alternative", _rivals(one, unit)),
         ]
     what = "rate" if one.measured_in == RADIANS.name else "specific force"
-    return [*lines, (f"fused {what} meanwhile", _rate(one, unit)), *injected]
+    return [*lines, (f"fused {what}", _rate(one, unit)), *injected]
 
 
 def _growth(one: Candidate, unit: Unit) -> str:
@@ -360,20 +355,20 @@ def _growth(one: Candidate, unit: Unit) -> str:
         f"{value * unit.factor:+.3g}"
         for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2)
     )
-    return f"{one.channel} {size.course}: {slope} {unit.name} a second, from {first} to {last} {unit.name}"
+    return f"{one.channel} {size.course} by {slope} {unit.name} per second, from {first} to {last} {unit.name}"
 
 
 def _evidence(one: Episode) -> str:
     """Say what the declaration rests on."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
-        words.append(f"{one.evidence.ratio:.3g} x its threshold")
+        words.append(f"statistic {one.evidence.ratio:.3g} times its threshold")
     if (
         one.state == "AMBIGUOUS"
         and one.evidence.last_alarm_s is not None
         and one.evidence.last_alarm_s < one.end_s
     ):
-        words.append(f"last above it at {one.evidence.last_alarm_s:.3f} s")
+        words.append(f"last alarm at {one.evidence.last_alarm_s:.3f} s")
     return ", ".join(words)
 
 
@@ -381,9 +376,9 @@ def _rivals(one: Episode, unit: Unit) -> str:
     """Say which other channels would explain it as well."""
     if one.state == "FAULTY":
         return (
-            "no other channel by itself"
+            "no other single channel explains the evidence"
             if len(one.channels) == 1
-            else "no channel by itself"
+            else "no single channel explains the evidence"
         )
     if len(one.channels) > FEW_CHANNELS:
         return f"an error of any of {', '.join(one.channels)}"
@@ -400,7 +395,7 @@ def _rate(one: Episode, unit: Unit) -> str:
     """Say what the fused rate did."""
     rate = one.rate
     if rate.published == 0.0:
-        return "none was published"
+        return "not published"
     share = (
         "published throughout"
         if rate.published == 1.0
@@ -414,7 +409,7 @@ def _rate(one: Episode, unit: Unit) -> str:
             else f" ({_figure(rate.std_before_rad_s, unit)} before)"
         )
         words.append(
-            f"its standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}"
+            f"mean standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}"
         )
     level = (
         ""

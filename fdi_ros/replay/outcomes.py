@@ -315,6 +315,11 @@ class Evaluation:
             0,
             np.zeros(3, dtype=np.int64),
         )  # those judged, with a rate, with an alarm
+        self.without_rate = 0
+        """Number of samples without a fused rate after the first one with a rate."""
+        self.without_rate_from: float | None = None
+        """Time of the first of these samples, s from the first message."""
+        self._has_had_rate = False
         self._unexplained: list[StateChange] = []
         self._unchecked = np.zeros(n)  # samples in which nothing checked the channel
         self._residuals = np.zeros((2, n))
@@ -341,6 +346,7 @@ class Evaluation:
             int(output.valid.sum()),
             int(output.alarm.sum()),
         )
+        self._count_missing_rates(output)
         unchecked = [
             _UNCHECKED[half.state] | ~np.isfinite(half.threshold)[:, None]
             for half in output.halves
@@ -370,6 +376,18 @@ class Evaluation:
             effect = output.rate - clean
             self._add_effect(0, effect[undetected])
             self._add_effect(1, effect[active.any(axis=1) & ~undetected])
+
+    def _count_missing_rates(self, output: Output) -> None:
+        """Count the samples without a rate; those before the first rate belong to the start-up."""
+        rows = np.flatnonzero(~output.valid)
+        if not self._has_had_rate:
+            if not output.valid.any():
+                return
+            self._has_had_rate = True
+            rows = rows[rows > int(output.valid.argmax())]
+        if len(rows) and self.without_rate_from is None:
+            self.without_rate_from = round(self.time(int(output.stamp[rows[0]])), 9)
+        self.without_rate += len(rows)
 
     def add_unmonitored(self, faulty: Block, healthy: Block) -> None:
         """Take in what the faults do to the plain least-squares rate of all channels; NaN: not to be compared."""

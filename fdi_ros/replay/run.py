@@ -34,7 +34,7 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.soundness import UnitHealth
+from fdi_ros.monitor.soundness import RateHealth, UnitHealth
 from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.replay.episodes import GAP, Story, pieces
 from fdi_ros.replay.health import Deliveries, Values, with_delivery
@@ -252,6 +252,7 @@ class Judge(Walk):
                 *(tuple(map(finite, level)) for level in levels)
             ),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
+            rate=self._rate_health(),
         )
         story, episodes = _joined([one.story(end) for one in self._recorders]), []
         for one in story.episodes:
@@ -269,14 +270,24 @@ class Judge(Walk):
             replace(story, episodes=tuple(episodes)),
         )
 
+    def _rate_health(self) -> RateHealth:
+        """Return how the fused rate was published."""
+        evaluation = self.evaluation
+        missing = evaluation.without_rate
+        return RateHealth(
+            missing_s=missing / (self.rate or math.inf),
+            missing_from_s=evaluation.without_rate_from,
+            share=1.0 - missing / max(1, evaluation.samples),
+        )
+
     def _noisy(self, statuses: Sequence[ChannelStatus]) -> dict[str, str]:
         """Say for how long channels were noisy, seconds at least, by their name."""
         seconds = {
             one.name: one.counts["noisy"] / (self.rate or math.inf) for one in statuses
         }
         return {
-            name: f"{name}: for {time:.1f} s noise of more than {NOISY:g} times what is"
-            " expected or usual, and more than the other units have"
+            name: f"{name}: for {time:.1f} s, its noise was more than {NOISY:g} times its usual"
+            " noise, and larger than that of the other units"
             for name, time in seconds.items()
             if time >= LASTING
         }
@@ -378,10 +389,10 @@ def _joined(stories: Sequence[Story]) -> Story:
 def _doubt_words(state: str, since: float | None, reason: str, end: float) -> str:
     """Return what is wrong with a channel that is not declared, in words; empty: nothing."""
     if state == "EXCLUDED":
-        return f"left out: {reason}"
+        return f"remained left out: {reason}"
     if state != "SUSPECT" or since is None or end - since < LASTING:
         return ""
-    return f"under suspicion from {since:.1f} s to the end ({reason})"
+    return f"remained suspected from {since:.1f} s to the end ({reason})"
 
 
 # A recording
@@ -485,9 +496,9 @@ def replay(
                     settings.bias.startup_bias_duration,
                 )
                 why = (
-                    "until then the biases are learned"
+                    "the start-up biases are measured until then"
                     if learned > 0
-                    else "there the part that is read begins"
+                    else "the part that is read begins there"
                 )
                 injector.refuse_between(
                     -math.inf, first + learned if learned > 0 else start, why

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fdi_ros.monitor.output import time_index
 from fdi_ros.monitor.soundness import (
     ChannelHealth,
     Concern,
+    RateHealth,
     UnitHealth,
     concerns_of,
 )
@@ -101,6 +102,8 @@ class MonitorResult:
     """Time that the monitor took for a sample, us."""
     units: tuple[UnitHealth, ...] = ()
     """The units, in the order of their topics."""
+    rate: RateHealth = field(default_factory=RateHealth)
+    """How the fused rate was published."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ class Judgement:
         channels: Sequence[ChannelHealth] = self.monitor.channels
         if self.story.declared:
             channels = [replace(one, residual_rms_rad_s=None) for one in channels]
-        return concerns_of(channels, self.monitor.units)
+        return concerns_of(channels, self.monitor.units, rate=self.monitor.rate)
 
 
 @dataclass(frozen=True)

@@ -250,8 +250,8 @@ MOVES = 0.1  # rate that a vehicle which is not at rest reaches while a fault is
 def smallest_hint(plan: Plan) -> str:
     """Say what the smallest sizes are, and the figures in brackets."""
     return (
-        f"from which size on {WANTED:.0%} of the faults tried were detected within {plan.within:g} s; in brackets how"
-        " many of that size were, and the 95 % interval of that share"
+        f"smallest size of which at least {WANTED:.0%} of the faults were detected within"
+        f" {plan.within:g} s; in brackets: detected, tried, 95 % interval"
     )
 
 
@@ -284,30 +284,37 @@ def sound_lines(tried: Subject) -> list[str]:
     baseline = tried.baseline
     if baseline is None or tried.refused:
         return [f"not tried: {tried.refused}"]
-    words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
-    lines = [f"{words}, from {baseline.begins:.1f} s on"]
+    words = (
+        f"without injected faults, nothing was declared in {baseline.duration:.1f} s"
+    )
+    lines = [
+        f"{words} ({baseline.judged:.0%} of the samples judged, from {baseline.begins:.1f} s on)"
+    ]
     if told := baseline.judgement.story.declared:
         more = (
             f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}"
             if len(told) > 1
             else ""
         )
-        doubt = "Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
+        doubt = "The recording contains a fault, or the config does not fit: the figures below are unreliable"
         lines = [
-            f"declared, with nothing injected: {episode_words(told[0])}{more}. {doubt}"
+            f"declared without injected faults: {episode_words(told[0])}{more}. {doubt}"
         ]
     if tried.skipped:
         at = ", ".join(f"{time:.1f} s" for time in tried.skipped)
-        why = "something stands declared then without one, or a channel gives nothing"
+        why = "a channel is already declared there, or gives no data"
         lines.append(f"no fault was injected at {at}: {why}")
     if not tried.times:
         lines.append(
-            "so no fault could be tried at all: mend the config, or name the channel in excluded_channels"
+            "no fault could be injected at all: correct the config, or name the channel in excluded_channels"
         )
-    lines += [f"as it is, {line}" for line in baseline.judgement.monitor.degraded]
+    lines += [
+        f"without injected faults, {line}"
+        for line in baseline.judgement.monitor.degraded
+    ]
     if tried.config.excluded_channels:
         lines.append(
-            f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}"
+            f"not tried, because excluded: {', '.join(tried.config.excluded_channels)}"
         )
     return lines
 
@@ -326,14 +333,15 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         words.append(f"{line.swept.words}: {shares}")
     false = sum(line.false for line in lines)
     words.append(
-        f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults"
+        "wrong declaration (a healthy channel, or a set without the faulty one):"
+        f" {false} of {len(tried.trials)} faults"
     )
     # At rest small faults are found that are lost in flight.
     moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
     motion = (
         f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
     )
-    rest = ": these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
+    rest = ": the vehicle was mostly AT REST; in flight the figures are worse (choose a part with --start, --end)"
     return [*words, motion if 2 * moving >= times else motion + rest]
 
 
@@ -344,10 +352,14 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     count, size = line.count(named), f"{line.swept.size:g} {line.swept.unit}".rstrip()
     interval = share(count, line.trials)
     of = f"({count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%})"
-    return f"from {size} {of}" if found else f"from a larger size on than {size} {of}"
+    return (
+        f"from {size} {of}"
+        if found
+        else f"not even at {size}, the largest size tried {of}"
+    )
 
 
-SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: faults with a false name or set"
+SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: faults with a wrong declaration"
 
 
 def _in_short(line: Line) -> str:
@@ -356,10 +368,10 @@ def _in_short(line: Line) -> str:
 
 
 HINTS = [
-    "isolated: the faulty channel was declared by itself; detected: that, or one of a set with others",
-    "delays are until it was detected, of all faults: a dash where fewer than half, or than 95 %, were detected",
-    "a stuck value or a scale factor shows only while the vehicle turns, noise mostly as a warning",
-    "this is of one recording: another flight, with other vibration, may need larger faults",
+    "isolated: only the faulty channel was declared; detected: isolated, or declared in a set with others",
+    "delay: from the start of a fault to its detection; a dash: fewer than half (or 95 %) were detected",
+    "a stuck value or a scale error is visible only while the vehicle turns; noise mostly gives a warning only",
+    "these figures are for one recording: a flight with more vibration may need larger faults",
 ]
 
 

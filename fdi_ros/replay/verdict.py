@@ -78,14 +78,16 @@ def unjudged_words(judgement: Judgement) -> str:
     """Return why the recording as a whole was not judged, in words; empty: it was."""
     scores, bias = judgement.scores, judgement.monitor.bias
     if scores.samples_judged == 0:
-        return f"none of {scores.samples} samples was judged; bias {bias.state}"
+        return (
+            f"none of {scores.samples} samples was judged (start-up bias: {bias.state})"
+        )
     share = scores.samples_judged / scores.samples
     if share < LEAST_JUDGED:
         return f"only {100 * share:.1f} % of {scores.samples} samples were judged"
     if bias.far:
         return (
-            f"{listed(bias.far)} began with a bias far beyond bias.turn_on_std, as after"
-            " a fault before the start"
+            f"the bias of {listed(bias.far)} was far larger than bias.turn_on_std from the"
+            " start: perhaps a fault before the recording"
         )
     return ""
 
@@ -149,7 +151,7 @@ def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
         *_reason_sentences(first),
     ]
     if first.since_s - first.start_s >= 0.05:
-        sentences.append(f"First sign at {first.start_s:.1f} s.")
+        sentences.append(f"First seen at {first.start_s:.1f} s.")
     others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
     if others:
         sentences.append(f"Later also {first_of(list(others), MOST_TOLD)}.")
@@ -160,12 +162,24 @@ def _who(one: Episode) -> str:
     """Return the channels as they are said aloud: ``imu_0, x and y,``."""
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
+    if one.state == "AMBIGUOUS" and len(parts) > 1:
+        return _one_of(one)
     if one.state != "FAULTY" or len(parts) == 1 or len(units) > 1 or "" in units:
         return one.who.removesuffix(",")
     unit = parts[0][0]
     if one.who == unit:
         return f"{unit}, all axes,"
     return f"{unit}, {listed([axis for _, _, axis in parts])},"
+
+
+def _one_of(one: Episode) -> str:
+    """Return the set as candidates: ``one axis of imu_0 (x, y or z: undecided)``."""
+    parts = [name.rpartition(".") for name in one.channels]
+    units = {unit for unit, _, _ in parts}
+    if len(units) == 1 and "" not in units:
+        axes = listed([axis for _, _, axis in parts], "or")
+        return f"one axis of {parts[0][0]} ({axes}: undecided)"
+    return f"{one.who.removesuffix(',')} (undecided)"
 
 
 def _when(one: Episode) -> str:
@@ -176,11 +190,9 @@ def _when(one: Episode) -> str:
         since += brief or f" to {one.end_s:.1f} s"
     if one.state == "STALE":
         return f"gives no data {since}"
-    if one.state == "FAULTY":
-        return since
-    if len(one.channels) == 1:
-        return f"{since}, not yet for certain"
-    return f"{since}; the data cannot tell which"
+    if one.state == "AMBIGUOUS" and len(one.channels) == 1:
+        return f"{since}, not yet confirmed"
+    return since
 
 
 def _size_sentences(one: Episode, unit: Unit) -> list[str]:
@@ -233,7 +245,7 @@ def _size_words(size: Size, unit: Unit) -> str:
     if abs(size.rad_s) <= size.std_rad_s and size.course == "steady":
         return ""
     if size.course == "gone":
-        return f"was off by {value} {unit.name} until {size.gone_s:.1f} s"
+        return f"was off by {value} {unit.name} until {size.gone_s:.1f} s only"
     if size.course in ("growing", "shrinking"):
         last = _rate(size.last_rad_s, size.std_rad_s, unit)
         return f"is off by {value}, {size.course} to {last} {unit.name}"

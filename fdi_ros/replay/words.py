@@ -5,14 +5,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import Word
+from fdi_ros.monitor.soundness import Word, short_names
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Story,
@@ -40,8 +42,10 @@ from fdi_ros.report.layout import (
     number,
     section_text,
 )
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import listed, shown
 
+AUTOPILOT_LOGS = (".bin", ".tlog")
+"""Logs of ArduPilot: they count IMUs from 0, its messages and parameters from 1."""
 MOST_EPISODES = 20
 """Episodes that a terminal shows with all their details."""
 
@@ -71,11 +75,15 @@ def _concern_lines(summary: Summary) -> list[str]:
 
 
 def _name_lines(summary: Summary) -> list[str]:
-    """Say which topic each unit is, unless the name of the unit is that of the topic."""
+    """Return which topic, or which IMU of the autopilot, each unit is, unless its name is the topic."""
     units = summary.monitor.units
-    if all(one.topic.strip("/") == one.name.strip("/") for one in units):
+    if any(one.topic.strip("/") != one.name.strip("/") for one in units):
+        return [f"Topics: {', '.join(f'{one.name} is {one.topic}' for one in units)}."]
+    numbers = [re.fullmatch(r"imu_(\d+)", one.name) for one in units]
+    if Path(summary.bag).suffix.lower() not in AUTOPILOT_LOGS or None in numbers:
         return []
-    return [f"Topics: {', '.join(f'{one.name} is {one.topic}' for one in units)}."]
+    pairs = [f"{match[0]} is IMU {int(match[1]) + 1}" for match in numbers if match]
+    return [f"In STATUSTEXT and parameters of the autopilot, {listed(pairs)}."]
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
@@ -112,25 +120,24 @@ def notes(summary: Summary) -> list[str]:
     stream, scores = summary.stream, summary.scores
     lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [
-        f"{count} malformed messages on {topic}"
+        f"{topic}: malformed messages: {count}"
         for topic, count in stream.malformed.items()
         if count
     ]
     if stream.disordered:
         lines.append(
-            f"{stream.disordered} messages left out: recorded after later ones"
+            f"{stream.disordered} messages not used: they were recorded out of order"
         )
     for topic, counters in stream.alignment.items():
         odd = ", ".join(
-            f"{ODD.get(name, name)} ({n})"
+            f"{ODD.get(name, name)}: {n}"
             for name, n in counters.items()
             if n and name != "received"
         )
         lines += [f"{topic}: {odd}"] if odd else []
     if missing := scores.samples - scores.samples_with_rate:
-        lines.append(
-            f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}"
-        )
+        bias = summary.monitor.bias.state
+        lines.append(f"{missing} samples without a fused rate (start-up bias: {bias})")
     lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
@@ -142,15 +149,15 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
     if abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:
         return []
     return [
-        f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has"
-        f" {rate.recorded_hz:.4g} Hz: the false-alarm rate is wrong by the same factor"
+        f"sample_rate is {rate.configured_hz:g} Hz in the config and {rate.recorded_hz:.4g} Hz"
+        " in the recording: the false-alarm rate is wrong by the same factor"
     ]
 
 
 def _detection_words(fault: Outcome) -> str:
     """Say when an injected fault was detected and isolated, and which channels were declared."""
     if fault.detected_at_s is None:
-        before = "its channels were already declared"
+        before = "not counted, because its channels were already declared"
         return before if fault.declared_before else "not detected"
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
@@ -171,7 +178,7 @@ def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
     if unexplained:
         count = f"{len(unexplained)} episode{'s' if len(unexplained) > 1 else ''}"
         first = f", the first {MOST_TOLD}" if len(unexplained) > MOST_TOLD else ""
-        lines = [f"{count} without an injected fault that explains it{first}:"]
+        lines = [f"{count} that no injected fault explains{first}:"]
         for one in unexplained[:MOST_TOLD]:
             where = f"stretch {one.stretch}: " if len(story.stretches) > 1 else ""
             lines.append(f"{where}{episode_words(one, unit)}.")
@@ -190,7 +197,7 @@ def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
     )
     if doubted:
         names = ", ".join(doubted)
-        return [f"No other channel was declared alone; doubted with them: {names}."]
+        return [f"No other channel was declared faulty, but {names} was in a set."]
     return ["No other channel was declared faulty."]
 
 
@@ -232,7 +239,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
     columns: dict[str, Callable[[Any], str]] = {
         "unit": lambda row: row[0].name,
         "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
-        "rate": lambda row: number(row[0].rate_hz, ".3g", " Hz"),
+        "usual rate": lambda row: number(row[0].rate_hz, ".3g", " Hz"),
         "checked": lambda row: f"{100 * min(one.checked for one in row[1]):.0f} %",
         "spikes": lambda row: str(sum(one.spikes for one in row[1])),
         "at end of range": lambda row: (
@@ -274,12 +281,19 @@ def _trouble_words(
     summary: Summary, unit: str, channels: Sequence[ChannelResult]
 ) -> str:
     """Say since when the unit is not healthy; a dash: it is."""
-    names = {unit, *(one.name for one in channels)}
+    own = [one.name for one in channels]
+    names = {unit, *own}
     faults = [
         one for one in summary.story.episodes if not names.isdisjoint(one.channels)
     ]
     words = [f"{one.state.lower()} from {one.start_s:.1f} s" for one in faults[:1]]
-    words += [one.words for one in summary.concerns if not names.isdisjoint(one.who)]
+    for one in summary.concerns:
+        about = [name for name in own if name in one.who]
+        if about and len(about) < len(own):
+            axes = listed([name.rpartition(".")[2] for name in short_names(about)])
+            words.append(f"{axes} {one.words}")
+        elif about or unit in one.who:
+            words.append(one.words)
     return "; ".join(words) or "-"
 
 
@@ -299,19 +313,19 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
         "isolated after": lambda fault: (
             milliseconds(fault.isolation_delay_s) if fault.isolated else "no"
         ),
-        "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
+        "declared": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
     effect = scores.fault_effect_rad_s
     rows = [
-        ("fused rate until detection", unit.words(effect.before_detection)),
-        ("fused rate after it", unit.words(effect.after_detection)),
+        ("fused rate before the detection", unit.words(effect.before_detection)),
+        ("fused rate after the detection", unit.words(effect.after_detection)),
         (
-            "least squares of all channels, no monitor",
+            "least squares of all channels, without a monitor",
             unit.words(effect.without_monitor),
         ),
     ]
     hint = (
-        "Rms difference from a replay without the faults; saturated samples left out."
+        "Difference (rms) from a replay without the faults; without saturated samples."
     )
     return [
         Section("Injected faults", "", head_and_rows(columns, scores.faults)),

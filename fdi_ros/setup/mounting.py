@@ -183,9 +183,7 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     )
 
 
-RHO_TITLE = (
-    "Correlation |rho| of the normalised residuals; 1: faults cannot be told apart"
-)
+RHO_TITLE = "Similarity of faults: correlation |rho| of the normalised residuals; 1: indistinguishable"
 WAITING_HINT = (
     "Smallest error, rad/s, that the best possible test finds within a time, on average. This test knows channel and"
     " size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A"
@@ -298,7 +296,7 @@ def pair_lines(result: Mounting) -> list[str]:
         if abs(cosine) > SAME_DIRECTION:
             why = f"{names[i]} and {names[j]} measure the same axis"
         lines.append(f"{why}: a fault of either is detected, but not which one")
-    hard = "{} and {} are hard to tell apart (|rho| {:.3f})"
+    hard = "{} and {} are almost indistinguishable (|rho| {:.3f})"
     lines += [
         hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar
     ]
@@ -317,7 +315,7 @@ def _double_words(result: Mounting) -> str:
         (loss for loss in result.double if np.isfinite(loss.gdop)),
         key=lambda loss: loss.gdop,
     )
-    words = f"after the loss of two: {len(spanning)} of {len(result.double)} pairs leave a rate"
+    words = f"after the loss of two channels: a rate for {len(spanning)} of {len(result.double)} pairs"
     if not spanning:
         return words
     best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
@@ -327,7 +325,7 @@ def _double_words(result: Mounting) -> str:
     )
     return (
         f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
-        f" with {seen} of them a third fault is detected on at least one channel, with {named} isolated on at least one"
+        f" a further fault of at least one channel is detected for {seen}, isolated for {named}"
     )
 
 

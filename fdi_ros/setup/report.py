@@ -276,7 +276,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
             np.degrees(1.0),
         ),
         (
-            "scale factors off nominal",
+            "scale factors differ from nominal",
             result.factor - 1.0,
             LARGE_SCALE,
             "{:+.1%}",
@@ -630,6 +630,13 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     }
 
 
+def _proof_section(found: SetupResult, hint: str, unit: Unit) -> Section:
+    """Lay out the proof; a recording whose channels contradict each other proves nothing."""
+    if found.disagree:
+        return Section("Proof", "Not done: the channels contradict each other.")
+    return Section("Proof", hint, told(_tried(found, unit)))
+
+
 def _sections(
     found: SetupResult, findings: Sequence[Finding], bag: str, config: str, unit: Unit
 ) -> tuple[list[str], list[Section]]:
@@ -651,7 +658,7 @@ def _sections(
     sections = [
         Section("Warnings", "", lines_of(findings, Role.WARNING)),
         Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),
-        Section("Proof", hint, told(_tried(found, unit))),
+        _proof_section(found, hint, unit),
         Section("What to do next", "", steps),
     ]
     if result is not None:

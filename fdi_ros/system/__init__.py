@@ -11,6 +11,7 @@ keys only, and the libraries that read recordings have none.
 from __future__ import annotations
 
 import importlib
+import shutil
 import sys
 import sysconfig
 from collections.abc import Sequence
@@ -113,8 +114,9 @@ def _pip() -> str:
     """Return the pip command for this Python, which a distribution may manage (PEP 668)."""
     managed = Path(sysconfig.get_path("stdlib")) / "EXTERNALLY-MANAGED"
     own = sys.prefix != sys.base_prefix
-    return (
-        "pip install"
-        if own or not managed.is_file()
-        else "pip install --user --break-system-packages"
-    )
+    if not own and managed.is_file():
+        return "pip install --user --break-system-packages"
+    found = shutil.which("pip")
+    if own and (found is None or Path(found).parent != Path(sys.executable).parent):
+        return f"{sys.executable} -m pip install"
+    return "pip install"

@@ -52,9 +52,9 @@ def test_columns_are_those_that_their_names_say(tmp_path, names):
         assert (stamp == np.round(TIME * 1e6) * 1000).all()
         assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
     assert damage == (
-        f"flight.csv: columns by their names: time is {names[0]}; /imu_0 is {', '.join(names[1:4])}; /imu_1 is"
+        f"flight.csv: columns, by their names: time = {names[0]}; /imu_0 = {', '.join(names[1:4])}; /imu_1 ="
         f" {', '.join(names[4:])}"
-        + ("" if "rad" in names[1] else "; no unit is named: taken as rad/s"),
+        + ("" if "rad" in names[1] else "; no unit in the names: rad/s assumed"),
     )
 
 
@@ -170,7 +170,7 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
         ("x: [", "is not YAML"),
         (
             "{time: t, time_unit: ms, imus: [[p1, q1, r1]]}",
-            "this table has one IMU (columns of 1 IMU at 100 Hz): no",
+            "this table has no other (columns of 1 IMU at 100 Hz)",
         ),
     ):
         about.write_text(text)

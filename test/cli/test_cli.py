@@ -63,7 +63,7 @@ def test_replay_prints_a_table_and_writes_the_summary_and_a_line_for_every_sampl
     assert re.search(
         r"^  1\. g2 FAULTY from 20\.[01]\d\d s \([+]0\.20", out, re.MULTILINE
     )
-    assert "\n       injected there: bias on g2\n" in out
+    assert "\n       injected faults: bias on g2\n" in out
     assert json.loads((tmp_path / "s.json").read_text())["faults"][0][
         "declared_channels"
     ] == ["g2"]
@@ -210,9 +210,9 @@ def test_rates_are_printed_in_degrees_where_asked_for(fdi, flight, config, repla
     assert "0.2 rad/s" in replay(*words).out
     out = replay(*words, "--degrees").out
     assert "11.4592 deg/s" in out
-    assert re.search(r"no monitor +5\.729578 deg/s\n", out)
+    assert re.search(r"without a monitor +5\.729578 deg/s\n", out)
     assert "rad/s" not in out
-    assert "3 values, up to 176 deg/s" in fdi("inspect", flight, "--degrees").out
+    assert "3 gyros, up to 176 deg/s" in fdi("inspect", flight, "--degrees").out
     assert "noise deg/s" in fdi("geometry", config, "--degrees").out
 
 
@@ -224,7 +224,7 @@ def test_a_sample_rate_that_is_far_from_the_recordings_is_refused_and_a_near_one
     wrong.write_text(
         config.read_text().replace("sample_rate: 100.0", f"sample_rate: {configured}")
     )
-    said = f"sample_rate is {configured:g} Hz in the config, the recording has 100 Hz"
+    said = f"sample_rate is {configured:g} Hz in the config and 100 Hz in the recording"
     if configured == 115.0:
         words = ("replay", flight, "--config", wrong, "--end", 1)
         assert f"note: {said}" in fdi(*words).out
@@ -331,7 +331,7 @@ def test_compile_leaves_nothing_to_compile(fdi, refused):
         "compile", "--detector", "max_residual", "guaranteed", "--json", "-"
     )
     said, _, folder = err.rstrip("\n").rpartition(" in ")
-    assert (code, said) == (0, "nothing to do: all is there,")
+    assert (code, said) == (0, "nothing to compile: all results are")
     figures = json.loads(out)
     assert (figures["compiled"], figures["folder"]) == (0, folder)
     assert figures["detectors"] == ["max_residual", "guaranteed"]
@@ -462,11 +462,11 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         (f"{REPLAY} --json none/s.json", "there is no folder"),
         (
             f"{SIGN} start=2'",
-            "sign on g1 starts at 2 s, expected at least 3 s: until then the biases are learned",
+            "sign on g1 starts at 2 s, expected at least 3 s: the start-up biases are measured until then",
         ),
         (
             f"{SIGN} start=32.5' --start 30",
-            "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then",
+            "fault sign on g1 starts at 32.5 s, expected at least 33 s: the start-up biases",
         ),
         (
             f"{SIGN} start=9' --end 9",
@@ -474,7 +474,7 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ),
         (
             f"{REPLAY} --check 'false=0 dlay<1'",
-            "'dlay<1' begins with 'dlay', did you mean 'delay'?",
+            "unknown condition 'dlay<1', did you mean 'delay'?",
         ),
         (
             f"{REPLAY} --check 'delay>1'",
@@ -803,7 +803,7 @@ def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_th
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
     for stream, said in (
         (Terminal(), r" 50 %\|.* \r$"),
-        (io.StringIO(), r"(?m)^fdi: power: 50% done, about 0 s left after 0 s$"),
+        (io.StringIO(), r"(?m)^fdi: power, 50% done after 0 s, about 0 s left$"),
     ):
         for quiet in (True, False):
             with progress(stream, quiet, "power") as show:

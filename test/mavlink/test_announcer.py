@@ -159,7 +159,7 @@ def test_the_whole_is_told_too() -> None:
         (Level.OK, "9 of 9 channels healthy", again),
         (
             Level.ERROR,
-            "3 of 6 channels healthy; no further fault would be seen",
+            "3 of 6 channels healthy; no further fault would be detected",
             [(CRITICAL, f"FDI: {NOTHING_SEEN}")],
         ),
         (Level.STALE, "no sample for 3.0 s", [(CRITICAL, "FDI: no samples")]),

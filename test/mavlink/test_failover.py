@@ -555,7 +555,9 @@ def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str) -> No
 
 def test_the_orders_of_failover_in_a_recording() -> None:
     begin = [Change(0.5, name, "OK", 0.0) for name in CHANNELS]
-    assert failover_text(begin, CHANNELS) == "failover, if armed: nothing to do"
+    assert failover_text(begin, CHANNELS) == (
+        "failover, if armed: no IMU would be taken out (failover_min_size 0.03 rad/s)"
+    )
     small = [Change(50.0, "imu_1.z", "FAULTY", 0.01), Change(60.0, "imu_1.z", "OK", 0)]
     first = [
         Change(105.2, "imu_1.x", "SUSPECT", 0.3),

@@ -48,7 +48,7 @@ def of_unit(axes: str) -> list[str]:
 
 WELL = "6 of 6 channels healthy; a further fault would be isolated"
 LEARNS = "no fused rate: the biases are being learned, at rest; 0"
-UNITS = "one of imu_1, imu_2 is faulty as a whole or in part, the evidence cannot tell which"
+UNITS = "one of imu_1, imu_2 is faulty, as a whole or in part: undecided"
 GONE = ["channel=g2 kind=dropout missing=1 start=2"]
 SEQUENTIAL = {"detector__name": "sequential"}
 
@@ -63,7 +63,7 @@ SEQUENTIAL = {"detector__name": "sequential"}
             lost(1, 2, 3),
             "monitor",
             Level.ERROR,
-            "0 of 6 channels healthy; no further fault would be seen",
+            "0 of 6 channels healthy; no further fault would be detected",
         ),
         (config(bias__startup_bias_duration=9.0), [], "monitor", Level.ERROR, LEARNS),
         (
@@ -114,10 +114,10 @@ def test_an_isolated_fault_by_how_much_and_since_when() -> None:
     line, values = lines["imu_2.y"], dict(lines["imu_2.y"].values)
     assert (line.level, values["state"]) == (Level.ERROR, "FAULTY")
     error, seconds = line.message.removeprefix("disagrees with the others by ").split(
-        " rad/s for "
+        " rad/s, for "
     )
     assert float(error) == pytest.approx(0.21, abs=0.01)
-    assert seconds.endswith(" s; isolated and left out")
+    assert seconds.endswith(" s; declared faulty and left out")
     assert float(seconds.split()[0]) == pytest.approx(4.0, abs=0.15)
     assert abs(float(values["residual (rad/s)"])) == pytest.approx(0.21, abs=0.02)
     assert lines["monitor"].level == Level.WARN
@@ -145,7 +145,7 @@ def test_of_two_parallel_units_the_axis_is_named_and_by_how_much_they_are_apart(
         f"the y axis of imu_1 or imu_2, {plus_minus(pair.size, pair.std)} rad/s apart"
     )
     assert apart in lines["monitor"].message
-    words = f"{apart}: one of the two is faulty, the evidence cannot tell which; for "
+    words = f"{apart}: one of the two is faulty, undecided, for "
     for name in pair.channels:
         assert lines[name].level == Level.ERROR
         assert lines[name].message.startswith(words)
@@ -203,7 +203,11 @@ def test_only_ok_is_ok_and_every_word_is_there(
             "no message yet on imu_1/data_raw",
         ),
         ({"silent": 3.2, "live": False}, Level.STALE, "silent for 3.2 s"),
-        ({"lag": 0.045}, Level.WARN, "stamps stay 45.0 ms behind the other inputs'"),
+        (
+            {"lag": 0.045},
+            Level.WARN,
+            "stamps are 45.0 ms behind those of the other inputs",
+        ),
         ({"lag": 0.0015}, Level.OK, "delivers"),
         ({"offset": 3600.0}, Level.WARN, "stamps are 60 min behind the clock"),
         ({"offset": -5.0}, Level.WARN, "stamps are 5.0 s ahead of the clock"),
@@ -212,22 +216,22 @@ def test_only_ok_is_ok_and_every_word_is_there(
             Level.WARN,
             "525 days behind the clock (of a recording? then use_sim_time",
         ),
-        ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
+        ({"recent": {"backward": 3}}, Level.WARN, "stamps going back: 3"),
         (
             {"recent": {"malformed": 2}, "error": "array has 5 values"},
             Level.WARN,
-            "malformed messages (2); array has 5 values",
+            "malformed messages: 2; array has 5 values",
         ),
         (
             {"recent": {"ahead": 7}},
             Level.WARN,
-            "stamps ahead of the clock, refused (7)",
+            "stamps ahead of the clock, refused: 7",
         ),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
         (
             {"live": False, "arrives": True, "recent": {"late": 50}},
             Level.STALE,
-            "can be used; messages too late",
+            "gives no usable message; messages too late",
         ),
     ],
 )
@@ -395,7 +399,7 @@ def test_a_noisy_channel_is_told_and_stays_in_use():
     }
     assert warned == {"monitor": Level.WARN, "imu_1.y": Level.WARN}
     assert 4 < channel.noise < 9
-    words = f"agrees with the others; noise {channel.noise:.1f} times noise_std and above the other units'"
+    words = f"agrees with the others; noise {channel.noise:.1f} times noise_std, and larger than in the other units"
     assert lines["imu_1.y"].message == words
     assert "degraded: imu_1.y" in lines["monitor"].message
     assert channel.state == ChannelState.OK
@@ -411,7 +415,7 @@ def test_a_gyro_that_begins_far_off_is_used_and_told_as_it_may_be_faulty():
         pipeline.process(Block(np.arange(600) * SECOND // 100, z))
         lines = told(pipeline)
         assert lines["g2"].level == lines["monitor"].level == level
-        assert ("began with a bias of 0.08" in lines["g2"].message) == (
+        assert ("bias of 0.08 rad/s at the start" in lines["g2"].message) == (
             level == Level.WARN
         )
         assert lines["g3"].level == Level.OK
@@ -436,7 +440,7 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
     ]
     assert status.channels[0].reason == Reason.DRIFTED
     assert line.message.startswith(
-        "has drifted: its bias is beyond bias.max_drift by 0.0"
+        "has drifted: its bias is beyond bias.max_drift (0.0"
     )
     assert line.level == Level.ERROR
 
@@ -453,7 +457,7 @@ def test_a_unit_that_gives_old_values_is_told_within_the_time_for_it(
     # After health.stuck_time, 0.2 s, and a quarter more.
     for part in (block[700:725], block[725:]):
         pipeline.process(part)
-        lines, words = told(pipeline), "imu_2 frozen: all its values repeat for"
+        lines, words = told(pipeline), "imu_2 frozen: all values have repeated for"
         says = {name for name, line in lines.items() if words in line.message}
         assert says == {"monitor", "imu_2.x", "imu_2.y", "imu_2.z"}
         assert all(lines[name].level >= Level.WARN for name in says)
@@ -469,7 +473,7 @@ def test_what_withholds_the_rate_is_what_is_said() -> None:
     line = told(pipeline)["monitor"]
     assert line.level == Level.ERROR
     assert line.message.startswith(
-        "no fused rate: withheld, as all channels repeat their values in motion"
+        "no fused rate: withheld, because all channels repeat their values in motion"
     )
 
 

@@ -84,7 +84,7 @@ def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path)
     assert (outcome.outcome, outcome.channels) == ("named", ("imu_2.accel_z",))
     text = summary_text(summary)
     assert "2 m/s^2" in text
-    assert "fused specific force meanwhile" in text
+    assert "fused specific force: " in text
     (episode,) = summary.story.episodes
     assert "m/s^2" in episode.words
     assert "rad/s" not in episode.words

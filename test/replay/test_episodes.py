@@ -189,13 +189,14 @@ def test_a_fault_that_comes_to_a_name_is_one_episode():
     states = course(9, 4000, *zip(rows, steps, strict=True))
     (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
     assert one.words == (
-        "imu_2.y FAULTY from 65.672 s (+0.0466 +- 0.0013 rad/s, growing to +0.304 rad/s); any of the 9 channels"
-        " from 63.072 s, it or imu_1.x from 63.080 s"
+        "imu_2.y FAULTY from 65.672 s (+0.0466 +- 0.0013 rad/s, growing to +0.304 rad/s); before that any"
+        " of the 9 channels from 63.072 s, imu_1.x or imu_2.y from 63.080 s"
     )
     counts = [(step.state, len(step.channels)) for step in one.steps]
     assert counts == [("AMBIGUOUS", 9), ("AMBIGUOUS", 2), ("FAULTY", 1)]
     assert (
-        dict(detail_words(one))["what else explains it"] == "no other channel by itself"
+        dict(detail_words(one))["alternative"]
+        == "no other single channel explains the evidence"
     )
     assert one.rate.published == 1.0
 
@@ -544,7 +545,7 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
         "2 of 2 injected faults detected, 2 isolated.",
     )
     words = "detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms."
-    last = "No other channel was declared alone; doubted with them: g4."
+    last = "No other channel was declared faulty, but g4 was in a set."
     assert sentences(told) == [f"bias on g1: {words}", f"bias on g6: {words}", last]
     unjudged = summary_of(replace(told.scores, samples_judged=0))
     assert sentences(unjudged)[-1].startswith(

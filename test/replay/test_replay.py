@@ -138,12 +138,12 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     assert re.fullmatch(r"FAULTY: imu_2 gives no data from 4\.\d s\.", words)
     second, *_ = sentences(summary)
     assert re.fullmatch(
-        r"Not checked at the end: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
+        r"Not checked at the end: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(most of .*\);"
         r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
         second,
     )
     assert (
-        "only 3 channels are left: a fault of one would not be seen, 4 are needed"
+        "only 3 channels are left: a fault of one would not be detected, 4 are needed"
         in summary.monitor.note
     )
     for check, met in (
@@ -194,7 +194,7 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.UNKNOWN
     assert words.startswith(
-        "CANNOT TELL: none of 200 samples was judged; bias learning."
+        "CANNOT TELL: none of 200 samples was judged (start-up bias: learning)."
     )
     assert (
         failures(parse_check("false=0", 0), summary)[0]

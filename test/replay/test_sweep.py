@@ -161,12 +161,12 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
     assert all(time < 40 for time in tried.times)
     assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
     words = sound_lines(tried)
-    assert words[0].startswith("declared, with nothing injected: g3 FAULTY from 40.0")
-    assert "in doubt" in words[0]
+    assert words[0].startswith("declared without injected faults: g3 FAULTY from 40.0")
+    assert "unreliable" in words[0]
     page = sweep_page([tried], plan, "bag", {})
     text = sweep_text([tried], plan, "bag")
     for told in (page, text):
-        assert told.index("nothing injected: g3 FAULTY") < told.index("bias 0.02 rad/s")
+        assert told.index("injected faults: g3 FAULTY") < told.index("bias 0.02 rad/s")
 
 
 def test_figures_of_a_vehicle_at_rest_are_called_that():
@@ -178,7 +178,7 @@ def test_figures_of_a_vehicle_at_rest_are_called_that():
         "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%"
         in text
     )
-    assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in text
+    assert "at 0 of 2 times: the vehicle was mostly AT REST" in text
     moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
     assert "AT REST" not in sweep_page([moving], plan, "bag", {})
 
@@ -239,7 +239,7 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
     code, out, _ = fdi(*words)
     assert code == 0
     assert "Side by side" in out
-    assert "not tried, as excluded: g2" in out
+    assert "not tried, because excluded: g2" in out
     own, without, cusum = json.loads(outputs[0].read_text())["monitors"]
     assert (own["name"], without["name"], cusum["detector"]) == (
         "two_triads.yaml",

@@ -16,7 +16,15 @@ from hypothesis import strategies as st
 from fdi_ros.inspection.names import unit_names
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.soundness import ChannelHealth, UnitHealth, concerns_of
+from fdi_ros.monitor.soundness import (
+    ChannelHealth,
+    RateHealth,
+    UnitHealth,
+    Word,
+    concerns_of,
+    short_names,
+    word_of,
+)
 from fdi_ros.replay.health import MOST_WINDOWS, Deliveries, Values
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
@@ -47,13 +55,13 @@ needs_cases = pytest.mark.skipif(
         (
             CASES / "all_saturate_2000dps.csv",
             4,
-            r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z were at the end of the range for 1\.8 s",
+            r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z measured the end of the range for 1\.8 s",
         ),
         (CASES / "clean.csv", 0, r"HEALTHY: "),
         (
             LOGS / "quad_25mm_cut_hover.bin",
             4,
-            r"CANNOT TELL: .*imu_2\.z was checked in only 4\d % of the samples",
+            r"CANNOT TELL: .*imu_2\.z could be checked in only 4\d % of the samples",
         ),
     ],
     ids=lambda value: value.stem if hasattr(value, "stem") else "",
@@ -144,10 +152,34 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     bad = ChannelHealth(name="b.x", checked=0.4, spikes=5)
     copy = UnitHealth(name="c", topic="/c", copy_of="a")
     assert [str(one) for one in concerns_of([*fine, bad], [copy])] == [
-        "b.x was checked in only 40 % of the samples",
+        "b.x could be checked in only 40 % of the samples",
         "c repeats the values of a: one sensor, no redundancy",
         "b.x has 5 spikes of one sample",
     ]
+
+
+@pytest.mark.parametrize(
+    ("missing", "share", "word"),
+    [(0.9, 0.99, None), (34.0, 0.77, Word.LOOK), (34.0, 0.4, Word.CANNOT_TELL)],
+)
+def test_a_flight_without_a_rate_for_long_is_not_healthy(missing, share, word):
+    fine = [ChannelHealth(name=f"a.{axis}", unit="a") for axis in "xyz"]
+    concerns = concerns_of(fine, rate=RateHealth(missing, 10.0, share))
+    if word is None:
+        assert concerns == []
+        return
+    (one,) = concerns
+    assert (one.word, word_of(concerns)) == (word, word)
+    assert str(one) == "the fused rate was not published for 34 s, first at 10.0 s"
+
+
+def test_three_axes_of_a_sensor_have_one_name():
+    names = [f"imu_0.{axis}" for axis in "xyz"] + ["imu_0.accel_x"]
+    assert short_names(names) == ["imu_0", "imu_0.accel_x"]
+    assert short_names(["imu_1.accel_x", "imu_1.accel_y", "imu_1.accel_z"]) == [
+        "imu_1.accel"
+    ]
+    assert short_names(["g1", "g2", "g3", "imu_0.y"]) == ["g1", "g2", "g3", "imu_0.y"]
 
 
 # Names

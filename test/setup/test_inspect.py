@@ -92,7 +92,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
     text = topics_text(reports, damage)
     assert "frozen: 150 of x and 200 of z" in text
     assert "1 malformed" in text
-    assert "1 stamps do not increase" in text
+    assert "1 stamps do not increase" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("which", ["flight", "recording"])
@@ -206,11 +206,11 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     )
     shown = fdi("inspect", path).out
     assert (
-        "3 values, none of them a rate, not finite: 20 of x and 20 of y and 20 of z\n"
+        "3 gyros, none with a rate, not finite: 20 of x and 20 of y and 20 of z\n"
         in shown
     )
     assert (
-        "3 values, none of them a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n"
+        "3 gyros, none with a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n"
         in shown
     )
     made = tmp_path / "c.yaml"
