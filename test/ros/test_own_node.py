@@ -23,6 +23,7 @@ from lifecycle_msgs.msg import Transition
 from ros.harness import (
     GEOMETRY,
     RATE,
+    SIGMA,
     TRANSITIONS,
     TWO_IMUS,
     connect,
@@ -312,17 +313,18 @@ def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) 
         assert listener.says("g5", "isolated")
         assert wait(lambda: listener.value("input gyros", "malformed") == "4")
         pipeline = Pipeline.from_config(config)
-        # As the node's, it has seen healthy samples.
-        pipeline.process(
-            Block(stamps[0] - 4_000_000 * np.arange(50, 0, -1), healthy(50, seed=99)[1])
-        )
+        # As the node's, it has seen a second at rest, and then nothing for a while.
+        before = stamps[0] - 1_000_000_000 - 4_000_000 * np.arange(250, 0, -1)
+        pipeline.process(Block(before, np.zeros((250, 6))))
         output = pipeline.process(Block(np.array(stamps), z))
-        # What the estimator knows after other samples before differs a little.
-        declared = ChannelState.FAULTY
-        np.testing.assert_array_equal(
-            np.array(states) == declared, output.state == declared
-        )
-        np.testing.assert_allclose(rates, output.rate, atol=1e-3)
+        # What the estimator knows after other samples before differs a little: single
+        # samples may be suspected, and rates differ by a quarter of their noise.
+        states, faulty = np.array(states), ChannelState.FAULTY
+        np.testing.assert_array_equal(states == faulty, output.state == faulty)
+        assert (states != output.state).any(axis=1).sum() <= 5
+        apart = np.array(rates) - output.rate
+        assert np.abs(apart).max() < 0.8 * SIGMA
+        assert np.sqrt((apart**2).mean()) < 0.16 * SIGMA
         # At the end comes another signal, of the other kind, and it is as well as after one.
         process.popen.send_signal(signal.SIGTERM)
 
