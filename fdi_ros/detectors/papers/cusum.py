@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cumulative sums: drift and steps too small for one sample."""
+"""Cumulative sums: detection of drift and of steps too small for one sample."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from fdi_ros.model.samples import Array
 
 @lru_cache(maxsize=16)
 def mean_overshoot(reference: float) -> float:
-    """By how much a sampled running sum is harder to bring to its threshold than a continuous one, on both ends.
+    """Return the mean overshoot of a sampled running sum over both of its ends.
 
-    ``-ln nu(2 k) / k`` with ``nu(x) = 2 / x^2 exp(-2 sum_n Phi(-x sqrt(n) / 2) / n)`` (Siegmund, Sequential Analysis,
-    1985, eq. 4.37), which is his constant 1.166 for small k and 1.137 at k = 1.
+    ``-ln nu(2 k) / k`` with ``nu(x) = 2 / x^2 exp(-2 sum_n Phi(-x sqrt(n) / 2) / n)``
+    (Siegmund, Sequential Analysis, 1985, eq. 4.37): 1.166 for small k, 1.137 at k = 1.
     """
     if reference < 0.1:
         return 1.166
@@ -56,25 +56,42 @@ def mean_overshoot(reference: float) -> float:
 
 
 def siegmund_run_length(threshold: float, reference: float) -> float:
-    """Mean samples until a sum of standard normal steps less k, from 0, reaches a threshold for the first time.
+    """Return the mean number of samples in which a running sum reaches a threshold.
 
-    Siegmund 1985: ``(exp(2 k b) - 1 - 2 k b) / (2 k^2)`` with b the threshold plus `mean_overshoot`.
+    The steps are standard normal less k. Siegmund (1985): ``(exp(2 k b) - 1 - 2 k b) / (2
+    k^2)``, where b is the threshold plus `mean_overshoot`.
     """
     x = 2 * reference * (threshold + mean_overshoot(reference))
     return (math.expm1(x) - x) / (2 * reference**2)
 
 
 def threshold_for(run_length: float, reference: float, correlation: Array) -> float:
-    """Threshold, in standard deviations, of correlated sums for the mean run length to the first false alarm of any.
+    """Return the threshold of correlated sums for the mean run length to a false alarm.
 
-    Sums whose samples are correlated alarm together at times. Given that one crosses the threshold, its samples drift
-    by +k, those of another by ``(2 rho - 1) k``; the other is then at a normally distributed distance D from the
-    threshold, ``2 k D`` having mean mu = ``4 (1 - rho) k b`` and variance 2 mu, and goes on to cross it with
-    probability exp(-2 k D). The mean of that is ``erfc(sqrt((1 - rho) k b))``. Crossings that are shared count once.
+    Sums of correlated samples sometimes alarm together, and shared crossings count once.
+    If one sum crosses the threshold, its samples drift by +k, and those of another sum by
+    ``(2 rho - 1) k``. The other sum is then at a normally distributed distance D from the
+    threshold, where ``2 k D`` has mean mu = ``4 (1 - rho) k b`` and variance 2 mu. Its
+    probability to cross as well is exp(-2 k D), with mean ``erfc(sqrt((1 - rho) k b))``.
 
-    ``run_length``: samples, of all sums together. ``reference`` k: what is subtracted from every sample, in standard
-    deviations. ``correlation`` (K, K): rho between the samples of the sums. `ConfigError` if the run length is so short
-    that no threshold above zero gives it.
+    Parameters
+    ----------
+    run_length
+        Mean number of samples to a false alarm of any sum.
+    reference
+        k, subtracted from every sample, in standard deviations.
+    correlation
+        Correlation rho between the samples of the sums, (K, K).
+
+    Returns
+    -------
+    float
+        Threshold, in standard deviations.
+
+    Raises
+    ------
+    ConfigError
+        If the run length is too short for any positive threshold.
     """
     count, overshoot = len(correlation), mean_overshoot(reference)
     apart = 1 - np.clip(correlation[~np.eye(count, dtype=bool)], -1, 1)
@@ -84,7 +101,7 @@ def threshold_for(run_length: float, reference: float, correlation: Array) -> fl
         b = threshold + overshoot
         shared = float(erfc(np.sqrt(apart * reference * b)).sum()) / count
         effective = count * max(1 - shared / 2, 1 / (1 + shared))
-        # A crossing takes b / k samples; of several sums, that time passes only once.
+        # A crossing takes b / k samples, which several sums share.
         single = max(
             effective * (run_length - b / reference) + b / reference, run_length
         )
@@ -97,7 +114,8 @@ def _single_threshold(run_length: float, reference: float) -> float:
         raise ConfigError(
             f"run length is {run_length:.4g} samples per sum, expected above {shortest:.3g}"
         )
-    # ln(1 + x + 2 k^2 L) is close from below; expm1(x) - x is convex, so Newton converges from there.
+    # ln(1 + x + 2 k^2 L) is a close lower bound. Since expm1(x) - x is convex, Newton's
+    # method converges from there.
     target = 2 * reference**2 * run_length
     x = math.log1p(target)
     for _ in range(20):
@@ -105,10 +123,11 @@ def _single_threshold(run_length: float, reference: float) -> float:
     return x / (2 * reference) - mean_overshoot(reference)
 
 
-LARGEST = 2.0**18  # standard deviations above which a sample is scaled down as a whole
+#: A larger sample is scaled down to this as a whole, standard deviations.
+LARGEST = 2.0**18
+#: Lasting errors of bias, scale and timing up to this many standard deviations are no
+#: fault: 0.3 % of sensors have more.
 SYSTEMATIC = 3.0
-"""Standard deviations of bias, scale and timing errors that are taken for no fault, however long they last: 0.3 % of
-sensors have more."""
 
 
 # The method ----------------------------------------------------------------------------------------------------------
@@ -116,40 +135,40 @@ sensors have more."""
 
 @record
 class Constants:
-    """What `judge` needs."""
+    """Constants of `judge`."""
 
     sensors: Sensors
     hypotheses: Hypotheses  # with the noise of the sample
-    resting: Hypotheses  # with noise_std alone: the averages are named by these
-    scale: Channels  # of each residual over noise_std, so that its variance is one; 0 if no fault is seen
+    resting: Hypotheses  # with noise_std alone, used to name averages
+    # factor of each residual over noise_std that gives unit variance, 0 if not detectable
+    scale: Channels
     squares: Square  # share of each channel's variance in that of a w0, 1 / (rad/s)^2
-    bias: Channels  # variance of the bias left in a w0
-    half_shift: Real
-    threshold: Real
-    window: Whole  # samples after the onset that the naming rests on
+    bias: Channels  # variance of the remaining bias in a w0
+    half_shift: Real  # k, standard deviations
+    threshold: Real  # standard deviations
+    window: Whole  # largest number of samples after the onset used to name a channel
 
 
 @record
 class Side:
-    """One running sum, and what was added up since it left zero, over at most `window` samples."""
+    """A running sum, and sums over at most `window` samples since its onset."""
 
-    total: Real
-    count: Whole  # samples added up
-    factor: Real  # of their common factors
-    systematic: Real  # of the standard deviations of their systematic parts
-    residual: Channels  # of the residuals over noise_std, times the factor
+    total: Real  # the running sum, standard deviations
+    count: Whole  # number of samples in the sums below
+    factor: Real  # sum of the common factors
+    systematic: Real  # sum of the standard deviations of the systematic errors
+    residual: Channels  # sum of the residuals over noise_std, times the factor
 
 
 @record
 class State:
     """Running sums, two per channel."""
 
-    sides: Annotated[
-        list[Side], 2 * MAX_CHANNELS
-    ]  # downward of each channel, then upward
+    # downward sum of each channel, then the upward ones
+    sides: Annotated[list[Side], 2 * MAX_CHANNELS]
     room: Scratch
-    resting: Channels  # of this sample: residuals over noise_std
-    variance: Channels  # of this sample: variance of each w0 by all errors; by noise_std alone it is 1
+    resting: Channels  # residuals of this sample over noise_std
+    variance: Channels  # of each w0 of this sample by all errors, 1 by noise_std alone
 
 
 @compiled
@@ -161,7 +180,7 @@ def advance(
     systematic: float,
     residual: NDArray[np.float64],
 ) -> None:
-    """Take one sample into a running sum; it stays between 0 and 1.5 thresholds."""
+    """Add one sample to a running sum, which is limited to 0 to 1.5 thresholds."""
     side.total = min(max(side.total + step, 0.0), 1.5 * params.threshold)
     if side.total == 0.0 and side.count > 0:
         side.count = 0
@@ -186,7 +205,8 @@ def name(
 ) -> None:
     """Name the channels that explain the average since the onset."""
     mean_part = side.systematic / side.count
-    # The variance of the average is at most 1 / count + mean_part^2: over its root, that of a sample.
+    # The variance of the average is at most 1 / count + mean_part^2. Division by its
+    # square root gives the variance of one sample.
     root = 1.0 / math.sqrt(1.0 / side.count + mean_part * mean_part)
     for i in range(params.sensors.n):
         state.room.residual[i] = side.residual[i] / side.count * root
@@ -199,7 +219,7 @@ def name(
 def name_largest(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Name the channels by the largest sum, the downward ones first where several are as large."""
+    """Name the channels by the largest sum. Of equal sums the first downward one counts."""
     for k in range(2 * MAX_CHANNELS):
         if state.sides[k].total == verdict.statistic:
             name(params, state.sides[k], state, sample, verdict)
@@ -210,7 +230,7 @@ def name_largest(
 def judge(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Advance all sums by one sample; on alarm, name the channels by the largest."""
+    """Advance all sums by one sample. On alarm, name the channels by the largest sum."""
     sensors, room = params.sensors, state.room
     n = sensors.n
     fill_scratch(params.resting, sensors, sample, room)
@@ -223,7 +243,7 @@ def judge(
     systematic = 0.0
     for i in range(n):
         w0 = state.resting[i] * params.scale[i]
-        # The scores hold w until the sums are advanced.
+        # The scores store w until the sums are advanced.
         verdict.scores[i] = (
             w0
             if sensors.constant
@@ -257,7 +277,7 @@ def judge(
 
 @compiled
 def plain_variances(params: Constants, sample: SampleInput, state: State) -> None:
-    """Variance of every w0 by all errors at the rate and acceleration of the sample, into ``state.variance``."""
+    """Write the variance of every w0 by all errors of this sample to ``state.variance``."""
     sensors, rate = params.sensors, state.room.correction
     n = sensors.n
     for a in range(3):
@@ -278,25 +298,27 @@ def plain_variances(params: Constants, sample: SampleInput, state: State) -> Non
 class Cusum(Detector):
     r"""Two running sums per channel, ``max(0, S + w_i - k)`` and ``max(0, S - w_i - k)``, against one threshold.
 
-    w_i is the whitened single-fault statistic of `likelihood_ratio`, ``k = shift / 2`` (Page, *Continuous inspection
-    schemes*, 1954). The threshold h follows from the mean run length to a false alarm, shared among both sides of all
-    channels that can be told apart, by Siegmund's approximation (`siegmund_run_length`). On alarm the largest sum sets
-    the onset, and `explain` names the channels that explain the average since then. Errors that keep their sign
-    (`bias_std`, scale, timing) raise k by `SYSTEMATIC` times the standard deviation that they have in w in that sample.
-    docs/methods.md has the rest, and when to take it.
+    w_i is the whitened single-fault statistic of `likelihood_ratio`, and ``k = shift / 2``
+    (Page, *Continuous inspection schemes*, 1954). The threshold h follows from the mean
+    run length to a false alarm, shared by both sides of all distinguishable channels, with
+    Siegmund's approximation (`siegmund_run_length`). On alarm the largest sum gives the
+    onset, and `explain` names the channels that explain the average since then. Errors of
+    constant sign (`bias_std`, scale, timing) raise k by `SYSTEMATIC` times their standard
+    deviation in w. docs/methods.md contains details and applications.
 
     Parameters
     ----------
     geometry, noise
         As of every `Detector`.
     shift
-        Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
+        Mean shift of w_i that is detected fastest, in standard deviations, 0.05 to 3.
     run_length
-        Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8 (1e-3 an hour at 100 Hz).
+        Mean number of samples to a false alarm of the whole detector, 2 to 1e15. Default
+        3.6e8 (1e-3 per hour at 100 Hz).
     false_alarms_per_hour, sample_rate
-        The other way to give it, with the rate in Hz.
+        In place of the run length, with the rate in Hz.
     confidence
-        With which rivals are rejected, above 0.5 and below 1.
+        Confidence with which rivals are rejected, above 0.5 and below 1.
 
     Notes
     -----
@@ -357,7 +379,7 @@ class Cusum(Detector):
             self.run_length, shift / 2, np.block([[rho, -rho], [-rho, rho]])
         )
         self.window = math.ceil(16 * self.threshold / shift) + 1
-        """Samples after the onset, at most, that the naming of the channel rests on."""
+        """Largest number of samples after the onset used to name a channel."""
         params["half_shift"], params["threshold"], params["window"] = (
             shift / 2,
             self.threshold,
@@ -365,9 +387,10 @@ class Cusum(Detector):
         )
 
     def samples_since_onset(self) -> NDArray[np.int64]:
-        """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).
+        """Return the number of samples since the estimated onset in each channel, (n,).
 
-        0: no drift. At most `window`: that long or longer. Of a channel's two sums the larger counts.
+        0: no drift. `window`: that long or longer. The larger of a channel's two sums
+        counts.
         """
         sides, n = self.states[0]["sides"], self.geometry.n
         down, up = sides[:n], sides[MAX_CHANNELS : MAX_CHANNELS + n]

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Guaranteeing (set-membership) detection: bounded errors, no statistics, up to two arbitrary channels.
+"""Guaranteeing (set-membership) detection: bounded errors and up to two arbitrary channels.
 
-It rests on the circuits of the sensitivity axes: smallest sets of channels with dependent axes, two parallel ones,
-three in a plane, four in space. Each carries exactly one check ``nu . z`` that no body rate moves, and every statement
-about bounded errors follows from these alone, as docs/methods.md#guaranteed has it.
+The method uses the circuits of the sensitivity axes: the smallest sets of channels with
+dependent axes (two parallel, three in a plane, four in space). Each circuit has exactly
+one check ``nu . z`` that does not depend on the body rate. All statements on bounded errors
+follow from these checks (docs/methods.md#guaranteed).
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from fdi_ros.model.samples import Array, Mask
 
 
 def circuits(axes: Array) -> Array:
-    """Return the checks of all circuits of axes (n, 3), (C, n): at most four entries of a row are not zero.
+    """Return the checks of all circuits of axes (n, 3), (C, n).
 
-    A row times the axes is zero.
+    At most four entries of a row are not zero, and a row times the axes is zero.
     """
     norm = np.linalg.norm(axes, axis=1)
     unit = axes / norm[:, None]
@@ -67,9 +68,8 @@ def _triples(unit: Array) -> Array:
     normal = products[np.arange(len(products)), longest]
     values = (products * normal[:, None, :]).sum(axis=2)
     length = np.linalg.norm(values, axis=1)
-    spans = (
-        length > ROUNDING
-    )  # else all three are parallel: every pair of them is a circuit already
+    # Otherwise all three are parallel, and every pair is already a circuit.
+    spans = length > ROUNDING
     return _scatter(
         index[dependent][spans], values[spans] / length[spans, None], len(unit)
     )
@@ -95,7 +95,7 @@ def _scatter(index: NDArray[np.intp], values: Array, n: int) -> Array:
 
 
 def _contains(rows: Array, smaller: Array) -> NDArray[np.bool_]:
-    """(len(rows),): whether the support of a row contains that of one of the smaller circuits."""
+    """Return for each row whether its support contains that of a smaller circuit."""
     support, small = (rows != 0).astype(np.int64), (smaller != 0).astype(np.int64)
     contains: NDArray[np.bool_] = (support @ small.T == small.sum(axis=1)).any(axis=1)
     return contains
@@ -105,12 +105,12 @@ MOST_CHANNELS = 9
 MOST_FAULTS = 2
 MOST_SETS = math.comb(MOST_CHANNELS, MOST_FAULTS)
 MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
-"""None contains another: no family of such sets of at most four channels is larger (Sperner)."""
-MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)  # circuits through one channel, likewise
-ABSENT = MOST_CHANNELS  # instead of a channel: its weight is zero
-WITHIN = (
-    1 + ROUNDING
-)  # a check this many times its bound still counts as within it: rounding is no fault
+"""No circuit contains another. No larger family of sets of four channels exists (Sperner)."""
+#: Largest number of circuits through one channel, by the same theorem.
+MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
+ABSENT = MOST_CHANNELS  #: In place of a channel, with weight zero.
+#: A check up to this multiple of its bound is not violated: rounding is no fault.
+WITHIN = 1 + ROUNDING
 
 
 # The method ----------------------------------------------------------------------------------------------------------
@@ -118,61 +118,50 @@ WITHIN = (
 
 @record
 class Circuits:
-    """The checks, each scaled to what its members' bounds allow, and the sets of channels that may be faulty."""
+    """Checks, scaled by the bounds of their members, and sets of possibly faulty channels."""
 
     sensors: Sensors
     bound: Channels  # limit of a healthy channel's error, rad/s
     threshold: Real  # size of error that counts as a failure, in bounds
     limit: Real  # of the statistic
-    faults: Whole  # channels that may be faulty, at most
+    faults: Whole  # largest number of faulty channels
     circuits: Whole  # number of checks
-    checks: Annotated[
-        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_CIRCUITS)
-    ]  # s/rad; one per column
-    weight: Annotated[
-        NDArray[np.float64], "f8", (MOST_CIRCUITS, MOST_CHANNELS + 1)
-    ]  # bound |check|; rows add to 1
-    rules_out: Annotated[
-        NDArray[np.int64], "i8", (MOST_CIRCUITS,)
-    ]  # bits of the sets that a violation rules out
-    sets: Whole  # number of the largest sets: they explain all that their subsets do
-    first: Whole  # bit of the first of them
-    members: Annotated[
-        NDArray[np.int64], "i8", (MOST_SETS, MOST_FAULTS)
-    ]  # their channels; ABSENT where there is none
-    circuit: Annotated[
-        NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)
-    ]  # [i]: those through channel i
-    slope: Annotated[
-        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)
-    ]  # check to the channel's error, rad/s
-    half: Annotated[
-        NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)
-    ]  # half-width of its interval, rad/s
-    # A circuit limits the error of channel i only if all its other members are healthy.
-    usable: Annotated[
-        NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)
-    ]  # [i, f]: so many when set f is faulty
-    which: Annotated[
-        NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)
-    ]  # their places in circuit[i]
+    # one check per column, s/rad
+    checks: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_CIRCUITS)]
+    # bound times |check|, rows add to 1
+    weight: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS, MOST_CHANNELS + 1)]
+    # mask of the sets that a violation of each check rules out
+    rules_out: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]
+    sets: Whole  # number of the largest sets, which explain all that their subsets do
+    first: Whole  # bit of the first largest set
+    # channels of the largest sets, or ABSENT
+    members: Annotated[NDArray[np.int64], "i8", (MOST_SETS, MOST_FAULTS)]
+    # [i]: circuits through channel i
+    circuit: Annotated[NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)]
+    # error of channel i per check, rad/s
+    slope: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]
+    # half-width of the interval of channel i by each circuit, rad/s
+    half: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]
+    # [i, f]: number of circuits through channel i without other members in set f: only
+    # healthy members limit the error of channel i
+    usable: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)]
+    # [i, f]: indices of these circuits in circuit[i]
+    which: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)]
 
 
 @record
 class Findings:
-    """What is found of one sample on the way to its verdict; nothing is remembered."""
+    """Intermediate results of one sample, without memory between samples."""
 
-    value: Annotated[
-        NDArray[np.float64], "f8", (MOST_CIRCUITS,)
-    ]  # of each check; size 1: all that bounds allow
-    violations: Whole  # number of checks violated
-    violated: Annotated[
-        NDArray[np.int64], "i8", (MOST_CIRCUITS,)
-    ]  # which; the worst first
+    # of each check, at most 1 within the bounds
+    value: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS,)]
+    violations: Whole  # number of violated checks
+    # violated checks, the worst first
+    violated: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]
     explanations: Whole  # number of the largest sets that explain the sample
-    explains: Annotated[NDArray[np.int64], "i8", (MOST_SETS,)]  # which
-    lower: Channels  # guaranteed interval of each channel's error, rad/s
-    upper: Channels
+    explains: Annotated[NDArray[np.int64], "i8", (MOST_SETS,)]  # these sets
+    lower: Channels  # lower end of the interval of each channel's error, rad/s
+    upper: Channels  # upper end, rad/s
 
 
 @compiled
@@ -191,7 +180,10 @@ def check(params: Circuits, z: Array, found: Findings) -> float:
 
 @compiled
 def explain(params: Circuits, found: Findings) -> int:
-    """List the checks violated and the largest sets that explain them; return the bits of all sets ruled out."""
+    """List the violated checks and the largest sets that explain them.
+
+    Return the mask of all sets ruled out.
+    """
     found.violations = found.explanations = 0
     ruled_out = 0
     for k in range(params.circuits):
@@ -213,13 +205,13 @@ def explain(params: Circuits, found: Findings) -> int:
 
 @compiled
 def mildest(params: Circuits, found: Findings) -> float:
-    """Size in bounds of the largest error in the mildest explanation of a sample that violates checks."""
+    """Return the largest error, in bounds, of the mildest explanation of the sample."""
     least = math.inf
     for m in range(found.explanations):
         members, largest = params.members[found.explains[m]], 0.0
         for v in range(found.violations):
             k = found.violated[v]
-            # Errors of t bounds in the faulty members stretch what the check allows to 1 + (t - 1) weight.
+            # Errors of t bounds in the faulty members allow a check of 1 + (t - 1) weight.
             weight = params.weight[k, members[0]] + params.weight[k, members[1]]
             largest = max(largest, (abs(found.value[k]) - 1) / weight)
             if largest >= least:
@@ -230,10 +222,11 @@ def mildest(params: Circuits, found: Findings) -> float:
 
 @compiled
 def intervals(params: Circuits, found: Findings) -> None:
-    """Fill in the interval of each channel's error, over all explanations; NaN if there are none."""
+    """Write the interval of each channel's error over all explanations, or NaN."""
     for i in range(params.sensors.n):
         lower, upper = math.inf, -math.inf
-        # An interval is widest where the channel itself is faulty: then little is left to do for the other sets.
+        # Intervals are widest for sets that contain the channel. Evaluated first, they
+        # make most other sets unnecessary.
         for faulty in (True, False):
             for m in range(found.explanations):
                 f = found.explains[m]
@@ -257,7 +250,10 @@ def intervals(params: Circuits, found: Findings) -> None:
 
 @compiled
 def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> None:
-    """Fill in the channels that have failed in some explanation, whether all have in each, and their errors."""
+    """Write the channels that failed in some explanation, and their errors.
+
+    The verdict isolates if all of them failed in each explanation.
+    """
     n, any_found = params.sensors.n, False
     for i in range(n):
         beyond = params.threshold * params.bound[i]
@@ -275,7 +271,7 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
             found.upper[i],
             params.threshold * params.bound[i],
         )
-        # No explanation, or only channels whose faults the geometry hides could have failed: nothing to choose by.
+        # No explanation, or only undetectable channels could have failed.
         if not any_found:
             verdict.suspects[i] = params.sensors.detectable[i]
         if verdict.suspects[i]:
@@ -289,7 +285,7 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
 def judge(
     params: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Judge one sample by its checks, and if these need a fault by what all explanations have in common."""
+    """Judge one sample by its checks, and if these imply a fault, by all explanations."""
     verdict.statistic, verdict.threshold = check(params, sample.z, found), params.limit
     if verdict.statistic < min(WITHIN, params.limit):
         return
@@ -298,7 +294,7 @@ def judge(
         verdict.statistic = mildest(params, found)
     verdict.alarm = verdict.statistic >= params.limit
     intervals(params, found)
-    # Comparisons with NaN are false: without an explanation nothing is known of a channel.
+    # Comparisons with NaN are false: without an explanation a channel is unknown.
     for i in range(params.sensors.n):
         if found.lower[i] > 0 or found.upper[i] < 0:
             verdict.scores[i] = max(found.lower[i], -found.upper[i]) / params.bound[i]
@@ -315,7 +311,7 @@ def explain_rows(
     lower: Array,
     upper: Array,
 ) -> None:
-    """Fill in the bits of the sets that samples z (N, n) rule out, (N,), and the intervals of the errors, (N, n)."""
+    """Write the masks of ruled-out sets (N,) and the intervals (N, n) of samples z (N, n)."""
     for k in range(len(z)):
         check(params[0], z[k], found[0])
         ruled_out[k] = explain(params[0], found[0])
@@ -325,22 +321,26 @@ def explain_rows(
 
 
 class Guaranteed(Detector):
-    r"""Intervals that certainly contain each channel's error, and the channels that have certainly failed.
+    r"""Intervals that certainly contain each channel's error, and certainly failed channels.
 
-    A healthy channel's error is at most its bound b_i; at most `max_faults` channels, any, are arbitrary. For a set F
-    of channels left out the admissible rates are ``Q_F = {q : |z_i - h_i q| <= b_i, i not in F}``; the error of channel
-    i is ``z_i - h_i q`` over the union of all Q_F (*Determining failures of a redundant inertial sensor unit by the
-    guaranteeing estimation method*: its linear programmes and test (10), with the sign lost in print). A channel has
-    certainly failed when its whole interval lies beyond ``threshold * b_i``. No programme is solved: each is decided at
-    a vertex of its dual, and the vertices are the circuits of the axes (see `circuits`). docs/methods.md has when to
-    take it.
+    The error of a healthy channel is at most its bound b_i. At most `max_faults` channels
+    have arbitrary errors. For a set F of channels left out, the admissible rates are ``Q_F
+    = {q : |z_i - h_i q| <= b_i, i not in F}``. The error of channel i is ``z_i - h_i q``
+    over the union of all Q_F (*Determining failures of a redundant inertial sensor unit by
+    the guaranteeing estimation method*: its linear programmes and test (10), with the sign
+    lost in print). A channel has certainly failed if its whole interval is beyond
+    ``threshold * b_i``. No linear programme is solved: the optimum is at a vertex of the
+    dual, and the vertices are the circuits of the axes (see `circuits`). docs/methods.md
+    states when to use this method.
 
-    - `statistic`: the size in bounds of the largest error in the mildest explanation of the sample with at most
-      `max_faults` faults; inf: there is none, it contradicts `max_faults` or the bounds. With max_faults = 0 the
-      factor by which all bounds would have to grow, its threshold 1.
-    - `suspects`: channels that have failed in some explanation, all when there is none; `isolated`: each has in all.
-    - `scores`: least possible size of each channel's error in bounds; 0 while the sample needs no fault.
-    - `error`: midpoint of the interval; 0 where it is unbounded or empty.
+    - `statistic`: largest error, in bounds, of the mildest explanation of the sample with
+      at most `max_faults` faults. Infinite without an explanation: the sample contradicts
+      `max_faults` or the bounds. With max_faults = 0, the factor by which all bounds would
+      have to grow, with threshold 1.
+    - `suspects`: channels that failed in some explanation, or all without an explanation.
+      `isolated`: each suspect failed in all explanations.
+    - `scores`: least size of each channel's error, in bounds, 0 if no fault is necessary.
+    - `error`: midpoint of the interval, 0 if unbounded or empty.
 
     Parameters
     ----------
@@ -349,12 +349,13 @@ class Guaranteed(Detector):
     noise
         Error model with a `bound`, one for all or one per channel.
     max_faults
-        0, 1 or 2, at most n - 4: with fewer than four channels left nothing checks them. Default: as many as n allows.
+        0, 1 or 2, at most n - 4, because fewer than four channels cannot be checked.
+        Default: the largest number for n.
     threshold
         Size of error that counts as a failure, in bounds, > 0.
     reduce_max_faults
-        Whether to lower max_faults to n - 4 instead of refusing it, as is done when channels are absent. The verdict
-        then holds for that many faults.
+        Lower max_faults to n - 4 instead of raising an error, as for absent channels. The
+        verdict then holds for that many faults.
     """
 
     name = "guaranteed"
@@ -393,7 +394,7 @@ class Guaranteed(Detector):
             for size in range(self.max_faults + 1)
             for f in combinations(range(geometry.n), size)
         )
-        """Sets of channels that may be the faulty ones, smallest first; columns of `culprits`."""
+        """Sets of possibly faulty channels, smallest first: columns of `culprits`."""
         params = self.constants[0]
         params["bound"][: geometry.n], params["threshold"] = self.bound, threshold
         params["limit"] = threshold if self.max_faults else WITHIN
@@ -404,7 +405,7 @@ class Guaranteed(Detector):
 
     @classmethod
     def refuses(cls, n: int) -> str:
-        """Why the method cannot run on n channels that span space; empty if it can."""
+        """Return why the method cannot run on n channels that span space, or ""."""
         return (
             ""
             if n <= MOST_CHANNELS
@@ -412,7 +413,7 @@ class Guaranteed(Detector):
         )
 
     def _prepare_checks(self, checks: Array) -> None:
-        """Fill in checks (C, n), and for each the sets of channels that leave all its members healthy."""
+        """Write checks (C, n), and for each the sets that leave all its members healthy."""
         params, (count, n) = self.constants[0], checks.shape
         params["circuits"], params["checks"][:n, :count] = count, checks.T
         params["weight"][:count, :n] = np.abs(checks) * self.bound
@@ -431,12 +432,12 @@ class Guaranteed(Detector):
         params["members"][: len(largest), : self.max_faults] = largest
 
     def _prepare_intervals(self, checks: Array) -> None:
-        """Fill in how the circuits through each channel limit its error, and which do so for each set at fault."""
+        """Write how circuits limit each channel's error, and which of them do for each set."""
         params = self.constants[0]
         for i, bound in enumerate(self.bound):
             through = np.flatnonzero(checks[:, i])
             half = 1 / np.abs(checks[through, i]) - bound
-            # The narrowest first: they leave least to tighten.
+            # The narrowest intervals first: then later ones seldom change the result.
             order = np.argsort(half, kind="stable")
             through, count = through[order], len(through)
             params["circuit"][i, :count], params["half"][i, :count] = (
@@ -455,26 +456,28 @@ class Guaranteed(Detector):
 
     @property
     def isolable(self) -> Mask:
-        """Channels whose fault can be named, (n,); none with max_faults = 0, which finds no fault at all."""
+        """Channels whose fault can be isolated, (n,). None with max_faults = 0."""
         return self.geometry.isolable & (self.max_faults > 0)
 
     def culprits(self, z: Array) -> Mask:
-        """Which of `sets` explain each sample z (N, n), all finite: (N, sets) bool; none: inconsistent."""
+        """Return for each finite sample z (N, n) which of `sets` explain it, (N, sets)."""
         ruled_out, _, _ = self._explain(self._checked(z))
         return np.asarray(ruled_out[:, None] >> np.arange(len(self.sets)) & 1 == 0)
 
     def error_bounds(self, z: Array) -> tuple[Array, Array]:
-        """Guaranteed interval of every channel's error.
+        """Return the guaranteed interval of every channel's error.
 
         Parameters
         ----------
         z
-            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample.
+            Measured channels, (N, n), rad/s. NaN or infinite: absent from that sample.
 
         Returns
         -------
-        lower (N, n) and upper (N, n), rad/s. Infinite: not limited by the other channels. NaN: the sample
-        contradicts `max_faults`, or the channel is absent or cannot be judged.
+        lower, upper
+            Ends of the intervals, (N, n), rad/s. Infinite: not limited by the other
+            channels. NaN: the sample contradicts `max_faults`, or the channel is absent or
+            cannot be judged.
 
         Raises
         ------
@@ -494,7 +497,7 @@ class Guaranteed(Detector):
         return lower, upper
 
     def _explain(self, z: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Bits of the sets that samples z (N, n), all finite, rule out, and lower and upper ends of the intervals."""
+        """Return the masks of ruled-out sets and the intervals of finite samples z (N, n)."""
         ruled_out, lower, upper = (
             np.empty(len(z), dtype=np.int64),
             np.empty(z.shape),

@@ -29,14 +29,18 @@ TOLERANCES = ("calibrated", "paper")
 
 
 class ResidualSearch(SingleFaultDetector):
-    """Search for the channel that disagrees, by one of four criteria of Gorelov et al. 2019; then its tolerance.
+    """Search for the failed channel by one of four criteria, then test its tolerance.
 
-    G_i is the least-squares inverse of H without row i, G_ij without rows i and j, ``z_ip = h_i G_i z``. ``scores`` are
-    the figures of the criterion, rad/s or its square; with 4 channels only that of `MaxResidual` exists, else NaN.
-    Tolerance ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s of the worst channel, threshold ``3 sqrt(sigma_0^2 +
-    sigma_k^2 z_ip^2)``. ``calibrated``: that statistic over its standard deviation, prediction included; threshold that
-    the largest of them over all channels exceeds with the false-alarm probability asked for. docs/methods.md has when
-    to take which.
+    Gorelov et al. (2019). G_i is the least-squares inverse of H without row i, G_ij the
+    inverse without rows i and j, and ``z_ip = h_i G_i z``. ``scores`` are the figures of
+    the criterion, rad/s or (rad/s)^2. With 4 channels only those of `MaxResidual` exist,
+    others are NaN.
+
+    With the tolerance ``paper``, eq. (8), the statistic is ``|z_i - z_ip|``, rad/s, of the
+    worst channel, and the threshold ``3 sqrt(sigma_0^2 + sigma_k^2 z_ip^2)``. With
+    ``calibrated`` the statistic is divided by its standard deviation, prediction included.
+    The largest of these over all channels exceeds the threshold with the required
+    false-alarm probability. docs/methods.md states when to use which.
 
     Parameters
     ----------
@@ -45,23 +49,21 @@ class ResidualSearch(SingleFaultDetector):
     tolerance
         ``calibrated`` or ``paper``.
     rate
-        For `calibrated`: `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with
-        `sample_rate`, Hz.
+        For `calibrated`: `false_alarm_probability` per sample, by default 1e-6, or
+        `false_alarms_per_hour` with `sample_rate`, Hz.
 
     Raises
     ------
     ConfigError
-        If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
+        If an option is out of range, or a false-alarm rate is given for `paper`.
     """
 
     Constants = WithForms
     judge = judge_sums
-    criterion_squares: ClassVar[bool] = (
-        False  # the criterion sums squares, not absolute values
-    )
-    criterion_largest: ClassVar[bool] = (
-        False  # the worst channel has the largest figure, not the least
-    )
+    #: The criterion sums squares, not absolute values.
+    criterion_squares: ClassVar[bool] = False
+    #: The worst channel has the largest figure, not the least.
+    criterion_largest: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -78,7 +80,7 @@ class ResidualSearch(SingleFaultDetector):
             raise ConfigError(
                 "tolerance 'paper' keeps no false-alarm rate: leave it out, or take 'calibrated'"
             )
-        # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
+        # Three of four channels have no residual: only the last criterion exists.
         scored = self.criterion_largest or geometry.n > 4
         largest = self.criterion_largest or not scored
         super().__init__(
@@ -149,17 +151,17 @@ class RateDeviation(ResidualSearch):
 
 
 class MaxResidual(ResidualSearch):
-    """The channel i of the largest ``|z_i - z_ip|``, each against its prediction from all others, eqs. (17)-(19)."""
+    """The channel i of the largest ``|z_i - z_ip|``, predicted by all others, eqs. (17)-(19)."""
 
     name = "max_residual"
     criterion_largest = True
 
 
 def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:
-    """For each channel i whose faults are seen, the prediction errors among the others.
+    """Return for each detectable channel i the prediction errors among the others.
 
-    List of i, forms (k, n) ``z_j - h_j G_ij z`` of the k channels j that the remaining ones predict, and the columns j
-    of G_i (3, k).
+    Each element contains i, the forms ``z_j - h_j G_ij z`` (k, n) of the k channels j that
+    the remaining channels predict, and the columns j of G_i (3, k).
     """
     found: list[tuple[int, Array, Array]] = []
     for i in map(int, np.flatnonzero(geometry.detectable)):
@@ -173,7 +175,10 @@ def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:
 
 
 def _squares(geometry: Geometry, weighted: Callable[[Array, Array], Array]) -> Array:
-    """Forms (n - 4, n, n): for each channel left out as many as its weighted forms have rank, of the same squares."""
+    """Return forms (n - 4, n, n) with the same sums of squares as the weighted forms.
+
+    Each channel left out has as many forms as the rank of its weighted forms.
+    """
     terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
     for i, forms, gain in _left_out(geometry):
         _, singular, rows = np.linalg.svd(weighted(forms, gain), full_matrices=False)
