@@ -113,7 +113,7 @@ ABSENT = MOST_CHANNELS  #: In place of a channel, with weight zero.
 WITHIN = 1 + ROUNDING
 
 
-# The method ----------------------------------------------------------------------------------------------------------
+# The method
 
 
 @record

@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Three methods of the paper on identification of faults: the projector on parity space, recursion, determinants.
+"""Identification of faults by a projector on parity space, recursion and determinants.
 
-"Algorithms of identification of faults of navigation measuring elements" (in Russian, no author line), sections 1-2, 3
-and 4.
+"Algorithms of identification of faults of navigation measuring elements" (in Russian,
+without author line), sections 1-2, 3 and 4.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from fdi_ros.model.geometry import ROUNDING, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 
-# The projector: sections 1 and 2 --------------------------------------------------------------------------------------
+# The projector: sections 1 and 2
 
 CONSTRUCTIONS = ("svd", "qr")
 NORMS = ("l2", "l1")
@@ -57,22 +57,22 @@ MOST_SETS = comb(MAX_CHANNELS, 3)
 
 @record
 class OneNorm(SingleFault):
-    """For the norm `l1`: every set of n - 3 channels whose errors alone can explain a sample."""
+    """Sets of n - 3 channels whose errors alone explain a sample, for the norm `l1`."""
 
-    sets: Whole  # how many
-    channels: Annotated[
-        NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)
-    ]  # [b, k]: channel k of set b
+    sets: Whole  # number of sets
+    # [b, k]: channel k of set b
+    channels: Annotated[NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)]
+    # [b, k]: error of that channel as a linear form of z
     solutions: Annotated[
         NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)
-    ]  # its error as a form of z
+    ]
 
 
 @callback(OneNorm, NoState, SampleInput, SampleVerdict)
 def judge_one_norm(
     params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Judge one sample by the error of least 1-norm that explains it."""
+    """Judge one sample by the error of least 1-norm that explains the sample."""
     n, z = params.sensors.n, sample.z
     best, least = 0, np.inf
     for b in range(params.sets):
@@ -83,7 +83,7 @@ def judge_one_norm(
                 break
         if norm < least:
             best, least = b, norm
-    # The scores of all other channels are zero as they come.
+    # The scores of all other channels are already zero.
     for k in range(n - 3):
         verdict.scores[params.channels[best, k]] = abs(
             value_of(params.solutions[best, k], z, n)
@@ -92,29 +92,33 @@ def judge_one_norm(
 
 
 class Projector(SingleFaultDetector):
-    """The channel whose fault leaves least of the parity vector unexplained.
+    """The channel whose fault leaves the least of the parity vector unexplained.
 
-    U2 (n, n - 3) spans the space in which the body rate cancels, ``U2' H = 0``: the last columns of the orthogonal
-    factor of the SVD or of the QR decomposition of H. ``e0 = U2 U2' z = G z`` is the least error that explains the
-    sample, g_k the columns of G. For every channel (section 2) ``kappa_k = g_k' e0 / |g_k|^2`` is its error were it
-    alone at fault, rad/s, and ``J(k) = |g_k kappa_k - e0|^2`` what that leaves, (rad/s)^2: the failed channel is the
-    argmin. With ``norm="l1"`` it has the largest ``|e_k|`` of the error e of least 1-norm with ``U2' e = U2' z``, found
-    by trying every set of n - 3 channels.
+    U2 (n, n - 3) spans the space in which the body rate cancels, ``U2' H = 0``: the last
+    columns of the orthogonal factor of the SVD or the QR decomposition of H. The least error
+    that explains the sample is ``e0 = U2 U2' z = G z``, and g_k are the columns of G. For
+    each channel (section 2) ``kappa_k = g_k' e0 / |g_k|^2`` is the error of a single fault,
+    rad/s, and ``J(k) = |g_k kappa_k - e0|^2`` the remainder, (rad/s)^2. The failed channel
+    has the least J(k). With ``norm="l1"`` the failed channel has the largest ``|e_k|`` of
+    the error e of least 1-norm with ``U2' e = U2' z``, found among all sets of n - 3
+    channels.
 
-    ``scores``: J(k), or ``|e_k|``. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
-    Threshold: the level that the largest of these over all channels exceeds with the false-alarm probability asked for;
-    an upper bound for `l1`, or unequal noise. docs/methods.md has when to take it.
+    ``scores`` are J(k) or ``|e_k|``. The statistic is ``|kappa_k|`` of the named channel
+    over its standard deviation. The largest of these over all channels exceeds the threshold
+    with the required false-alarm probability. For `l1` or unequal noise the threshold is an
+    upper bound. docs/methods.md states when to use this method.
 
     Parameters
     ----------
     geometry, noise
         As of every `Detector`.
     construction
-        ``svd`` or ``qr``: equal to rounding, QR is cheaper to build.
+        ``svd`` or ``qr``: equal except for rounding. QR is cheaper to build.
     norm
         ``l2`` or ``l1``.
     rate
-        `false_alarm_probability` per sample, by default 1e-6; or `false_alarms_per_hour` with `sample_rate`, Hz.
+        `false_alarm_probability` per sample, by default 1e-6, or `false_alarms_per_hour`
+        with `sample_rate`, Hz.
     """
 
     name = "projector"
@@ -158,9 +162,9 @@ class Projector(SingleFaultDetector):
 
 
 def parity_basis(axes: Array, construction: str) -> Array:
-    """U2 (n, n - 3): orthonormal columns with ``U2' axes = 0``, from the SVD or the QR decomposition of axes (n, 3).
+    """Return U2 (n, n - 3): orthonormal columns with ``U2' axes = 0``, for axes (n, 3).
 
-    `ConfigError` if there is no such construction.
+    Raise `ConfigError` for an unknown construction.
     """
     if chosen("construction", construction, CONSTRUCTIONS) == "svd":
         return np.linalg.svd(axes)[0][:, 3:]
@@ -168,16 +172,17 @@ def parity_basis(axes: Array, construction: str) -> Array:
 
 
 def _single_errors(basis: Array, seen: NDArray[np.bool_]) -> Array:
-    """Matrix (n, n) that maps z to kappa_k; zero where no fault is seen."""
+    """Return the matrix (n, n) that maps z to kappa_k, zero for undetectable channels."""
     projector = basis @ basis.T
     power = np.where(seen, np.sum(projector**2, axis=0), 1.0)
     return np.where(seen[:, None], projector.T @ projector / power[:, None], 0.0)
 
 
 def _unexplained(basis: Array, seen: NDArray[np.bool_]) -> Array:
-    """Forms (n - 4, n, n) whose squares, summed over the first axis, are J(k); one of zeros for n = 4.
+    """Return forms (n - 4, n, n) whose squares, summed over the first axis, are J(k).
 
-    ``J(k) = y' U2 (I - u u' / u'u) U2' y`` with u row k of U2: the square of what U2' y has across u.
+    ``J(k) = y' U2 (I - u u' / u'u) U2' y`` with u row k of U2: the square of the part of
+    U2' y normal to u. For n = 4 a single form is zero.
     """
     n, m = basis.shape
     forms = np.zeros((max(m - 1, 1), n, n))
@@ -190,9 +195,9 @@ def _unexplained(basis: Array, seen: NDArray[np.bool_]) -> Array:
 def _basic_solutions(
     basis: Array, seen: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], Array]:
-    """Every set of n - 3 channels (b, n - 3) that spans parity space, and the forms (b, n - 3, n) of their errors.
+    """Return all sets of n - 3 channels that span parity space, and forms of their errors.
 
-    Channels whose faults are not seen are in no set.
+    The shapes are (b, n - 3) and (b, n - 3, n). Undetectable channels are in no set.
     """
     n, m = basis.shape
     sets = np.array(list(combinations(np.flatnonzero(seen), m)))
@@ -204,18 +209,23 @@ def _basic_solutions(
     return sets[spans], solutions
 
 
-# Recursion over cyclic permutations: section 3 ------------------------------------------------------------------------
+# Recursion over cyclic permutations: section 3
 
 Index = NDArray[np.intp]
 
-NOTHING = 1e-20  # k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero.
+#: k_s of an innovation of 1e-10 standard deviations, which is rounding. Added to divisors,
+#: so that 0 / 0 is zero.
+NOTHING = 1e-20
 
 
 @callback(WithForms, NoState, SampleInput, SampleVerdict)
 def judge_innovations(
     params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Judge one sample by the largest k_s of all equations and permutations; form [k, i] as `innovations` has it."""
+    """Judge one sample by the largest k_s of all equations and permutations.
+
+    Forms [k, i] are those of `innovations`.
+    """
     n, largest = params.sensors.n, 0.0
     fill_variances(params, sample, verdict)
     for i in range(n):
@@ -232,18 +242,20 @@ def judge_innovations(
 
 
 class Recursive(SingleFaultDetector):
-    """The channel whose equation, taken last, breaks a recursion that went well until then.
+    """The channel whose equation, taken last, contradicts the recursion before.
 
-    The equations ``z_i = a_i x`` are solved one by one (section 3): ``x+ = x + P a' Y (z - a x)``, ``Y = (sigma^2 + a P
-    a')^-1``, ``P+ = P - P a' Y a P``, for all n cyclic permutations. Those that find the rate have no innovation; each
-    other gives ``k_s = nu^2 Y``, chi-square with one degree of freedom while the model holds. The ratio of the last two
-    k_s of a permutation is largest when the failed channel comes last. Innovations are fixed linear forms of z,
-    precomputed with the resting noise of each channel.
+    The equations ``z_i = a_i x`` are solved one by one (section 3): ``x+ = x + P a' Y (z - a
+    x)``, ``Y = (sigma^2 + a P a')^-1``, ``P+ = P - P a' Y a P``, for all n cyclic
+    permutations. The equations that determine the rate have no innovation. Each other one
+    gives ``k_s = nu^2 Y``, chi-square with one degree of freedom for healthy channels. The
+    ratio of the last two k_s of a permutation is largest when the failed channel comes last.
+    Innovations are fixed linear forms of z, calculated with the resting noise.
 
-    ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last; NaN with 4
-    channels. Statistic: the largest k_s of all equations and permutations. Threshold k_s,max: the level that it exceeds
-    with the false-alarm probability asked for, exact for constant noise. Where the noise depends on rate or
-    acceleration, nu^2 is divided by its variance in that sample. docs/methods.md has when to take it.
+    ``scores`` are the last ratios ``k_s,n / k_s,n-1`` of the permutation that ends with the
+    channel, or NaN with 4 channels. The statistic is the largest k_s of all equations and
+    permutations. It exceeds the threshold k_s,max with the required false-alarm probability,
+    which is exact for constant noise. If the noise depends on rate or acceleration, nu^2 is
+    divided by its variance in that sample. docs/methods.md states when to use this method.
 
     Parameters
     ----------
@@ -272,9 +284,9 @@ class Recursive(SingleFaultDetector):
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:
-    """Innovations over their standard deviation as linear forms of z, (n - 3, n, n); axes (n, 3), noise_std (n,).
+    """Return innovations over their standard deviation as linear forms of z, (n - 3, n, n).
 
-    ``[k, i]`` is the k-th innovation of the permutation that puts channel i last.
+    ``[k, i]`` is the k-th innovation of the permutation that ends with channel i.
     """
     n = len(axes)
     forms = np.zeros((n - 3, n, n))
@@ -288,7 +300,7 @@ def innovations(axes: Array, noise_std: Array) -> Array:
 
 
 def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array | None:
-    """Innovation form (n,) of one equation after those before it, None where they do not predict it."""
+    """Return the innovation form (n,) of an equation, or None if it is not predicted."""
     weighted = axes[before] / noise_std[before][:, None]
     axis = axes[new] / noise_std[new]
     gain = axis @ np.linalg.pinv(weighted, rcond=ROUNDING)
@@ -300,31 +312,28 @@ def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array
     return form / np.sqrt(1 + gain @ gain)
 
 
-# Determinants of five channels: section 4 -----------------------------------------------------------------------------
+# Determinants of five channels: section 4
 
 Four = tuple[float, float, float, float]
 
 CHANNELS = 5
 CRITERIA = ("determinant", "condition_number")
 NO_POWER = 1e-200
-"""Added to every term, so that a sample of zeros divides nothing by zero; a condition number above its inverse is
-infinite."""
+"""Added to every term, so that a sample of zeros causes no division by zero. A condition
+number above its inverse is infinite."""
 
 
 @record
 class Struck(WithForms):
-    """Constants of the comparison: [j] is [H z] without row j, its determinant the one form of score j."""
+    """Constants for [H z] without row j. Its determinant is the single form of score j."""
 
-    determinants_resting: Annotated[
-        NDArray[np.float64], "f8", (CHANNELS,)
-    ]  # their standard deviations at rest, rad/s
+    # standard deviations of the determinants at rest, rad/s
+    determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]
     by_condition: Flag  # the criterion is the condition number
-    complement: Annotated[
-        NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)
-    ]  # U' of H, as forms of z
-    singular: Annotated[
-        NDArray[np.float64], "f8", (CHANNELS, 3)
-    ]  # singular values of H
+    # U' of H without row j, as forms of z
+    complement: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]
+    # singular values of H without row j
+    singular: Annotated[NDArray[np.float64], "f8", (CHANNELS, 3)]
 
 
 @callback(Struck, NoState, SampleInput, SampleVerdict)
@@ -336,7 +345,7 @@ def judge_determinants(
     fill_variances(params, sample, verdict)
     for j in range(CHANNELS):
         size = abs(value_of(params.forms[0, j], sample.z, CHANNELS))
-        # A determinant that is always zero has no deviation.
+        # A determinant that is always zero has no standard deviation.
         if size > 0:
             std = std_of(
                 params, params.forms[0, j], params.determinants_resting[j], verdict
@@ -350,13 +359,14 @@ def judge_determinants(
 
 @compiled
 def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
-    """2-norm condition number of [H z] without row j; infinite where that is singular.
+    """Return the 2-norm condition number of [H z] without row j, or infinity.
 
-    With ``U diag(s) Q'`` the singular value decomposition of the axes without row j, ``u = U' z`` and delta the last
-    of its four entries (U's last column is normal to the axes), the largest singular value squared is the largest root
-    of ``sum_k u_k^2 / (x - s_k^2) = 1``, s_4 = 0. The inverse of the smallest, squared and times delta^2, is that of
-    ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither divides by delta, which is zero for a failed
-    row without noise.
+    The axes without row j have the singular value decomposition ``U diag(s) Q'``. ``u = U'
+    z``, and delta is the last of its four entries, since the last column of U is normal to
+    the axes. The square of the largest singular value is the largest root of ``sum_k u_k^2 /
+    (x - s_k^2) = 1``, s_4 = 0. The inverse square of the smallest one, times delta^2, is the
+    largest root of ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither
+    equation divides by delta, which is zero for a failed row without noise.
     """
     u, z = params.complement[j], sample.z
     s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
@@ -378,14 +388,15 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
 
 @compiled
 def largest_root(powers: Four, poles: Four) -> float:
-    """Largest root x of ``sum_k powers_k / (x - poles_k) = 1``, or the largest pole.
+    """Return the largest root x of ``sum_k powers_k / (x - poles_k) = 1``, or the largest pole.
 
-    Newton's method on one over the sum, which is concave in x: it climbs from the left and never oversteps.
+    Newton's method is applied to the inverse of the sum. This is concave in x, so the
+    iteration increases from the left and never exceeds the root.
     """
     x = 0.0
     for k in range(4):
         x = max(x, poles[k] + (powers[k] + NO_POWER))
-    # Off the pole by rounding; then five steps are usual.
+    # Just beyond the pole. Then about five steps suffice.
     x *= 1 + 1e-15
     for _ in range(40):
         value, slope = 0.0, 0.0
@@ -402,16 +413,18 @@ def largest_root(powers: Four, poles: Four) -> float:
 
 
 class Determinant(SingleFaultDetector):
-    """Five channels: the one without which axes and sample are consistent.
+    """The one of five channels without which axes and sample are consistent.
 
-    Form ``[H z]`` (5, 4) and strike row j (section 4): ``d_j = |det|``, linear in z with the cofactors of H. Without
-    noise d_j is zero for the failed channel and only there; with noise the failed channel is the argmin. With
-    ``criterion="condition_number"`` it has the largest condition number (2-norm) of the four by four matrix: H is fixed
-    and only its last column changes, so the extreme singular values are roots of a secular equation of rank one, found
-    by Newton's method. docs/methods.md has when to take it.
+    ``d_j`` is the absolute determinant of ``[H z]`` (5, 4) without row j (section 4), linear
+    in z with the cofactors of H. Without noise only the failed channel has d_j = 0. With
+    noise the failed channel has the least d_j. With ``criterion="condition_number"`` it has
+    the largest 2-norm condition number of the four by four matrix. Only the last column of
+    this matrix changes, so the extreme singular values are roots of a secular equation of
+    rank one, found by Newton's method. docs/methods.md states when to use this method.
 
-    ``scores``: d_j, rad/s, or the condition numbers. Statistic, for both: the largest d_j over its standard deviation.
-    Threshold: the level that it exceeds with the false-alarm probability asked for; exact for constant noise.
+    ``scores`` are d_j, rad/s, or the condition numbers. The statistic of both criteria is the
+    largest d_j over its standard deviation. It exceeds the threshold with the required
+    false-alarm probability, which is exact for constant noise.
 
     Parameters
     ----------
@@ -454,13 +467,13 @@ class Determinant(SingleFaultDetector):
 
     @classmethod
     def refuses(cls, n: int) -> str:
-        """Why the method cannot run on n channels."""
+        """Return why the method cannot run on n channels, or ""."""
         words = f"determinant has {n} channels, expected {CHANNELS}: struck of one row, only [H z] of five is square"
         return "" if n == CHANNELS else words
 
 
 def determinant_forms(axes: Array) -> Array:
-    """Forms (5, 5) of z: row j gives det of [axes z] without row j."""
+    """Return forms (5, 5) of z. Row j gives the determinant of [axes z] without row j."""
     forms = np.zeros((CHANNELS, CHANNELS))
     for j in range(CHANNELS):
         others = np.delete(np.arange(CHANNELS), j)

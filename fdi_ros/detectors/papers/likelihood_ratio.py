@@ -1,13 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Generalised likelihood ratio for one faulty channel, then for two; and which channels explain a sample with a fault.
+"""Generalised likelihood ratio for one and for two faulty channels.
 
-A hypothesis "these channels L are arbitrary, all others healthy" leaves L out. With S the residual matrix of all
-channels and ``r = S z``, that changes r to ``r - S[:, L] S_LL^-1 r_L``, and ``S_LL^-1 r_L`` are the errors: no
-hypothesis needs a matrix of its own. With noise that depends on the rate the variances under a hypothesis are those at
-the least-squares rate of the channels *kept*, and the weighted solution is a correction to it. So no weight depends on
-the channels left out: a larger fault of channel i is never less visible in the statistic of {i}.
+A hypothesis "channels L have arbitrary errors, all others are healthy" leaves L out. With
+the residual matrix S of all channels and ``r = S z``, the residuals become ``r - S[:, L]
+S_LL^-1 r_L``, and the errors are ``S_LL^-1 r_L``. Thus no hypothesis needs its own matrix.
+If the noise depends on the rate, the variances under a hypothesis are those at the
+least-squares rate of the remaining channels, and the weighted solution is a correction to
+that rate. Thus no weight depends on the channels left out, and a larger fault of channel i
+is never less visible in the statistic of {i}.
 """
 
 from __future__ import annotations
@@ -45,49 +47,63 @@ from fdi_ros.model.noise import (
 from fdi_ros.model.samples import Array
 
 MAX_RATIO = 1e6
-"""Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,
-and weights further apart would leave no correct digit in the normal equations."""
-SAME_FIT = 1e-6  # chi-squares this close are equal but for rounding
+"""Largest ratio of variances in a sample. Under a wrong hypothesis a huge fault appears as
+rate, and a larger ratio of weights would leave no correct digit in the normal equations."""
+SAME_FIT = 1e-6  #: Chi-squares that differ by less are equal except for rounding.
 
 
 @record
 class Hypotheses:
-    """What the hypotheses on one set of channels need; see `explain` for the limits."""
+    """Constants of the hypotheses on one set of channels. `explain` uses the limits."""
 
     fixed: Flag  # the weights are those of noise_std in every sample
-    residual: Square  # S; fixed: of values divided by noise_std
+    residual: Square  # S, or if fixed, S of values divided by noise_std
     single_limit: Real
     pair_limit: Real
     unit_limit: Real
     rival_margin: Real
     can_isolate: Flag
     pairs: Flag  # pairs are tried
-    units: Whole  # whole units that are tried
-    unit: Annotated[NDArray[np.int64], "i8", (4, 3)]  # their channels
+    units: Whole  # number of whole units that are tried
+    unit: Annotated[NDArray[np.int64], "i8", (4, 3)]  # channels of these units
 
 
 @record
 class Scratch:
-    """Room for what is worked out on one sample; nothing in it lasts."""
+    """Working memory for one sample."""
 
     residual: Channels  # S z
     quiet: Channels  # variance without the part of the rate, (rad/s)^2
     kept: Channels  # residuals under a hypothesis
-    variance: Channels
-    inverse: Symmetric  # covariance of the rate under a hypothesis
+    variance: Channels  # under a hypothesis, (rad/s)^2
+    inverse: Symmetric  # covariance of the rate under a hypothesis, (rad/s)^2
     correction: Vector  # of the rate, rad/s
     estimate: Vector  # errors of the channels left out, rad/s
     remaining: Channels  # chi-square of each single-channel hypothesis
-    misfit: Channels  # chi-square of the best pair of each channel; of a unit, its three errors, rad/s
+    # chi-square of the best pair of each channel, or the three errors of a unit, rad/s
+    misfit: Channels
 
 
 def prepare_hypotheses(
     params: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool
 ) -> None:
-    """Fill a record of `Hypotheses`, noise with one value per channel.
+    """Fill a record of `Hypotheses` from noise with one value per channel.
 
-    ``confidence``: with which rivals are rejected, above 0.5 and below 1 (else `ConfigError`). ``fixed``: the weights
-    are those of noise_std in every sample.
+    Parameters
+    ----------
+    params
+        The record.
+    geometry, noise
+        Sensitivity axes, and errors of healthy channels.
+    confidence
+        Confidence with which rivals are rejected, above 0.5 and below 1.
+    fixed
+        The weights are those of noise_std in every sample.
+
+    Raises
+    ------
+    ConfigError
+        If the confidence is out of range.
     """
     if not 0.5 < confidence < 1:
         raise ConfigError(
@@ -102,7 +118,7 @@ def prepare_hypotheses(
     params["pair_limit"] = chi2_isf(rest, m - 2) if m > 2 else math.inf
     params["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
     params["rival_margin"] = 2 * math.log(confidence / rest)
-    # With five channels a pair explains anything.
+    # A pair of five channels explains every sample.
     params["can_isolate"], params["pairs"] = m > 1, n > 5
     units = [unit for unit in geometry.units if _may_be_one_fault(geometry, unit)]
     params["units"] = len(units)
@@ -110,7 +126,7 @@ def prepare_hypotheses(
 
 
 def whitened_residuals(geometry: Geometry, noise: NoiseModel) -> Array:
-    """Matrix (n, n) from values over noise_std to residuals over noise_std, weights 1 / noise_std^2."""
+    """Return the matrix (n, n) from values to residuals, both over noise_std."""
     white = geometry.axes / noise.noise_std[:, None]
     return np.eye(geometry.n) - white @ np.linalg.pinv(white)
 
@@ -123,7 +139,7 @@ def whitened_directions(geometry: Geometry, noise: NoiseModel) -> Array:
 
 
 def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
-    """Whether a common fault of three channels, one chip or one cable, leaves at least one check."""
+    """Return whether a check remains after a common fault of three channels of a unit."""
     rest = np.delete(geometry.axes, unit, axis=0)
     return (
         len(unit) == 3
@@ -137,7 +153,7 @@ def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
 def fill_scratch(
     params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch
 ) -> None:
-    """Work out what all hypotheses on one sample share."""
+    """Calculate the quantities that all hypotheses on one sample share."""
     n = sensors.n
     for i in range(n):
         total = 0.0
@@ -155,7 +171,10 @@ def fill_scratch(
 def leave_out(
     params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int
 ) -> None:
-    """Residuals without channels a, b, c (b and c may be -1: none) in `kept`, and in their own places their errors."""
+    """Write the residuals without channels a, b and c to `kept`, and the errors of these.
+
+    b and c may be -1: none. Errors are in the places of their channels.
+    """
     S, r = params.residual, room.residual
     e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
     if c >= 0:
@@ -188,10 +207,11 @@ def leave_out(
 def correct_rate(
     sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int
 ) -> float:
-    """Correct the rate of the channels kept by their weights in this sample; return the chi-square they leave.
+    """Correct the rate of the remaining channels by their weights in this sample.
 
-    `kept` holds residuals about the plain least-squares rate: of the size of the noise, so that the weighted solution
-    is a small correction and no digits are lost to a large rate.
+    `kept` contains residuals of the plain least-squares rate, which have the size of the
+    noise. Thus the weighted solution is a small correction, and a large rate costs no
+    digits. Return the remaining chi-square.
     """
     n, kept = sensors.n, room.kept
     smallest = math.inf
@@ -239,7 +259,10 @@ def fit(
     b: int,
     c: int,
 ) -> float:
-    """Fit the hypothesis that channels a, b, c are faulty: chi-square of the others; errors in `estimate`, rad/s."""
+    """Return the chi-square of the others if channels a, b, c are faulty.
+
+    Their errors, rad/s, are written to `estimate`.
+    """
     leave_out(params, sensors.n, room, a, b, c)
     residual = 0.0
     if params.fixed:
@@ -263,7 +286,7 @@ def fit(
 def whitened(
     params: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int
 ) -> float:
-    """Error of channel i over its standard deviation; 0 if no fault of it is seen."""
+    """Return the error of channel i over its standard deviation, 0 if not detectable."""
     if not sensors.detectable[i]:
         return 0.0
     if params.fixed:
@@ -286,9 +309,10 @@ def explain(
     room: Scratch,
     verdict: SampleVerdict,
 ) -> None:
-    """Name the channels that explain a sample taken by `fill_scratch`: suspects, whether isolated, their errors.
+    """Write the suspects that explain a sample, their errors, and whether they are isolated.
 
-    A single channel and its rivals, else pairs, else a whole unit, else all: docs/methods.md#likelihood_ratio.
+    These are a single channel and its rivals, or else pairs, or else a whole unit, or else
+    all channels (docs/methods.md#likelihood_ratio). `fill_scratch` must have been called.
     """
     n, best = sensors.n, math.inf
     for i in range(n):
@@ -325,7 +349,7 @@ def explain_by_pairs(
     room: Scratch,
     verdict: SampleVerdict,
 ) -> bool:
-    """Name the channels of all pairs that explain the sample; False, and nothing is named, if none does."""
+    """Name the channels of all pairs that explain the sample. Return False if none does."""
     if not params.pairs:
         return False
     n, possible = sensors.n, 0
@@ -334,7 +358,7 @@ def explain_by_pairs(
         room.misfit[i] = math.inf
     for i in range(n):
         for j in range(i + 1, n):
-            # Two that cannot be told apart explain no more together than one of them.
+            # Two indistinguishable channels explain no more than one of them.
             if (
                 sensors.detectable[i]
                 and sensors.detectable[j]
@@ -355,9 +379,9 @@ def explain_by_pairs(
 def add_suspect(
     room: Scratch, verdict: SampleVerdict, i: int, residual: float, estimate: float
 ) -> None:
-    """Make a channel of a pair that explains the sample a suspect; its error is that of the best pair it is in.
+    """Add a channel of a pair that explains the sample, with its error in its best pair.
 
-    Of pairs that explain the sample equally well, as all pairs of three parallel axes do, the largest error counts.
+    Among equally good pairs, such as those of three parallel axes, the largest error counts.
     """
     verdict.suspects[i] = True
     as_good = residual <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(
@@ -376,7 +400,7 @@ def explain_by_units(
     room: Scratch,
     verdict: SampleVerdict,
 ) -> bool:
-    """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
+    """Name the unit that explains the sample. Return False unless exactly one does."""
     found, possible = -1, 0
     for k in range(params.units):
         unit = params.unit[k]
@@ -400,12 +424,12 @@ def explain_by_units(
 
 @compiled
 def add_alike(sensors: Sensors, suspects: NDArray[np.uint8]) -> int:
-    """Add to the suspects all channels that cannot be told apart from one of them; return how many there are."""
+    """Add all channels indistinguishable from a suspect. Return the number of suspects."""
     count = 0
     for i in range(sensors.n):
         if sensors.detectable[i] and not suspects[i]:
             for j in range(sensors.n):
-                # Alike is transitive: one that was just added stands for its whole group.
+                # Alike is transitive, so an added channel represents its whole group.
                 if suspects[j] and sensors.alike[i, j]:
                     suspects[i] = True
         if suspects[i]:
@@ -413,12 +437,12 @@ def add_alike(sensors: Sensors, suspects: NDArray[np.uint8]) -> int:
     return count
 
 
-# The method ----------------------------------------------------------------------------------------------------------
+# The method
 
 
 @record
 class Constants:
-    """What `judge` needs."""
+    """Constants of `judge`."""
 
     sensors: Sensors
     hypotheses: Hypotheses
@@ -429,7 +453,7 @@ class Constants:
 def judge(
     params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Largest whitened residual of all channels; on alarm, the channels that explain it."""
+    """Judge one sample by the largest whitened residual."""
     sensors, largest = params.sensors, 0.0
     fill_scratch(params.hypotheses, sensors, sample, room)
     for i in range(sensors.n):
@@ -446,23 +470,24 @@ def judge(
 
 
 class LikelihoodRatio(Detector):
-    r"""Largest whitened residual, with an exact false-alarm probability, and the channels that explain it.
+    r"""Largest whitened residual, with an exact false-alarm probability.
 
-    Under "channel i is off by an unknown amount" the logarithm of the likelihood rises by ``w_i^2 / 2``, with ``w_i =
-    (z_i - h_i omega_i) / std``: omega_i the weighted least-squares rate of the other channels, std the standard
-    deviation of the difference. With constant noise of equal size ``w_i = r_i / (sigma sqrt(S_ii))``. The statistic is
-    ``max_i |w_i|``; its threshold is exact for correlated w_i (`max_normal_threshold`), at the weights of noise_std
-    alone. On alarm `explain` says which channels may be faulty: one, its rivals, or pairs. docs/methods.md has the
-    rest, and when to take it.
+    If channel i has an unknown error, the logarithm of the likelihood rises by ``w_i^2 /
+    2``, ``w_i = (z_i - h_i omega_i) / std``. Here omega_i is the weighted least-squares rate
+    of the other channels, and std the standard deviation of the difference. With constant
+    noise of equal size ``w_i = r_i / (sigma sqrt(S_ii))``. The statistic is ``max_i |w_i|``.
+    The threshold is exact for correlated w_i (`max_normal_threshold`) with the weights of
+    noise_std. On alarm `explain` finds the suspects: one channel, its rivals, or pairs.
+    docs/methods.md contains details and applications.
 
     Parameters
     ----------
     geometry, noise
         As of every `Detector`.
     false_alarm_probability, false_alarms_per_hour, sample_rate
-        Per sample, 0 to 1, or per hour at a sample rate in Hz; default 1e-6 per sample.
+        Per sample, 0 to 1, or per hour at a sample rate in Hz. Default 1e-6 per sample.
     confidence
-        With which rivals are rejected, above 0.5 and below 1.
+        Confidence with which rivals are rejected, above 0.5 and below 1.
 
     Notes
     -----

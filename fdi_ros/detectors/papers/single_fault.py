@@ -1,12 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all methods share that name the one channel whose fault explains a sample best.
+"""Common parts of methods that name the one channel whose fault explains a sample best.
 
-They rest on linear forms of a sample in which the body rate cancels: predictions, innovations, determinants. ``f = F @
-z`` with ``F @ H = 0``: only the channels' errors reach f, so its standard deviation follows from the noise model alone.
-A judge of such a method fills the scores, has `worst` name a channel, compares one figure with one threshold, and
-leaves the rest to `conclude`.
+These methods use linear forms of a sample in which the body rate cancels: predictions,
+innovations, determinants. For ``f = F @ z`` with ``F @ H = 0`` only the errors of channels
+reach f, so the standard deviation follows from the noise model alone. The judge of such a
+method writes the scores, names a channel by `worst`, compares one figure with one threshold,
+and calls `conclude`.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ from fdi_ros.model.samples import Array, Mask
 
 
 def prediction_errors(axes: Array) -> Array:
-    """Matrix (n, n) that maps z to ``z_i - z_ip``, each channel against its prediction from all the others.
+    """Return the matrix (n, n) that maps z to prediction errors ``z_i - z_ip``.
 
-    ``z_i - z_ip = r_i / S_ii`` on any axes (n, 3). Rows of channels no fault of which is seen are zero.
+    Each channel is predicted by all others: ``z_i - z_ip = r_i / S_ii`` for any axes (n, 3).
+    Rows of undetectable channels are zero.
     """
     residuals = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
     share = np.diag(residuals)[:, None]
@@ -57,9 +59,9 @@ def resting_std(forms: Array, noise: NoiseModel) -> Array:
 def largest_form_threshold(
     forms: Array, geometry: Geometry, noise: NoiseModel, probability: float
 ) -> float:
-    """Level that the largest |f| / std of forms (k, n) exceeds with a probability when every channel is healthy.
+    """Return the level that the largest |f| / std of forms (k, n) exceeds with a probability.
 
-    A row of zeros is a form that is always zero.
+    All channels are healthy. Rows of zeros are ignored.
     """
     gain = forms[np.abs(forms).max(axis=1) > 0] @ geometry.parity.T
     covariance = (geometry.parity * noise.noise_std**2) @ geometry.parity.T
@@ -71,7 +73,7 @@ def largest_form_threshold(
 
 @compiled
 def value_of(form: Array, z: Array, n: int) -> float:
-    """Value of one form for the first n of z."""
+    """Return the value of a form for the first n elements of z."""
     total = 0.0
     for j in range(n):
         total += form[j] * z[j]
@@ -79,28 +81,27 @@ def value_of(form: Array, z: Array, n: int) -> float:
 
 
 TRIALS, TRIAL_FAULT, TRIAL_NOISE = 200, 50.0, 1.5
-"""Trials per channel, size of the faults tried and noise in them, in noise_std: the fault is by far the larger part;
-more noise than assumed finds rivals rather than misses them."""
+"""Trials per channel, and size of faults and noise in the trials, in noise_std. The fault is
+by far the larger part. More noise than assumed finds too many rivals rather than too few."""
 
 
 @record
 class SingleFault:
-    """What follows from the channel named, whatever the method that names it; methods add to it."""
+    """Consequences of naming a channel, common to all these methods."""
 
     sensors: Sensors
-    errors: Square  # row i: z_i - z_ip, channel i against its prediction from all others, as a form of z
+    errors: Square  # row i: prediction error z_i - z_ip as a form of z
     resting: Channels  # standard deviation of z_i - z_ip at rest, rad/s
     limit: Real  # threshold of the method's figure
-    suspects: Annotated[
-        NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)
-    ]  # row i: suspects when i is named
-    names: Flags  # the fault is isolated when i is named
-    sign: Real  # +1: the worst channel has the largest score; -1: the least
-    scored: Flag  # the scores tell channels apart; if not, none are published
+    # row i: suspects if channel i is named
+    suspects: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]
+    names: Flags  # the fault is isolated if channel i is named
+    sign: Real  # +1 if the worst channel has the largest score, -1 if the least
+    scored: Flag  # the scores distinguish channels, and are published
 
 
 def chosen(name: str, value: str, words: tuple[str, ...]) -> str:
-    """Return the value of an option; `ConfigError` if it is none of the words that it may be."""
+    """Return the value of an option, or raise `ConfigError` for an unknown word."""
     if value not in words:
         raise ConfigError(f"{name} is {value!r}, expected one of: {', '.join(words)}")
     return value
@@ -109,18 +110,29 @@ def chosen(name: str, value: str, words: tuple[str, ...]) -> str:
 class SingleFaultDetector(Detector):
     """Base of methods that name one channel and compare one figure with one threshold.
 
-    The channel named stands for all that have its parity direction: they are the suspects together, and the fault
-    is isolated only where there is no other. A method that may name one channel for a large fault of another, as
-    some do on lopsided axes, tries that in advance (`_try_faults`): all whose fault may have had it named are suspects.
-    The error of a suspect is its difference from the prediction of all other channels, ``z_i - z_ip = r_i / S_ii``:
-    the least-squares estimate were it alone at fault.
+    All channels with the parity direction of the named one are suspects. The fault is
+    isolated only if no other channel has this direction. With unfavourable axes a method may
+    name one channel for a large fault of another. This is tried in advance (`_try_faults`):
+    all channels whose fault may lead to this name are suspects. The error of a suspect is
+    the prediction error ``z_i - z_ip = r_i / S_ii``, the least-squares estimate of a single
+    fault.
 
-    Statistic and threshold, unless a method has its own: ``|z_i - z_ip|`` of the channel named over its standard
-    deviation, against the level that the largest of these over all channels exceeds with the false-alarm probability.
+    Unless a method has its own, the statistic is ``|z_i - z_ip|`` of the named channel over
+    its standard deviation. The largest of these over all channels exceeds the threshold with
+    the false-alarm probability.
 
-    ``options``: of the method, to which those of the false-alarm rate are added. ``largest``: the worst channel has the
-    largest score, not the least. ``scored``: as in `SingleFault`. ``errors``: matrix (n, n) that maps z to ``z_i -
-    z_ip``; None: from the axes.
+    Parameters
+    ----------
+    geometry, noise
+        As of every `Detector`.
+    options
+        Options of the method. Those of the false-alarm rate are added.
+    largest
+        The worst channel has the largest score, not the least.
+    scored
+        As in `SingleFault`.
+    errors
+        Matrix (n, n) that maps z to ``z_i - z_ip``. None: from the axes.
     """
 
     def __init__(
@@ -159,26 +171,26 @@ class SingleFaultDetector(Detector):
 
     @property
     def isolable(self) -> Mask:
-        """Channels whose fault is named, and no other's fault in its place, (n,)."""
+        """Channels that are named for their own fault and for no other, (n,)."""
         return self._names & ~(
             self._suspects & ~np.eye(self.geometry.n, dtype=bool)
         ).any(axis=0)
 
     def _set_suspects(self, suspects: Mask, names: Mask) -> None:
-        """Set the suspects when channel i is named, row i of (n, n), and whether that isolates the fault, (n,)."""
+        """Set for each named channel the suspects (n, n) and whether these isolate (n,)."""
         n = self.geometry.n
         self._suspects, self._names = suspects, names
         params = self.constants[0]
         params["suspects"][:n, :n], params["names"][:n] = suspects, names
-        # Constants that are already in use are copied anew.
+        # Rows that were prepared from the constants before are outdated.
         vars(self).pop("_rows", None)
 
     def _try_faults(self) -> None:
-        """Find out which channels are named for a fault of `TRIAL_FAULT`: row i of the suspects, if i is named.
+        """Find by trial which channels are named for a fault of `TRIAL_FAULT`.
 
-        The same trials each time, in somewhat more than the noise assumed, drawn channel by channel: where a rival is
-        named in few of them, their order decides. Larger faults are named no worse: the scores are even homogeneous
-        functions of z, of which the fault then is the larger part.
+        The trials are always the same, with somewhat more noise than assumed. Larger faults
+        are not named worse: the scores are even homogeneous functions of z, and the fault
+        is then an even larger part of z.
         """
         n = self.geometry.n
         noise = (
@@ -197,7 +209,7 @@ class SingleFaultDetector(Detector):
 
 @compiled
 def worst(params: SingleFault, verdict: SampleVerdict) -> int:
-    """Return the channel of the worst score among those whose faults are seen."""
+    """Return the detectable channel with the worst score."""
     named, most = -1, -math.inf
     for i in range(params.sensors.n):
         badness = params.sign * verdict.scores[i]
@@ -208,7 +220,7 @@ def worst(params: SingleFault, verdict: SampleVerdict) -> int:
 
 @compiled
 def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
-    """Error of channel i were it alone at fault, rad/s: ``z_i - z_ip``."""
+    """Return the error of channel i for a single fault, rad/s: ``z_i - z_ip``."""
     return value_of(params.errors[i], sample.z, params.sensors.n)
 
 
@@ -216,9 +228,10 @@ def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
 def fill_variances(
     params: SingleFault, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Error variance of each channel at the least-squares rate of the sample, (rad/s)^2, where that depends on it.
+    """Write the error variance of each channel, (rad/s)^2, if it depends on the rate.
 
-    It is in the place of the errors, which is free until the verdict is concluded.
+    The variance is at the least-squares rate of the sample, and is stored in the place of
+    the errors, which is free until the verdict is concluded.
     """
     for i in range(0 if params.sensors.constant else params.sensors.n):
         rate_along = sample.z[i] - error_of(params, i, sample) * params.sensors.share[i]
@@ -231,7 +244,10 @@ def fill_variances(
 def std_of(
     params: SingleFault, form: Array, resting: float, verdict: SampleVerdict
 ) -> float:
-    """Return the standard deviation of one form in the sample, after `fill_variances`, from that at rest."""
+    """Return the standard deviation of a form in the sample, after `fill_variances`.
+
+    ``resting`` is the standard deviation at rest.
+    """
     if params.sensors.constant:
         return resting
     total = 0.0
@@ -244,7 +260,7 @@ def std_of(
 def conclude_by_error(
     params: SingleFault, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Fill the verdict, whose scores are there, by ``|z_i - z_ip|`` of the worst over its standard deviation."""
+    """Complete a verdict with scores by ``|z_i - z_ip|`` of the worst channel over its std."""
     named = worst(params, verdict)
     fill_variances(params, sample, verdict)
     std = std_of(params, params.errors[named], params.resting[named], verdict)
@@ -267,7 +283,7 @@ def conclude(
     sample: SampleInput,
     verdict: SampleVerdict,
 ) -> None:
-    """Fill the verdict, whose scores are there, from the channel named, the statistic and its threshold."""
+    """Complete a verdict with scores from the named channel, statistic and threshold."""
     alarm = statistic >= threshold
     verdict.statistic, verdict.threshold, verdict.alarm = statistic, threshold, alarm
     verdict.isolated = alarm and params.names[named]
@@ -279,23 +295,24 @@ def conclude(
             verdict.scores[i] = math.nan
 
 
-# Scores that are sums of forms ----------------------------------------------------------------------------------------
+# Scores that are sums of forms
 
 
 @record
 class WithForms(SingleFault):
-    """For scores that are made of linear forms of z."""
+    """Constants of scores that consist of linear forms of z."""
 
     terms: Whole  # forms per score
     squares: Flag  # sum squares, not absolute values
+    # [t, i]: form t of score i
     forms: Annotated[
         NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)
-    ]  # [t, i]: t of score i
+    ]
     paper: Flag  # the tolerance of a residual search is that of its paper
 
 
 def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
-    """Fill in forms (t, n, n)."""
+    """Write forms (t, n, n) into the constants."""
     terms, n, _ = forms.shape
     params["terms"], params["squares"], params["forms"][:terms, :n, :n] = (
         terms,
@@ -308,7 +325,7 @@ def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
 def judge_sums(
     params: WithForms, state: NoState, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Judge one sample by the error of the channel that the sums of absolute or squared forms name."""
+    """Judge one sample by the error of the channel with the worst sum of forms."""
     for i in range(params.sensors.n):
         for t in range(params.terms):
             value = value_of(params.forms[t, i], sample.z, params.sensors.n)
