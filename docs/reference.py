@@ -46,6 +46,7 @@ WHEN = {
     "noise.noise_std": "Always: measured by `fdi setup`, vibration of your flight included.",
     "noise.scale_std": "From the data sheet, or smaller once calibrated.",
     "noise.timing_std": "Units are not sampled by one clock.",
+    "noise.nonlinearity_std": "The data sheet states more, or `fdi setup` measures more.",
     "noise.bound": "With the detector `guaranteed`: the limit from the data sheet.",
     "noise.bias_walk": "As `fdi calibrate` measures it. Larger: slow drifts are no fault; smaller: they are found.",
     "noise.acceleration_window": "Strong vibration: longer, so that it is not taken for angular acceleration.",

@@ -274,6 +274,13 @@ class NoiseConfig:
     timing_std: tuple[float, ...] = _per_channel(
         (0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0
     )
+    nonlinearity_std: tuple[float, ...] = _per_channel(
+        (0.002,),
+        "standard deviation of the error that is not linear in the rate, share of the rate",
+        "",
+        0.0,
+        1.0,
+    )
     bound: tuple[float, ...] = _per_channel(
         (),
         "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std",

@@ -342,7 +342,10 @@ def isolate(params: Constants, kf: Estimator, case: Case) -> None:
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, kf.samples
     stood = (kf.samples - case.since) * params.period
-    if inference.common and stood >= time_to_settle(params, inference):
+    # One value that is far off decides nothing, whatever the odds.
+    may_be_spike = 0 < kf.far_samples < params.least
+    settled = stood >= time_to_settle(params, inference)
+    if inference.common and settled and not may_be_spike:
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0

@@ -30,10 +30,13 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.algebra import along, dot, dot_in, invert, square
+from fdi_ros.core.algebra import along, dot, dot_in, invert
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.core.records import Matrix, Parity
 from fdi_ros.estimator.error_states import (
+    SIGNALS,
+    SPEED,
+    Layout,
     Projection,
     fill_signals,
     project,
@@ -42,6 +45,7 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
 from fdi_ros.estimator.noise import BLOCK, BURST, MOTION, Noise
 from fdi_ros.model.geometry import ROUNDING
+from fdi_ros.model.samples import Array
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""
@@ -126,6 +130,20 @@ class Inference:
 
 
 @compiled
+def set_mean_speed(
+    layout: Layout, kf: Estimator, before: Total, share: float, signals: Array
+) -> None:
+    """Put a share of the sums of absolute rates since ``before`` into signals (n, `SIGNALS`), rad/s.
+
+    In a turn to and fro the mean rate is zero, and the mean of the absolute rate is not.
+    """
+    for k in range(SIGNALS):
+        if layout.by[k] == SPEED:
+            for i in range(layout.n):
+                signals[i, k] = share * (kf.total.speed[i] - before.speed[i])
+
+
+@compiled
 def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
     """Set the mean of the last ``size`` samples to be explained, and its covariance."""
     n, layout, before = params.sensors.n, params.layout, inference.before
@@ -135,6 +153,8 @@ def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) 
     fill_mean(params, kf, inference, size)
     signals = inference.at.signals
     fill_signals(layout, inference.rate, inference.angular_acceleration, signals)
+    moves = 1.0 if kf.noise.regime == MOTION else 0.0
+    set_mean_speed(layout, kf, before, moves / size, signals)
     subtract_errors(layout, kf.states, signals, inference.y, inference.y)
     project(layout, kf.states, inference.at)
     for i in range(n):
@@ -155,7 +175,9 @@ def fill_mean(
         count = kf.total.count[i] - before.count[i]
         if kf.mask >> i & 1 and count > LEAST_PRESENCE * size:
             inference.mask |= 1 << i
-            inference.y[i] = (kf.total.values[i] - before.values[i]) / count
+            # What may still turn out to be a spike counts as long as it lasts.
+            total = kf.total.values[i] + kf.spike_sum[i]
+            inference.y[i] = (total - before.values[i]) / count
     inference.judged = inference.mask & kf.judged
     # At rest a seeming rate is the fault itself, and no motion.
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
@@ -188,10 +210,11 @@ def add_noise(
     # A turn that ends as it began leaves no trace of a delay in the mean.
     part = min(1.0, 3.0 * params.length / size)
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
-    nonlinear = params.nonlinearity * params.nonlinearity * square(inference.rate)
     for i in range(params.sensors.n):
         noise = noise_of_mean(params, kf.noise, i, size)
-        inference.covariance[i, i] += noise + kf.peak_extra[i] * part + nonlinear
+        speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
+        bent = params.nonlinearity[i] * speed
+        inference.covariance[i, i] += noise + kf.peak_extra[i] * part + bent * bent
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part

@@ -97,9 +97,9 @@ LEAST_TIME = 0.02
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion:
 its slow noise is unknown anew."""
-LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
-"""Scale error, sampling instant of a channel in s, and what is not linear in the rate:
-less is not believed of any, calibrated or not."""
+LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
+"""Scale error, sampling instant in s, and nonlinearity: less is not believed of any
+channel, calibrated or not."""
 FEWEST_BLOCKS = 3  # in a row from which the acceleration in the middle of one is known
 SHORT = (
     1.0 - 1e-9
@@ -482,14 +482,17 @@ class Sequential(Detector):
         params["members"][: len(geometry.units)] = [
             mask_of(channels) for channels in geometry.units
         ]
+        nonlinearity = np.maximum(noise.nonlinearity_std, LEAST_NONLINEARITY)
         prepare_layout(
             params["layout"],
+            geometry.axes,
             unit,
             len(geometry.units),
             {
                 "bias": noise.bias_std,
                 "scale": np.maximum(noise.scale_std, LEAST_SCALE),
                 "delay": delay_std,
+                "asymmetry": nonlinearity,
             },
             {"bias": walk},
         )
@@ -500,10 +503,8 @@ class Sequential(Detector):
             0.5 * self.sample_rate / params["length"], 8.0
         )
         params["expected"][:n] = noise.noise_std**2
-        params["timing"][:n], params["nonlinearity"] = (
-            np.maximum(noise.timing_std, LEAST_TIMING),
-            BENT,
-        )
+        params["timing"][:n] = np.maximum(noise.timing_std, LEAST_TIMING)
+        params["nonlinearity"][:n] = nonlinearity
         params["gain_odds"] = math.log(gain_odds)
         params["rest_std"] = REST_STD
         used = all_sets(n)

@@ -15,6 +15,7 @@ from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
     SIGNALS,
+    SPEED,
     TURN,
     fill_signals,
     keep_least_variance,
@@ -96,16 +97,16 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     # At rest a rate on which no channels agree is a fault, not motion.
     turning = square > TURNING * noise + kf.shaken and kf.noise.regime == MOTION
     kf.turning, kf.turn_noise = turning, noise
-    speed = kf.rates[1, 0] ** 2 + kf.rates[1, 1] ** 2 + kf.rates[1, 2] ** 2
     if kf.noise.regime == REST:
         for i in range(n):
             kf.angular_acceleration[i] = kf.extra[i] = 0.0
         return
     for i in range(n):
-        along = jerk = lately = 0.0
+        along = jerk = lately = speed = 0.0
         for a in range(3):
             h = params.sensors.axes[i, a]
             along += h * kf.acceleration[a]
+            speed += h * kf.rates[1, a]
             after, before = (
                 (kf.rates[0, a] - kf.rates[1, a]) / ahead,
                 (kf.rates[1, a] - kf.rates[2, a]) / behind,
@@ -116,7 +117,8 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
         swift = params.timing[i] * max(
             max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0
         )
-        kf.extra[i] = swift * swift + params.nonlinearity * params.nonlinearity * speed
+        bent = params.nonlinearity[i] * speed
+        kf.extra[i] = swift * swift + bent * bent
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
@@ -204,6 +206,15 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
             least = unlearnable(error, inside, kf.usual_rate[a])
             keep_least_variance(layout, i, RATE_X + a, least, kf.least_variance)
     for i in range(n):
+        along = inside = 0.0
+        for a in range(3):
+            share = params.sensors.axes[i, a] * params.sensors.axes[i, a]
+            along += share * kf.usual_rate[a]
+            inside += share * kf.shared.vibration[a]
+        error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
+        inside = max(inside, error / (UNEQUAL * UNEQUAL))
+        least = unlearnable(error, inside, along)
+        keep_least_variance(layout, i, SPEED, least, kf.least_variance)
         # Variance of a difference of two blocks, with the root of the unknown slow
         # noise: the full factor would
         # stop delays from being learned in the first seconds of motion.
@@ -267,11 +278,11 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     moves = kf.noise.regime == MOTION
     begins = kf.turning or (moves and square > 4.0 * TURNING * kf.turn_noise)
     for i in range(n):
-        quick = 0.0
+        quick = speed = 0.0
         for a in range(3):
-            quick += (
-                params.sensors.axes[i, a] * (kf.rates[0, a] - kf.rates[1, a]) / ahead
-            )
+            h = params.sensors.axes[i, a]
+            quick += h * (kf.rates[0, a] - kf.rates[1, a]) / ahead
+            speed += h * kf.rates[0, a]
         if not begins:
             quick = 0.0
         if abs(kf.angular_acceleration[i]) > abs(quick):
@@ -282,6 +293,8 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
             else PEAK * kf.peak_turn[i]
         )
         kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
+        bent = params.nonlinearity[i] * speed if moves else 0.0
+        kf.bent[i] = max(PEAK * kf.bent[i], bent * bent)
     for a in range(3):
         kf.signal_rate[a] = kf.rates[0, a] if moves else 0.0
     fill_signals(layout, kf.signal_rate, kf.peak_turn, kf.at.signals)

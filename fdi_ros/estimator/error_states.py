@@ -22,16 +22,19 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import (
     MAX_CHANNELS,
     MAX_UNITS,
+    Axes,
     Square,
     Whole,
     compiled,
     record,
 )
+from fdi_ros.core.algebra import along
 from fdi_ros.model.samples import Array
 
-ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
-"""Multipliers of a state in a channel: one, the body rate about an axis, or the negative angular
-acceleration along the channel. All but the first are motion, and zero at rest."""
+ONE, RATE_X, RATE_Y, RATE_Z, TURN, SPEED = range(6)
+"""Multipliers of a state in a channel: one, the body rate about an axis, the negative
+angular acceleration along the channel, or the absolute rate along it. All but the first
+are motion, and zero at rest."""
 GIVEN = math.nan  # in the table: the caller of `prepare_layout` gives the size
 
 
@@ -63,6 +66,8 @@ ERROR_KINDS = (
     StateKind("bias rate", "rad/s^2", False, (), 5e-6, memory=1200.0, feeds="bias"),
     # 100 ppm: two quartzes of 50 ppm.
     StateKind("clock rate", "s/s", True, (), 1e-4, memory=7200.0, feeds="delay"),
+    # Half the difference between the scale factors of positive and negative rates.
+    StateKind("asymmetry", "", False, (SPEED,), GIVEN, 1e-6),
 )
 """Biases come first. Add new kinds at the end."""
 MULTIPLIERS = tuple(by for kind in ERROR_KINDS for by in kind.by)
@@ -86,6 +91,7 @@ class Layout:
     """Which states exist, and how they change with time."""
 
     n: Whole  # channels
+    axes: Axes  # sensitivity axes (n, 3)
     count: Whole  # states
     by: Annotated[NDArray[np.int64], "i8", (SIGNALS,)]  # what each signal is
     place: Entries  # state of each signal of a channel, or -1
@@ -132,18 +138,20 @@ def places_of(name: str, n: int, units: int) -> list[list[int]]:
 
 def prepare_layout(
     layout: NDArray[np.void],
+    axes: Array,
     unit: NDArray[np.int64],
     units: int,
     priors: Mapping[str, float | Array],
     walks: Mapping[str, float | Array],
 ) -> None:
-    """Fill a record of `Layout`: unit (n,) has the number of the unit of each channel.
+    """Fill a record of `Layout` from the axes (n, 3) and the number of the unit of each channel, unit (n,).
 
     ``priors``, ``walks``: standard deviations and random walks by the names of kinds,
     scalar or (n,), that stand in place of the table's. `ValueError` if one is in
     neither.
     """
     n = len(unit)
+    layout["axes"][:n] = axes
     layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = (
         n,
         MULTIPLIERS,
@@ -221,6 +229,8 @@ def fill_signals(
                 signals[i, k] = 1.0
             elif by == TURN:
                 signals[i, k] = -angular_acceleration[i]
+            elif by == SPEED:
+                signals[i, k] = abs(along(layout.axes[i], rate))
             else:
                 signals[i, k] = rate[by - RATE_X]
 

@@ -109,10 +109,9 @@ class Constants:
     adaptation_gain: Real  # of the noise of the moment, per block
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
-    nonlinearity: (
-        Real  # standard deviation of errors not linear in the rate, share of the rate
-    )
     gain_odds: Real  # logarithm of the odds that a unit's gain is wrong, against gyros
+    # standard deviation of errors not linear in the rate, share of the rate along each
+    nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s
     determines: Sets  # sets of channels that give a rate
     spans: Sets  # of the sets that give a rate, those with redundancy
@@ -130,6 +129,7 @@ class Total:
     values: Channels  # rad/s
     count: Channels  # samples that each channel has delivered
     rate: Vector  # rad/s
+    speed: Channels  # absolute rate along each channel, rad/s
     instant: Vector  # rate of that sample alone, rad/s
 
 
@@ -199,6 +199,7 @@ class Estimator:
     filled: Whole
     far_samples: Whole  # samples in a row that are far off
     spike_channels: Mask  # culprits in these
+    spike_sum: Channels  # sum of their deviations, which the totals lack, rad/s
     sum_values: Channels  # rad/s
     sum_count: Channels  # samples that each channel has delivered
     sum_time: Channels  # when each has, s since the block begins
@@ -236,6 +237,7 @@ class Estimator:
     peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels  # lately largest, (rad/s)^2
+    bent: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2
@@ -268,7 +270,10 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     """
     n, noise = params.sensors.n, kf.noise
     lasting = 2.0 * params.length
-    fill_parity(kf.parity, params.sensors, kf.mask, noise.now.sample)
+    for i in range(n):
+        # Nonlinearity bounds what any channel can show in a turn, and is not ignorance.
+        kf.growth[i] = noise.now.sample[i] + lasting * kf.bent[i]
+    fill_parity(kf.parity, params.sensors, kf.mask, kf.growth)
     for i in range(n):
         kf.known[i] = kf.parity.information[i, i]
     for i in range(n):
@@ -381,6 +386,7 @@ def copy_total(n: int, source: Total, target: Total) -> None:
     target.sample = source.sample
     for i in range(n):
         target.values[i], target.count[i] = source.values[i], source.count[i]
+        target.speed[i] = source.speed[i]
     for a in range(3):
         target.rate[a], target.instant[a] = source.rate[a], source.instant[a]
 
@@ -397,6 +403,29 @@ def follow_gaps(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
+def add_speed(params: Constants, total: Total) -> None:
+    """Add the absolute rate along each channel, rad/s."""
+    for i in range(params.sensors.n):
+        total.speed[i] += abs(along(params.sensors.axes[i], total.instant))
+
+
+@compiled
+def add_to_total(kf: Estimator, i: int, value: float) -> None:
+    """Add a value to the total of its channel, without what may still turn out to be a spike."""
+    spike = kf.corrected[i] - kf.imputed[i]
+    if kf.far_samples == 0:
+        kf.spike_sum[i] = 0.0
+    elif kf.spiked == 0:
+        # It lasts, and is no spike.
+        kf.total.values[i] += kf.spike_sum[i]
+        kf.spike_sum[i] = 0.0
+    else:
+        kf.spike_sum[i] += spike
+    kf.total.values[i] += value - spike
+    kf.total.count[i] += 1.0
+
+
+@compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and, unless a spike, to the block; return whether the block is complete."""
     n, total = params.sensors.n, kf.total
@@ -405,8 +434,7 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
         kf.begun = kf.seconds - seconds
     for i in range(n):
         if kf.mask >> i & 1:
-            total.values[i] += values[i]
-            total.count[i] += 1.0
+            add_to_total(kf, i, values[i])
         if kf.mask >> i & 1 and kf.spiked == 0:
             kf.sum_values[i] += values[i]
             kf.sum_count[i] += 1.0
@@ -417,6 +445,7 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
             total.instant[a] = kf.rate[a]
         total.rate[a] += total.instant[a]
         kf.sum_rate[a] += total.instant[a]
+    add_speed(params, total)
     copy_total(n, total, kf.last_samples[kf.samples % SAMPLES])
     kf.filled += 1
     if kf.filled < params.length:

@@ -42,6 +42,9 @@ class NoiseModel:
     bound
         Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma).
         Only `guaranteed` needs this.
+    nonlinearity_std
+        Standard deviation of errors that are not linear in the rate, as a share of the
+        rate, 0 to 1. Only `sequential` uses this.
     bias_std
         Standard deviation of the bias left after its correction, rad/s, >= 0. A bias
         does not average out, so only methods that accumulate use this.
@@ -61,6 +64,7 @@ class NoiseModel:
         timing_std: ArrayLike = 0.0,
         bound: ArrayLike | None = None,
         bias_std: ArrayLike = 0.0,
+        nonlinearity_std: ArrayLike = 0.002,
     ) -> None:
         self.noise_std = _checked("noise_std", noise_std, "rad/s", above=True)
         self.scale_std = _checked("scale_std", scale_std, "", 1.0)
@@ -69,6 +73,7 @@ class NoiseModel:
             None if bound is None else _checked("bound", bound, "rad/s", above=True)
         )
         self.bias_std = _checked("bias_std", bias_std, "rad/s")
+        self.nonlinearity_std = _checked("nonlinearity_std", nonlinearity_std, "", 1.0)
 
     def __repr__(self) -> str:
         return f"NoiseModel({', '.join(f'{name}={value}' for name, value in vars(self).items())})"

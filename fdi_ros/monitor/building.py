@@ -82,6 +82,7 @@ def build_noise(config: Config, n: int) -> NoiseModel:
         np.array(noise.timing_std),
         bound,
         bias_std,
+        np.array(noise.nonlinearity_std),
     )
     return NoiseModel(*map(np.squeeze, values)).for_channels(n)
 

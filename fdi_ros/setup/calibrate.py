@@ -22,6 +22,7 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
 from fdi_ros.inspection.turns import LEAST_ROTATION, LEAST_WINDOWS
 from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.building import (
     CHANNEL_DELAY,
@@ -422,6 +423,9 @@ def _settings(
         "noise.timing_std": _short(
             changed(before.timing_std, _timing(config, active, found))
         ),
+        "noise.nonlinearity_std": _short(
+            changed(before.nonlinearity_std, _nonlinearity(before, active, found))
+        ),
         "bias.fixed": _rounded(changed(config.bias.fixed or 0.0, found.bias), 7),
         "bias.startup_bias_duration": 0.0,
         # No single recording shows how biases differ from one start to the next.
@@ -459,6 +463,16 @@ def _timing(config: Config, active: Int, found: StateEstimate) -> Array:
         else 0.0
     )
     return np.where(error < np.maximum(before, LEAST_SKEW), error, before)
+
+
+def _nonlinearity(before: NoiseModel, active: Int, found: StateEstimate) -> Array:
+    """Return the nonlinearity of channels (n,): as configured, or more where the recording shows more.
+
+    A recording shows the rates that were flown, and no larger ones.
+    """
+    usual, shown = before.nonlinearity_std[active], found.nonlinearity
+    sure = shown.is_measured and shown.value > SHOWN * shown.error
+    return np.maximum(usual, shown.value if sure else 0.0)
 
 
 def _rounded(values: Array, digits: int) -> list[float]:

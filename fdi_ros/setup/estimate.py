@@ -49,6 +49,7 @@ from fdi_ros.setup.noise import (
     of_the_moment,
     projector,
 )
+from fdi_ros.setup.nonlinearity import Nonlinearity, measure
 from fdi_ros.setup.smoother import (
     NormalEquations,
     RandomWalk,
@@ -149,6 +150,8 @@ class StateEstimate:
     rest: Mask
     #: (B, 3) of the body, rad/s
     rate: Array
+    #: errors that are not linear in the rate
+    nonlinearity: Nonlinearity
 
     @property
     def rest_seconds(self) -> float:
@@ -255,6 +258,7 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         blocks,
         one.rest,
         one.rate,
+        one.nonlinearity(sensors, axes, found.mean),
     )
 
 
@@ -496,6 +500,23 @@ class _Pass:
         whole = moments + np.eye(BASE) * np.maximum(off, 1e-12)[:, :, None]
         return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
 
+    def nonlinearity(self, sensors: Priors, axes: Array, bias: Array) -> Nonlinearity:
+        """Measure what is not linear in the rate, with axes (n, 3) and mean biases (n,), rad/s."""
+        window = self.window
+        # Only blocks in which no channel is absent.
+        rows = self.used & ~self.rest[window] & self.present[window].all(axis=1)
+        rate = self.rate[rows]
+        return measure(
+            self.blocks.mean[rows] - bias - rate @ axes.T,
+            rate,
+            self.blocks.seconds[rows],
+            self.variance,
+            window[rows],
+            axes,
+            sensors.bias_std,
+            sensors.scale_std,
+        )
+
     def colours(self, axes: Array) -> Array:
         """Return the variance (2, n) of longer means over white noise, at least 1.
 
@@ -535,8 +556,9 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
         "bias": sensors.bias_std,
         "scale": sensors.scale_std,
         "delay": sensors.delay_std,
+        "asymmetry": 0.0,
     }
-    prepare_layout(layout, sensors.unit, sensors.units, priors, {"bias": 0.0})
+    prepare_layout(layout, axes, sensors.unit, sensors.units, priors, {"bias": 0.0})
     # Each of the base alone: rates, and accelerations along the channels.
     signals = np.zeros((BASE, n, SIGNALS))
     rates, accelerations = (

@@ -115,6 +115,11 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     words += "bias walk" if walk.value else "bias walk too small to measure, below"
     words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
+    bent = found.nonlinearity
+    words = "nonlinearity not measured: turn faster, both ways about every axis"
+    if bent.is_measured:
+        words = f"nonlinearity {100 * bent.value:.2g} +- {100 * bent.error:.1g} % of the largest rate"
+    yield Finding(Role.FOUND, "nonlinearity", words, (), bent.value, bent.error)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
         words = f"{', '.join(names)}: {_delay_words(delay, 'imus.delays' in result.settings)}"
@@ -459,6 +464,8 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
             "share_of_recording": found.floor.share,
             "scale_std": result.scale[0],
             "scale_std_error": result.scale[1],
+            "nonlinearity": found.nonlinearity.value,
+            "nonlinearity_error": found.nonlinearity.error,
             "timing_std_s": result.timing,
             "bias_walk": found.bias_walk.value or None,
             "bias_walk_possible": found.bias_walk.possible,

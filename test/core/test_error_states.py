@@ -34,6 +34,7 @@ PRIORS = {
     "delay": 0.01,
     "bias rate": 1e-4,
     "clock rate": 1e-4,
+    "asymmetry": 1e-3,
 }
 WALKS = {"bias": 1e-3, "scale": 1e-4, "delay": 1e-4}
 
@@ -48,9 +49,10 @@ def random_channels(seed, n):
     return rng, axes.copy(), root @ root.T
 
 
-def estimator(n, units):
+def estimator(n, units, axes=None):
     layout, states = allocate(Layout)[0], allocate(ErrorStates)[0]
-    prepare_layout(layout, np.arange(n) * units // n, units, PRIORS, WALKS)
+    axes = np.tile(np.eye(3), (n, 1))[:n] if axes is None else axes
+    prepare_layout(layout, axes, np.arange(n) * units // n, units, PRIORS, WALKS)
     begin_states(layout, states, np.full(n, 0.01))
     return layout, states
 
@@ -60,7 +62,7 @@ class Measured:
 
     def __init__(self, seed, n):
         self.rng, self.axes, self.noise = random_channels(seed, n)
-        self.layout, self.states = estimator(n, n // 3)
+        self.layout, self.states = estimator(n, n // 3, self.axes)
         predict(self.layout, self.states, 3.0)
         self.n, self.count = n, int(self.layout["count"])
         self.x, self.p = self.x_and_p()

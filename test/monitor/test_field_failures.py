@@ -61,7 +61,8 @@ JUMP, DEAD = (
         (parallel(3), 2000, BRIEF, "imu_1.z", 0.1, Reason.DISAGREES),
         # A drift below every threshold is found by the drift test, does not return, and shows in no single sample.
         (
-            parallel(3, detector__name="cusum"),
+            # Of the bias too, nothing is to be learned.
+            parallel(3, detector__name="cusum", noise__nonlinearity_std=0.0),
             6000,
             DRIFT,
             "imu_1.x",
@@ -243,7 +244,9 @@ def test_two_parallel_units_disagree_and_which_is_wrong_stays_open_even_alone():
 
 def test_a_drift_may_return_where_declarations_do_and_no_other_channel_is_named():
     """The estimator learns a bias of 3.5 mrad/s meanwhile, so the channel is right again, until it is no more."""
-    pipeline = Pipeline(parallel(3, detector__name="cusum", decision__latch=False))
+    # Where no bias is allowed for, scale and asymmetry would learn it instead.
+    usual = {"bias__turn_on_std": 0.005, "decision__latch": False}
+    pipeline = Pipeline(parallel(3, detector__name="cusum", **usual))
     _, output = run(pipeline, 6000, *DRIFT)
     found = declarations(pipeline, output)
     assert set(found) == {("imu_1.x", "FAULTY")}

@@ -69,6 +69,11 @@ def test_stated_errors_grow_where_the_model_does_not_fit():
         size = np.abs(z[:, channel])
         z[:, channel] *= 1.0 + share * size / size.max()
     bent = calibrate(Block(one.block.stamp, z, one.block.received), one.config)
+    # Two of nine channels by 2 %, a third of which no channel contradicts.
+    assert 0.006 < bent.settings["noise.nonlinearity_std"][0] < 0.013
+    assert bent.estimate.nonlinearity.is_measured
+    assert linear.settings["noise.nonlinearity_std"] == [0.002], "as configured"
+    assert linear.estimate.nonlinearity.value < 0.001
     grown = bent.axes_std / linear.axes_std
     assert 1.15 < np.median(grown) < 3.0
     assert np.abs((bent.axes - one.axes) / bent.axes_std).max() < 4.0
