@@ -12,9 +12,6 @@ out.
 from __future__ import annotations
 
 import math
-from typing import Any
-
-from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import (
     Channels,
@@ -25,6 +22,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import dot, invert
 from fdi_ros.detectors.naming import (
     MISFIT,
     Inference,
@@ -53,6 +51,7 @@ from fdi_ros.estimator.estimator import (
 )
 from fdi_ros.estimator.noise import BLOCK, SCALES, update_unknown
 from fdi_ros.estimator.snapshots import is_after_hole, move_biases, predict_from
+from fdi_ros.model.samples import Array
 
 STANDS = 0.6
 """Share of the logarithm of the run length that a hypothesis has, against all that is
@@ -75,6 +74,7 @@ OTHERS, TURNED = 6.0, 0.3
 """What is left of other channels in a block, if only those named are faulty: within so
 many standard deviations, that noise does not reach in a flight, and so much of the
 others' error, as axes are learned while they are watched."""
+ALIKE = 1e-3  # least share of the variance of a channel that others do not explain
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration):
 that is no fault."""
@@ -244,55 +244,83 @@ def open_case(params: Constants, state: State) -> None:
 
 @compiled
 def shows_others(params: Constants, state: State, named: int) -> bool:
-    """Whether single blocks since the onset show errors of other channels than those named.
+    """Whether single blocks since the onset show errors of other channels than those named, at most three.
 
     The mean of two that come and go, or that began one after the other, may look like a
     third. That of a channel points its own way in every block, however large it is in
     each.
     """
-    kf, case, scale = state.estimator, state.case, state.scales[BLOCK]
-    information, n = kf.block_information, params.sensors.n
-    first = second = -1
+    kf, inference, n = state.estimator, state.case.inference, params.sensors.n
+    information, count = kf.block_information, 0
     for i in range(n):
         if named >> i & 1:
-            first, second = (i, -1) if first < 0 else (first, i)
-    if not information[first, first] > 0.0 or (
-        second >= 0 and not information[second, second] > 0.0
-    ):
-        return False
-    both = correlation(information, first, second) if second >= 0 else 0.0
-    free = max(1.0 - both * both, 1e-3)
+            if count == 3 or not information[i, i] > 0.0:
+                return False
+            fill_correlations(information, i, named, inference.matrix[count])
+            # Channels that look alike have no matrix that can be inverted.
+            inference.matrix[count, count] += ALIKE
+            count += 1
+    invert(inference.matrix, count, inference.inverse)
     for j in range(n):
-        if named >> j & 1 or not kf.judged >> j & 1 or not information[j, j] > 0.0:
-            continue
-        # Regression on the one or two that are named.
-        on_first = correlation(information, j, first)
-        on_second = correlation(information, j, second) if second >= 0 else 0.0
-        a, b = (
-            (on_first - both * on_second) / free,
-            (on_second - both * on_first) / free,
-        )
-        variance = 1.0 - a * on_first - b * on_second
-        for back in range(scale.kept):
-            if (
-                scale.first[(scale.newest - back + KEPT) % KEPT]
-                < case.onset - params.length
-            ):
-                break
-            x = value_at(scale, back, first)
-            y = value_at(scale, back, second) if second >= 0 else 0.0
-            other = abs(value_at(scale, back, j) - a * x - b * y)
-            if variance > 1e-3 and other > OTHERS * math.sqrt(variance) + TURNED * max(
-                abs(x), abs(y)
-            ):
+        if not named >> j & 1 and kf.judged >> j & 1 and information[j, j] > 0.0:
+            # Regression on those named.
+            fill_correlations(information, j, named, inference.along)
+            variance = 1.0
+            for p in range(count):
+                share = dot(inference.inverse[p], inference.along, count)
+                inference.amplitude[p] = share
+                variance -= share * inference.along[p]
+            if variance > ALIKE and shows_other(params, state, named, j, variance):
                 return True
     return False
 
 
 @compiled
-def correlation(information: NDArray[Any], i: int, j: int) -> float:
-    """Of what is left over of two channels."""
-    return information[i, j] / math.sqrt(information[i, i] * information[j, j])
+def shows_other(
+    params: Constants, state: State, named: int, j: int, variance: float
+) -> bool:
+    """Whether channel j shows more in a block than those named explain, by the shares in ``amplitude``."""
+    case, scale = state.case, state.scales[BLOCK]
+    for back in range(scale.kept):
+        first = scale.first[(scale.newest - back + KEPT) % KEPT]
+        if first < case.onset - params.length:
+            break
+        other, largest, p = value_at(scale, back, j), 0.0, 0
+        for i in range(params.sensors.n):
+            if named >> i & 1:
+                x = value_at(scale, back, i)
+                other -= case.inference.amplitude[p] * x
+                largest = max(largest, abs(x))
+                p += 1
+        if abs(other) > OTHERS * math.sqrt(variance) + TURNED * largest:
+            return True
+    return False
+
+
+@compiled
+def fill_correlations(information: Array, i: int, named: int, out: Array) -> None:
+    """Correlations of what is left over of channel i with that of those named, at most three."""
+    q = 0
+    for j in range(len(information)):
+        if named >> j & 1:
+            scale = math.sqrt(information[i, i] * information[j, j])
+            out[q] = information[i, j] / scale
+            q += 1
+
+
+@compiled
+def widen(params: Constants, state: State) -> None:
+    """Suspect more channels than those named, as blocks show others: those of their unit, if these explain all."""
+    inference = state.case.inference
+    named = inference.common
+    inference.common = 0
+    for unit in range(params.units):
+        inside = params.members[unit] & inference.mask
+        holds = named & ~inside == 0 and named != inside and inside != inference.mask
+        if holds and not shows_others(params, state, inside):
+            inference.union = inside
+            return
+    inference.union, inference.fitted = inference.judged, False
 
 
 @compiled
@@ -314,7 +342,7 @@ def name_channels(params: Constants, state: State) -> None:
         return
     case.next = kf.samples + max(size // RENAME, 1)
     if inference.common and shows_others(params, state, inference.common):
-        inference.common, inference.union, inference.fitted = 0, inference.judged, False
+        widen(params, state)
     if not lacks_witnesses(case):
         case.witnesses = inference.mask
     case.suspects = inference.union
