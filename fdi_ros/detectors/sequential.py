@@ -482,7 +482,6 @@ class Sequential(Detector):
         params["members"][: len(geometry.units)] = [
             mask_of(channels) for channels in geometry.units
         ]
-        nonlinearity = np.maximum(noise.nonlinearity_std, LEAST_NONLINEARITY)
         prepare_layout(
             params["layout"],
             geometry.axes,
@@ -492,7 +491,7 @@ class Sequential(Detector):
                 "bias": noise.bias_std,
                 "scale": np.maximum(noise.scale_std, LEAST_SCALE),
                 "delay": delay_std,
-                "asymmetry": nonlinearity,
+                "asymmetry": noise.nonlinearity_std,
             },
             {"bias": walk},
         )
@@ -504,7 +503,9 @@ class Sequential(Detector):
         )
         params["expected"][:n] = noise.noise_std**2
         params["timing"][:n] = np.maximum(noise.timing_std, LEAST_TIMING)
-        params["nonlinearity"][:n] = nonlinearity
+        params["nonlinearity"][:n] = np.maximum(
+            noise.nonlinearity_std, LEAST_NONLINEARITY
+        )
         params["gain_odds"] = math.log(gain_odds)
         params["rest_std"] = REST_STD
         used = all_sets(n)

@@ -148,7 +148,7 @@ def prepare_layout(
 
     ``priors``, ``walks``: standard deviations and random walks by the names of kinds,
     scalar or (n,), that stand in place of the table's. `ValueError` if one is in
-    neither.
+    neither. With priors of zero the last kind has no states.
     """
     n = len(unit)
     layout["axes"][:n] = axes
@@ -172,6 +172,9 @@ def prepare_layout(
         )
         if np.isnan(prior).any() or np.isnan(walk).any():
             raise ValueError(f"prior and walk of the {kind.name} must be given")
+        if kind is ERROR_KINDS[-1] and not prior.any():
+            # No state depends on the places of the last kind, so it costs nothing.
+            break
         for owner, places in enumerate(owners):
             count += len(places)
             layout["prior"][places], layout["walk"][places] = prior[owner], walk[owner]

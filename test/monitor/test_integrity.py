@@ -163,7 +163,8 @@ def test_half_a_second_of_a_turn_makes_the_level_smaller(rate, name, share, most
     The level is at least 5.3 deviations of the fused rate, for a risk of 1e-7. Beyond
     that are faults too small to be noticed, which count more where biases are none.
     """
-    pipeline = Pipeline(config(detector__name=name, noise__scale_std=0.003))
+    linear = {"noise__scale_std": 0.003, "noise__nonlinearity_std": 0.0}
+    pipeline = Pipeline(config(detector__name=name, **linear))
     z = np.tile(pipeline.geometry.axes @ np.array(rate), (50, 1))
     z += np.random.default_rng(0).normal(0.0, 0.0025, z.shape)
     output = pipeline.process(block(z))
