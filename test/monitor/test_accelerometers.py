@@ -337,6 +337,7 @@ def test_every_detector_judges_accelerometers_as_gyros(name):
             detector=name,
             noise__noise_std=NOISE / 150,
             noise__bias_walk=0.0,
+            noise__nonlinearity_std=0.0,
             bias__turn_on_std=0.0,
             bias__max_drift=5.0 / 150,
             **{f"accelerometers__{key}": 0.0 for key in known},
