@@ -30,11 +30,11 @@ from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.inspection.fitness import not_configured, refuse_unfit
 from fdi_ros.inspection.starting_config import assumed_config
-from fdi_ros.mavlink.failover_replay import Change, failover_text
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.accelerometers import possible_names
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import failures, parse_check
+from fdi_ros.replay.failover import FailoverReplay, is_possible
 from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Sink, replay, with_unused
@@ -80,10 +80,17 @@ def run_replay(arguments: Namespace) -> int:
         if arguments.report is not None
         else None
     )
+    is_log = arguments.bag.suffix.lower() in AUTOPILOT_LOGS
+    failover = (
+        FailoverReplay(geometry.channel_names)
+        if is_log and is_possible(geometry.channel_names)
+        else None
+    )
     with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
         sinks = [
             *_sinks(arguments, config, stack),
             *([report] if report else []),
+            *([failover] if failover else []),
         ]
         part = (arguments.start, arguments.end)
         summary = replay(
@@ -110,13 +117,8 @@ def run_replay(arguments: Namespace) -> int:
             )
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
-    if arguments.bag.suffix.lower() in AUTOPILOT_LOGS:
-        changes = [
-            Change(one.at_s, one.channel, one.state, one.error or 0.0)
-            for one in summary.scores.events
-            if one.channel in geometry.channel_names
-        ]
-        words += f"{failover_text(changes, geometry.channel_names)}\n"
+    if failover is not None:
+        words += f"{failover.text}\n"
     if assumed:
         words += f"note: no --config: assumed {assumed.words}\n"
     else:

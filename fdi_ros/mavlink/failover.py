@@ -114,7 +114,7 @@ class Failover:
         """Whether a stop now leaves nothing to put back: in flight, IMUs stay out."""
         pairs = zip(self._state.memories, self.evidence.imus, strict=True)
         waits = any(
-            memory.ours and not imu.named and not memory.without_notch
+            memory.ours and imu.named is False and not memory.without_notch
             for memory, imu in pairs
         )
         return self._vehicle.armed or not self._vehicle.in_reach or not waits
@@ -222,7 +222,7 @@ class Failover:
         ]
         imus: list[Imu] = []
         for imu, (use, heard) in zip(
-            evidence.look(delivers, now), self._values, strict=True
+            evidence.look(delivers, self.out, now), self._values, strict=True
         ):
             is_known = is_same and now - heard < FORGOTTEN
             imus.append(imu._replace(use=use if is_known else None, heard=heard))
@@ -287,7 +287,7 @@ class Failover:
         imus = [imu._replace(heard=now if imu.heard else 0) for imu in view.imus]
         against = []
         for k, imu in enumerate(imus):
-            bad = imu._replace(named=True, size=math.inf, delivers=True)
+            bad = imu._replace(blamed=True, size=math.inf, delivers=True)
             trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
             against.append(objection(k, memories, trial, now, self._settings))
         reasons = [
@@ -299,7 +299,7 @@ class Failover:
             apart = is_apart(imu, self._settings)
             checks = (
                 (memory.without_notch, "reboot before flight"),
-                (imu.use and imu.named and apart, "faulty and in use"),
+                (imu.use and imu.blamed, "faulty and in use"),
                 (imu.use and apart, "differs and is in use"),
                 (imu.use is False, "not in use"),
                 (imu.use and not imu.delivers, "sends nothing"),

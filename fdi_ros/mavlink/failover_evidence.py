@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -29,14 +29,22 @@ LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR = 0.5
-#: Share of the rate added to `CLEAR`: gyros of one type differ in scale by up to 3 %, and
-#: healthy ones then by more than `CLEAR` in a turn of 17 rad/s.
+#: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
+#: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
+SKEW = (
+    20 * MS
+)  #: Two IMUs may measure this far apart in time, ns: see `RawComparison.steps`.
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
 FEWEST = 3  #: and this number of samples.
 SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
+TRUSTED = (
+    2 * NS
+)  #: IMUs are trusted once all have agreed with each other for this time, ns.
+REPEATING = 100 * MS  #: A gyro that repeats one value for this time is stuck, ns,
+MOVED = 0.02  #: if the rate of another one has changed by this meanwhile, rad/s.
 #: States of channels that are a doubt.
 DOUBTS = {
     ChannelState.SUSPECT,
@@ -46,6 +54,13 @@ DOUBTS = {
 }
 CERTAIN = 5.0  #: Standard deviations from which a size is known.
 SILENT = NS // 2  #: An IMU without samples for this time does not deliver, ns.
+FORGOTTEN = 5 * NS  #: Older states of the monitor are unknown, ns.
+KEPT = 64  #: Samples kept of each IMU.
+
+UNKNOWN: Vector = (math.nan, math.nan, math.nan)
+NOBODY: tuple[int, set[int], int] = (-1, set(), 0)
+#: Difference of each pair of IMUs, in either order, by axis, rad/s. NaN: unknown.
+Apart = dict[tuple[int, int], Vector]
 
 
 class Difference(NamedTuple):
@@ -74,16 +89,29 @@ class RawComparison:
 
     def __init__(self, count: int, interval: int) -> None:
         self._reach = 2 * interval // 5
-        self._last: list[tuple[int, Vector]] = [(-NS, (0.0, 0.0, 0.0))] * count
+        self._lag = max(1, SKEW // interval)
+        self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN)] * count
+        self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
             (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
         }
+        # When the value of an IMU last changed, and the rates of all IMUs then.
+        self._changed: list[tuple[int, list[Vector]]] = [(-NS, [])] * count
+        self._stuck = [False] * count
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
         """Take a sample of an IMU, from 0: stamp in ns, rate in rad/s."""
         if unit >= len(self._last):
             return
+        if rate != self._last[unit][1]:
+            self._changed[unit] = stamp, [last for _, last in self._last]
+            self._stuck[unit] = False
         self._last[unit] = stamp, rate
+        self._recent[unit].append(rate)
+        for other, (since, rates) in enumerate(self._changed):
+            repeats = other != unit and rates and stamp - since >= REPEATING
+            if repeats and math.dist(rate, rates[unit]) > MOVED:
+                self._stuck[other] = True
         for pair, rows in self._pairs.items():
             if unit not in pair:
                 continue
@@ -98,15 +126,39 @@ class RawComparison:
         """Return the size of the last rate of an IMU, rad/s."""
         return math.hypot(*self._last[unit][1])
 
-    def least(self, unit: int, other: int, count: int, now: int) -> float:
-        """Return the smallest of the last count differences of two IMUs at time now, ns.
+    def is_stuck(self, unit: int) -> bool:
+        """Return whether an IMU has repeated one value while another one moved."""
+        return self._stuck[unit]
 
-        The size of a difference is its largest component, rad/s. NaN: fewer are known.
+    def repeats(self, unit: int, count: int) -> bool:
+        """Return whether the last count samples of an IMU are all the same."""
+        return len(set(list(self._recent[unit])[-count:])) < 2
+
+    def steps(self, unit: int, count: int) -> Vector:
+        """Return how far each axis of an IMU changed within `SKEW`, rad/s.
+
+        The largest change among the last count samples: what a healthy IMU that measures
+        this much earlier or later differs by.
         """
-        rows = list(self._pairs[min(unit, other), max(unit, other)])[-count:]
-        if len(rows) < count or now - rows[-1][0] > CURRENT:
-            return math.nan
-        return min(max(map(abs, difference)) for _, difference in rows)
+        rates = list(self._recent[unit])[-count - self._lag :]
+        largest = [0.0, 0.0, 0.0]
+        for before, after in zip(rates, rates[self._lag :], strict=False):
+            for axis in range(3):
+                change = abs(after[axis] - before[axis])
+                largest[axis] = max(largest[axis], change)
+        return largest[0], largest[1], largest[2]
+
+    def steady(self, unit: int, other: int, count: int, now: int) -> Vector:
+        """Return the smallest of the last count differences of two IMUs, by axis, rad/s.
+
+        0 where the differences do not all have the same sign. NaN: fewer are known at
+        time now, ns.
+        """
+        rows = self._latest(unit, other, count, now)
+        if rows is None:
+            return UNKNOWN
+        x, y, z = (_steady(column) for column in zip(*rows, strict=True))
+        return x, y, z
 
     def between(
         self, unit: int, other: int, now: int, last: int = 0
@@ -115,20 +167,36 @@ class RawComparison:
 
         last: number of samples averaged. 0: all within `AVERAGED`.
         """
-        rows = list(self._pairs[min(unit, other), max(unit, other)])[-last:]
-        if len(rows) < last or not rows or now - rows[-1][0] > CURRENT:
+        rows = self._latest(unit, other, last, now)
+        if rows is None:
             return None
-        sign = 1.0 if unit < other else -1.0
         count = len(rows)
-        columns = list(zip(*(row for _, row in rows), strict=True))
-        mean = [sign * sum(column) / count for column in columns]
+        columns = list(zip(*rows, strict=True))
+        mean = [sum(column) / count for column in columns]
         # With one pair nothing is known of the noise.
         scale = math.sqrt(count * (count - 1)) if count > 1 else 0.0
         std = [
-            math.dist(column, [sign * centre] * count) / scale if scale else math.inf
+            math.dist(column, [centre] * count) / scale if scale else math.inf
             for column, centre in zip(columns, mean, strict=True)
         ]
         return Difference((mean[0], mean[1], mean[2]), (std[0], std[1], std[2]))
+
+    def _latest(
+        self, unit: int, other: int, count: int, now: int
+    ) -> list[Vector] | None:
+        """Return the last count differences of two IMUs, all of late if 0, or None."""
+        rows = list(self._pairs[min(unit, other), max(unit, other)])[-count:]
+        if not rows or len(rows) < count or now - rows[-1][0] > CURRENT:
+            return None
+        sign = 1.0 if unit < other else -1.0
+        return [(sign * x, sign * y, sign * z) for _, (x, y, z) in rows]
+
+
+def _steady(values: Sequence[float]) -> float:
+    """Return the value nearest to zero, or 0 if the values differ in sign."""
+    low = min(values)
+    high = max(values)
+    return max(low, 0.0) + min(high, 0.0)
 
 
 class Evidence:
@@ -141,7 +209,8 @@ class Evidence:
     interval
         Time between two samples of an IMU, ns.
     min_size
-        Smallest difference at which an IMU is apart, rad/s.
+        Smallest difference at which an IMU is apart, rad/s. `SCALE` of the smaller of the
+        two rates adds to it.
     """
 
     def __init__(self, count: int, interval: int, min_size: float) -> None:
@@ -153,7 +222,17 @@ class Evidence:
         self.apart = [math.nan] * count
         self._min_size = min_size
         self._fewest = max(FEWEST, QUICK // interval + 1)
-        self._states: list[set[float]] = [set()] * count
+        # States of the three channels of each IMU. Empty: unknown.
+        self._states: list[tuple[ChannelState, ...]] = [()] * count
+        self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
+        # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
+        self._refuted: list[set[ChannelState] | None] = [None] * count
+        # Axes that are FAULTY, since when while the IMU agrees, ns, and those of them that
+        # have been so for `TRUSTED`.
+        self._named: list[set[int]] = [set()] * count
+        self._named_at = [0] * count
+        self._outdated: list[set[int]] = [set()] * count
+        self._together: int | None = None  # since when all IMUs agree, ns
         self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0
         self._looked = 0
@@ -163,74 +242,203 @@ class Evidence:
         if now - self.heard >= SILENT:
             self.begun = now
         self.heard = now
-        self._states = [set(states[k : k + 3]) for k in range(0, len(states), 3)]
+        found = [ChannelState(int(state)) for state in states]
+        self._states = [tuple(found[k : k + 3]) for k in range(0, len(found), 3)]
 
-    def look(self, delivers: Sequence[bool], now: int) -> tuple[Imu, ...]:
-        """Return the IMUs at time now, ns, given which IMUs deliver samples."""
-        apart: dict[tuple[int, int], float] = {}  # rad/s, by pair
-        for pair in combinations(range(len(delivers)), 2):
-            if delivers[pair[0]] and delivers[pair[1]]:
-                difference = self.raw.between(*pair, now)
-                apart[pair] = difference.size if difference else math.nan
-        odd, lasting = self._odd_one(apart, now)
+    def look(
+        self, delivers: Sequence[bool], out: Sequence[int], now: int
+    ) -> tuple[Imu, ...]:
+        """Return the IMUs at time now, ns.
+
+        Parameters
+        ----------
+        delivers
+            Whether each IMU delivers samples.
+        out
+            IMUs, from 0, out of use by our orders. Two bad IMUs may agree with each
+            other, so agreement with these counts only while they are trusted.
+        """
+        if now - self.heard >= FORGOTTEN:
+            self._states = [()] * len(delivers)
+        units = [k for k, does in enumerate(delivers) if does]
+        apart = self._compare(units, now)
+        self._note_trust(units, apart, now)
+        odd, axes, lasting = self._odd_one(units, apart, now)
         if odd != self._odd:
             self._odd = odd
             self._odd_since = now
+        if now - self._odd_since < lasting:
+            odd = -1
+        partners = {k: self._partners(k, units, out) for k in units}
+        nearest = [
+            self._nearest(k, partners.get(k, []), apart) for k in range(len(delivers))
+        ]
+        self.apart = [max(vector) for vector in nearest]
         held = math.exp(-(now - self._looked) / NS / DECAY)
         self._looked = now
         imus = []
-        for k, before in enumerate(self.imus):
-            own = [size for pair, size in apart.items() if k in pair]
-            # One difference that is unknown may be the one in which the IMU agrees.
-            known = own and not any(map(math.isnan, own))
-            size = min(own) if known else math.nan
-            self.apart[k] = size
-            agreed = (before.agreed or now) if size < self._min_size else None
-            if before.size > size and (agreed is None or now - agreed < HEALED):
-                size = max(size, before.size * held)
-            faulty = ChannelState.FAULTY in self._states[k]
-            voted = k == odd and now - self._odd_since >= lasting
+        for k, vector in enumerate(nearest):
+            agrees = any(self._agree(k, j, apart) for j in partners.get(k, []))
+            agreed = (self.imus[k].agreed or now) if agrees else None
+            if agreed is None or now - agreed < HEALED:
+                before = [held * size for size in self._sizes[k]]
+                x, y, z = map(max, vector, before)
+                vector = x, y, z
+            self._sizes[k] = vector
+            named = self._faulty(k)
+            accused = set(named)
+            if agreed is None or named != self._named[k]:
+                self._named[k] = named
+                self._named_at[k] = now
+            elif now - self._named_at[k] >= TRUSTED:
+                self._outdated[k] = named
+            self._outdated[k] = self._outdated[k] & named
+            if not self._is_odd(k, units, apart):
+                accused -= self._outdated[k]
+            if k == odd:
+                accused |= axes
+            is_unknown = not self._states[k] and k != odd
             imus.append(
                 Imu(
-                    named=faulty or voted,
-                    ok=self._states[k] == {ChannelState.OK},
+                    named=None if is_unknown else bool(named or k == odd),
+                    blamed=any(vector[axis] >= self._min_size for axis in accused),
+                    ok=set(self._states[k]) == {ChannelState.OK},
                     delivers=delivers[k],
-                    size=size,
+                    size=max(vector),
                     agreed=agreed,
                 )
             )
         self.imus = tuple(imus)
         return self.imus
 
-    def _odd_one(
-        self, apart: Mapping[tuple[int, int], float], now: int
-    ) -> tuple[int, int]:
-        """Return the IMU that is bad without a name, and for how long that must stand, ns.
-
-        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`
-        and `SCALE`, or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
-
-        Parameters
-        ----------
-        apart
-            Difference of each pair of IMUs that deliver samples, rad/s. NaN: unknown.
-        """
-        for pair, alike in apart.items() if len(apart) == 3 else ():
-            (k,) = {0, 1, 2}.difference(pair)
-            size = min(size for other, size in apart.items() if other != pair)
-            if not alike < max(self._min_size, ALIKE * size):
+    def _compare(self, units: Sequence[int], now: int) -> Apart:
+        """Return by how much more than scales explain each pair differs, by axis, rad/s."""
+        found: Apart = {}
+        for j, k in combinations(units, 2):
+            difference = self.raw.between(j, k, now)
+            if difference is None:
+                found[j, k] = found[k, j] = UNKNOWN
                 continue
-            states = self._states[k]
-            turning = max(map(self.raw.rate, pair))
-            limit = LARGE if states & DOUBTS else CLEAR + SCALE * turning
-            if all(self.raw.least(k, j, self._fewest, now) >= limit for j in pair):
-                return k, 0
-            if ChannelState.AMBIGUOUS in states and size >= VOTE * self._min_size:
-                return k, LASTING
-        sets = [
-            k for k, one in enumerate(self._states) if ChannelState.AMBIGUOUS in one
-        ]
-        return (sets[0] if len(sets) == 1 else -1), LASTING
+            scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
+            x, y, z = (max(0.0, abs(mean) - scale) for mean in difference.mean)
+            found[j, k] = found[k, j] = x, y, z
+        return found
+
+    def _note_trust(self, units: Sequence[int], apart: Apart, now: int) -> None:
+        """Note whether all IMUs agree, and which are apart from all others."""
+        pairs = list(combinations(units, 2))
+        stuck = any(map(self.raw.is_stuck, units))
+        agree = pairs and all(max(apart[pair]) < self._min_size for pair in pairs)
+        self._together = (self._together or now) if agree and not stuck else None
+        for k in units:
+            own = [max(apart[k, j]) for j in units if j != k]
+            if self._together is not None and now - self._together >= TRUSTED:
+                self._refuted[k] = self._doubts(k)
+            elif all(size >= self._min_size for size in own):
+                self._refuted[k] = None
+
+    def _doubts(self, unit: int) -> set[ChannelState]:
+        return DOUBTS.intersection(self._states[unit])
+
+    def _faulty(self, unit: int) -> set[int]:
+        """Return the axes of an IMU that the monitor finds faulty."""
+        states = enumerate(self._states[unit])
+        return {axis for axis, state in states if state == ChannelState.FAULTY}
+
+    def _partners(
+        self, unit: int, units: Sequence[int], out: Sequence[int]
+    ) -> list[int]:
+        """Return the IMUs with which one is compared: in use or trusted, or else all."""
+        others = [k for k in units if k != unit]
+        fit = [k for k in others if k not in out or self._refuted[k] is not None]
+        return fit or others
+
+    def _nearest(self, unit: int, partners: Sequence[int], apart: Apart) -> Vector:
+        """Return the difference of an IMU to the nearest of its partners."""
+        found = [apart[unit, k] for k in partners]
+        # One difference that is unknown may be the one in which the IMU agrees.
+        if not found or any(map(math.isnan, map(max, found))):
+            return UNKNOWN
+        return min(found, key=max)
+
+    def _agree(self, unit: int, other: int, apart: Apart) -> bool:
+        """Return whether an IMU agrees with a partner that is sound."""
+        is_sound = self.apart[other] < self._min_size or set(self._states[other]) == {
+            ChannelState.OK
+        }
+        is_stuck = self.raw.is_stuck(unit) or self.raw.is_stuck(other)
+        return is_sound and not is_stuck and max(apart[unit, other]) < self._min_size
+
+    def _is_odd(self, unit: int, units: Sequence[int], apart: Apart) -> bool:
+        """Return whether the two other IMUs agree, and nothing is against these two.
+
+        They are trusted, their values change, and every doubt that the monitor has of
+        them was refuted before, or is one that it has of this IMU too.
+        """
+        others = [k for k in units if k != unit]
+        if len(others) != 2 or unit not in units:
+            return False
+        size = min(max(apart[unit, k]) for k in others)
+        if not max(apart[others[0], others[1]]) < max(self._min_size, ALIKE * size):
+            return False
+        for k in others:
+            refuted = self._refuted[k]
+            if refuted is None or self.raw.repeats(k, self._fewest):
+                return False
+            if not self._doubts(k) <= refuted | self._doubts(unit):
+                return False
+        return True
+
+    def _odd_one(
+        self, units: Sequence[int], apart: Apart, now: int
+    ) -> tuple[int, set[int], int]:
+        """Return the IMU that is bad without a name, its axes, and how long that must stand.
+
+        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
+        or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
+        """
+        for k in units:
+            if not self._is_odd(k, units, apart):
+                continue
+            if axes := self._clear_axes(k, units, now):
+                return k, axes, 0
+            sizes = [apart[k, j] for j in units if j != k]
+            axes = {
+                axis
+                for axis in self._set(k)
+                if min(size[axis] for size in sizes) >= VOTE * self._min_size
+            }
+            if axes:
+                return k, axes, LASTING
+        sets = [k for k in units if self._set(k)]
+        return (sets[0], self._set(sets[0]), LASTING) if len(sets) == 1 else NOBODY
+
+    def _set(self, unit: int) -> set[int]:
+        """Return the axes of an IMU that are in a set of the monitor."""
+        states = enumerate(self._states[unit])
+        return {axis for axis, state in states if state == ChannelState.AMBIGUOUS}
+
+    def _clear_axes(self, unit: int, units: Sequence[int], now: int) -> set[int]:
+        """Return the axes on which an IMU is far off from both others, in one direction.
+
+        Farther than scales explain, and than the others turn within `SKEW`.
+        """
+        first, second = (k for k in units if k != unit)
+        count = self._fewest
+        turning = max(self.raw.rate(first), self.raw.rate(second))
+        limit = (LARGE if self._doubts(unit) else CLEAR) + SCALE * turning
+        rows = zip(
+            self.raw.steady(unit, first, count, now),
+            self.raw.steady(unit, second, count, now),
+            self.raw.steps(first, count),
+            self.raw.steps(second, count),
+            strict=True,
+        )
+        return {
+            axis
+            for axis, (one, other, *steps) in enumerate(rows)
+            if abs(_steady((one, other))) >= limit + max(steps)
+        }
 
     def error(self, unit: int, now: int) -> tuple[str, float] | None:
         """Return the axis on which an IMU is off most, and by how much, rad/s.

@@ -8,10 +8,13 @@ the present view and its own memory, and returns orders, conditions to announce,
 the next memory. It has no clock and no link. An order sets INS_USEk.
 
 Definitions
-    apart    raw rate differs from the nearest other IMU by ``min_size`` or more
-    named    by the monitor, now or in its last report, or odd: the raw rates of two of
-             three IMUs agree, and the third is far off (`failover_evidence.Evidence`)
-    bad      named, and apart. With only one of both, left in use.
+    apart    raw rate differs by ``min_size`` or more, and more than scales explain, from
+             the nearest IMU that is in use or trusted
+    named    by the monitor, now or in its last report if that is not old, or by the raw
+             rates: two of three IMUs agree, and the third is far off
+    blamed   named on an axis that is apart. A name from before the IMU last agreed counts
+             only while two of three IMUs agree, and this one does not
+    bad      blamed, and delivers. Else left in use.
     sound    delivers, and the monitor finds it OK or it is not apart
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
@@ -20,12 +23,15 @@ Definitions
              our order
     held     wanted out of use
 
+`failover_evidence.Evidence` finds what is apart, named and blamed.
+
 Rules, in this order at each tick
     1. Held IMUs go back in use if the operator asks, if no other IMU is left in use,
        or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
        is taken out in a flight. In flight that needs a live monitor. On the ground an
-       IMU that is still named stays out. An IMU that was out when the
-       autopilot started has no notch filters: only the operator or rule 4 puts it back.
+       IMU stays out that is still named, or of which the monitor reports nothing. An IMU
+       that was out when the autopilot started has no notch filters: only the operator or
+       rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
     3. Orders are sent until the autopilot reports what is wanted. An order to take an
@@ -78,6 +84,7 @@ class Condition(Enum):
     DANGER = "bad, in use, armed"
     OUT = "out of use by our order, armed"
     STAYS_OUT = "out of use by our order on the ground, because it is still named"
+    UNREPORTED = "out of use by our order on the ground, without reports of the monitor"
     REBOOT = "was out of use when the autopilot started: no notch filters"
     STUCK_OUT = "ordered back, but not reported in use"
     LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
@@ -104,12 +111,14 @@ class Imu(NamedTuple):
 
     use: bool | None = None  #: Last report of its INS_USE. None: no recent report.
     heard: int = NEVER  #: Time of that report.
-    named: bool = False  #: By the monitor or the raw rates, as defined above.
+    named: bool | None = None  #: By the monitor or the raw rates. None: no reports.
+    blamed: bool = False  #: Named on an axis that is apart, as defined above.
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
     size: float = float("nan")
-    """Largest raw difference to the nearest other IMU of late, rad/s. NaN: unknown."""
-    agreed: int | None = None  #: Not apart since this time. None: apart or unknown.
+    """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
+    #: Not apart from a sound IMU since this time. None: apart, stuck or unknown.
+    agreed: int | None = None
 
 
 class View(NamedTuple):
@@ -208,7 +217,7 @@ def is_apart(imu: Imu, settings: PolicySettings) -> bool:
 
 def is_bad(imu: Imu, settings: PolicySettings) -> bool:
     """Return whether an IMU is to be out of use. Of unknown size: no."""
-    return imu.delivers and imu.named and is_apart(imu, settings)
+    return imu.delivers and imu.blamed and is_apart(imu, settings)
 
 
 def is_sound(imu: Imu, settings: PolicySettings) -> bool:
@@ -256,7 +265,8 @@ def decide(
             # Parameters outlive a boot. The next report shows how it began.
             memory.seen = memory.against_since = None
             memory.lane_angle = 0.0
-            memory.without_notch = memory.ours
+            memory.tries = 0
+            memory.held = memory.without_notch = memory.ours
         _remember(memory, imu, view, now, settings)
     _note_lanes(memories, view, now - state.at, settings)
     _release(memories, view, now)
@@ -380,7 +390,7 @@ def _release(memories: Sequence[Memory], view: View, now: int) -> None:
     for memory, imu in zip(memories, view.imus, strict=True):
         pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
         agrees = imu.agreed is not None and now - imu.agreed >= pause
-        may = view.monitored if view.armed else not imu.named
+        may = view.monitored if view.armed else imu.named is False
         heals = agrees and may and imu.delivers and not memory.without_notch
         if memory.held and (view.restore or none_left or heals):
             memory.held = False
@@ -475,7 +485,8 @@ def _condition(
         (is_danger, Condition.DANGER),
         (asked_back, Condition.STUCK_OUT),
         (memory.without_notch, Condition.REBOOT),
-        (is_out and not view.armed and imu.named, Condition.STAYS_OUT),
+        (is_out and not view.armed and imu.named is True, Condition.STAYS_OUT),
+        (is_out and not view.armed and imu.named is None, Condition.UNREPORTED),
         (is_out, Condition.OUT),
         (memory.left_alone, Condition.LEFT_ALONE),
         (apart, Condition.APART),

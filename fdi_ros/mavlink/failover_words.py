@@ -24,6 +24,7 @@ WORDS = {
     Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
     Condition.OUT: Words(CRITICAL, "out of use"),
     Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
+    Condition.UNREPORTED: Words(WARNING, "out of use, monitor silent"),
     Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
     Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
     Condition.LEFT_ALONE: Words(WARNING, "set by others, left alone"),

@@ -157,6 +157,7 @@ class Flight:
                     else None,
                     heard=self.told[k][1],
                     named=self.named[k],
+                    blamed=self.named[k],
                     ok=not self.named[k] and not self.error[k],
                     delivers=self.delivers[k],
                     size=size,

@@ -17,7 +17,6 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
-from fdi_ros.mavlink.failover_replay import Change, failover_text
 from fdi_ros.mavlink.failover_words import WORDS
 from mavlink.autopilots import NS, PARAMETERS, UTC, Autopilot, Conversation
 from mavlink.flights import Flight
@@ -551,25 +550,6 @@ def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str) -> No
     (tmp_path / "out.json").chmod(0o666)
     with pytest.raises(ConfigError, match="others can write it"):
         Monitored(tmp_path, Autopilot("ardupilot"))
-
-
-def test_the_orders_of_failover_in_a_recording() -> None:
-    begin = [Change(0.5, name, "OK", 0.0) for name in CHANNELS]
-    assert failover_text(begin, CHANNELS) == (
-        "failover, if armed: no IMU would be taken out (failover_min_size 0.03 rad/s)"
-    )
-    small = [Change(50.0, "imu_1.z", "FAULTY", 0.01), Change(60.0, "imu_1.z", "OK", 0)]
-    first = [
-        Change(105.2, "imu_1.x", "SUSPECT", 0.3),
-        Change(105.3, "imu_1.x", "FAULTY", 0.3),
-        Change(122.0, "imu_1.x", "OK", 0.0),
-    ]
-    whole = [Change(140.0, f"imu_2.{axis}", "AMBIGUOUS", 0.5) for axis in "xyz"]
-    assert failover_text(begin + small + first + whole, CHANNELS) == (
-        "failover, if armed: IMU 1 (imu_1) out of use at 105.3 s; IMU 1 (imu_1) in use"
-        " again at 124.0 s; IMU 2 (imu_2) out of use at 140.3 s"
-    )
-    assert failover_text(begin, CHANNELS[:4]) == ""
 
 
 def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:

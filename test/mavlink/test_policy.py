@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.mavlink.failover_evidence import Evidence, RawComparison
 from fdi_ros.mavlink.failover_policy import (
+    GROUNDED,
     LASTING,
     LONGEST_PAUSE,
     PAUSE,
+    QUICK_TRIES,
     STALE_ANSWER,
+    Condition,
     Imu,
     Memory,
     PolicySettings,
@@ -62,29 +64,42 @@ def test_a_late_answer_to_a_read_is_nobodys_hand_and_a_later_one_is():
     assert reported(OUT, begin, begin + LASTING + 40 * MS).left_alone
 
 
-@pytest.mark.parametrize(("apart", "compared"), [(7, True), (9, False)])
-def test_samples_form_a_pair_within_four_tenths_of_an_interval(apart, compared):
-    raw = RawComparison(2, 20 * MS)
-    for k in range(20):
-        raw.feed(0, START + 20 * k * MS, (0.1, 0.0, 0.0))
-        # The next sample of the first comes 20 ms later, and is not compared with this.
-        raw.feed(1, START + (20 * k + apart) * MS, (0.0, 0.0, 0.0))
-    found = raw.between(0, 1, START + 400 * MS)
-    assert (found is not None) == compared
-    assert not compared or found.mean == pytest.approx((0.1, 0.0, 0.0))
+def on_the_ground(memory, now, *, named=False, use=False, boots=0):
+    """Decision about the first of three IMUs, which has agreed for long, disarmed."""
+    first = Imu(use, now, named=named, delivers=True, size=0.0, agreed=START - 10**12)
+    other = Imu(True, now, named=named, delivers=True, size=0.0, agreed=START - 10**12)
+    view = View(
+        (first, other, other),
+        linked=True,
+        disarmed=GROUNDED,
+        monitored=True,
+        boots=boots,
+    )
+    memories = (memory, Memory(seen=True), Memory(seen=True))
+    return decide(PolicyState(memories, at=now - 20 * MS), view, now, PolicySettings())
 
 
 @pytest.mark.parametrize(
-    ("rate", "factor", "named"),
-    [(20.0, 1.03, False), (20.0, 1.1, True), (20.0, 0.0, True), (0.7, 0.0, True)],
+    ("named", "condition"),
+    [(False, None), (True, Condition.STAYS_OUT), (None, Condition.UNREPORTED)],
 )
-def test_an_error_of_scale_in_a_fast_turn_is_no_clear_error(rate, factor, named):
-    """Two IMUs agree, and the third one reads the rate times a factor; no doubt."""
-    evidence = Evidence(3, 20 * MS, min_size=0.03)
-    evidence.hear([0.0] * 9, START)
-    for k in range(10):
-        now = START + k * 20 * MS
-        for unit, scale in enumerate((1.0, 1.0, factor)):
-            evidence.raw.feed(unit, now, (scale * rate, 0.0, 0.0))
-        imus = evidence.look([True] * 3, now)
-    assert [imu.named for imu in imus] == [False, False, named]
+def test_on_the_ground_an_imu_goes_back_only_where_the_monitor_reports_no_fault(
+    named, condition
+):
+    decision = on_the_ground(OUT, START + 60 * 1000 * MS, named=named)
+    assert [order.use for order in decision.orders] == ([] if condition else [True])
+    assert condition is None or (0, condition) in decision.words
+
+
+def test_a_boot_begins_anew_with_orders_that_were_not_answered():
+    """The IMU was ordered back in vain before; it is in use from the start of the next."""
+    tired = replace(OUT, held=False, tries=QUICK_TRIES + 5, back_sent=START + MS)
+    now = START + 60 * 1000 * MS
+    assert (0, Condition.STUCK_OUT) in on_the_ground(tired, now).words
+    before = on_the_ground(tired, now, boots=1)
+    assert (0, Condition.REBOOT) in before.words
+    assert not before.orders
+    after = on_the_ground(tired, now, use=True, boots=1)
+    assert not after.words
+    memory = after.state.memories[0]
+    assert (memory.ours, memory.held, memory.without_notch) == (False,) * 3

@@ -1,0 +1,142 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Orders that failover would have given in a recorded flight, had the vehicle been armed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.mavlink.failover import PARAMETERS
+from fdi_ros.mavlink.failover_evidence import DOUBTS, LARGE, SILENT, Evidence
+from fdi_ros.mavlink.failover_policy import (
+    PolicySettings,
+    PolicyState,
+    View,
+    decide,
+)
+from fdi_ros.mavlink.failover_words import imu_name
+from fdi_ros.mavlink.protocol import MS, NS
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.run import Sink
+
+INTERVAL = 20 * MS  #: The link of a vehicle brings samples at this interval, ns.
+BEGIN = 10 * NS  #: Time of the policy at the start of the recording, ns.
+BEFORE = 3 * NS  #: The policy looks at this time before a doubt, ns: IMUs gain trust,
+AFTER = 40 * NS  #: and at this time after it, ns: longer than every pause.
+
+
+class _Sample(NamedTuple):
+    at: int  # time of the policy, ns
+    rates: list[float]  # rad/s; NaN: not delivered
+    states: list[float]
+
+
+class FailoverReplay(Sink):
+    """Asks the policy of failover in a recording, with the evidence of a live vehicle.
+
+    Only the times near a doubt of the monitor or near a large raw difference are looked
+    at: nothing else can bring about an order.
+
+    Parameters
+    ----------
+    channels
+        Names of all gyro channels, three for each IMU.
+    """
+
+    def __init__(self, channels: Sequence[str]) -> None:
+        self._channels = channels
+        self._count = len(channels) // 3
+        self._settings = PolicySettings()
+        self._state = PolicyState.begin(self._count)
+        self._use = [True] * self._count
+        self._first: int | None = None  # stamp of the first sample, ns
+        self._next = 0
+        self._until = 0  # the policy is asked until this time, ns
+        self._done: list[str] = []
+        self.begin_stretch()
+
+    def begin_stretch(self) -> None:
+        """Forget what was compared: the next samples come after a long gap."""
+        self._evidence = Evidence(self._count, INTERVAL, self._settings.min_size)
+        self._delivered = [0] * self._count
+        self._waiting: deque[_Sample] = deque(maxlen=BEFORE // INTERVAL)
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Take the next samples."""
+        if not len(block):
+            return
+        count = len(self._channels)
+        self._first = int(block.stamp[0]) if self._first is None else self._first
+        rates = block.z[:, :count]
+        if block.received is not None:
+            rates = np.where(block.received[:, :count], rates, np.nan)
+        states = output.state[:, :count]
+        matters = np.isin(states, list(DOUBTS)).any(axis=1) | _is_far(rates)
+        for row, stamp in enumerate((block.stamp - self._first + BEGIN).tolist()):
+            self._until = stamp + AFTER if matters[row] else self._until
+            if stamp < self._next:
+                continue
+            self._next = stamp + INTERVAL - MS
+            sample = _Sample(stamp, rates[row].tolist(), states[row].tolist())
+            self._waiting.append(sample)
+            while stamp <= self._until and self._waiting:
+                self._ask(self._waiting.popleft())
+
+    def _ask(self, sample: _Sample) -> None:
+        """Ask the policy about one sample, and note its orders."""
+        now = sample.at
+        for k in range(self._count):
+            x, y, z = sample.rates[3 * k : 3 * k + 3]
+            if np.isfinite(x + y + z):
+                self._evidence.raw.feed(k, now, (x, y, z))
+                self._delivered[k] = now
+        self._evidence.hear(sample.states, now)
+        memories = self._state.memories
+        out = [k for k, memory in enumerate(memories) if memory.ours]
+        delivers = [now - last < SILENT for last in self._delivered]
+        imus = self._evidence.look(delivers, out, now)
+        imus = tuple(
+            imu._replace(use=use, heard=now)
+            for imu, use in zip(imus, self._use, strict=True)
+        )
+        view = View(imus, linked=True, armed=True, monitored=True)
+        decision = decide(self._state, view, now, self._settings)
+        self._state = decision.state
+        for k, in_use in decision.orders:
+            if self._use[k] != in_use:
+                words = "in use again" if in_use else "out of use"
+                at = (now - BEGIN) / NS
+                self._done.append(
+                    f"{imu_name(k, self._channels)} {words} at {at:.1f} s"
+                )
+            self._use[k] = in_use
+
+    @property
+    def text(self) -> str:
+        """The orders in one line."""
+        least = self._settings.min_size
+        none = f"no IMU would be taken out (failover_min_size {least:g} rad/s)"
+        return f"failover, if armed: {'; '.join(self._done) or none}"
+
+
+def is_possible(channels: Sequence[str]) -> bool:
+    """Return whether failover works with these channels: three for each of 2 or 3 IMUs."""
+    count, rest = divmod(len(channels), 3)
+    return 2 <= count <= len(PARAMETERS) and not rest
+
+
+def _is_far(rates: NDArray[np.float64]) -> NDArray[Any]:
+    """Return for each sample whether any two IMUs differ by `LARGE`; rates (N, 3 IMUs)."""
+    units = rates.reshape(len(rates), -1, 3)
+    low = np.nanmin(np.where(np.isnan(units), np.inf, units), axis=1)
+    high = np.nanmax(np.where(np.isnan(units), -np.inf, units), axis=1)
+    far: NDArray[Any] = (high - low >= LARGE).any(axis=1)
+    return far

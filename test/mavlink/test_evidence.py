@@ -1,0 +1,282 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Evidence against an IMU: what raw rates and the monitor's states are enough for."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from fdi_ros.core.states import ChannelState
+from fdi_ros.mavlink.failover_evidence import (
+    FORGOTTEN,
+    Evidence,
+    RawComparison,
+)
+from fdi_ros.mavlink.failover_policy import Imu
+
+MS = 1_000_000
+NS = 1000 * MS
+STEP = 20 * MS
+START = 1000 * NS
+OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = map(int, list(ChannelState)[:6])
+
+#: Rates of one IMU in rad/s, given those of the vehicle.
+Gyro = Callable[[np.ndarray], Sequence[float]]
+
+
+def sound(rate: np.ndarray) -> Sequence[float]:
+    return rate
+
+
+def zero(rate: np.ndarray) -> Sequence[float]:
+    return 0.0 * rate
+
+
+class Watched:
+    """Evidence of IMUs in a vehicle that turns by up to 1 rad/s, with noise of 2 mrad/s."""
+
+    def __init__(self, count: int = 3) -> None:
+        self.evidence = Evidence(count, STEP, min_size=0.03)
+        self.gyros: list[Gyro] = [sound] * count
+        self.states = [OK] * 3 * count
+        self.out: list[int] = []
+        self.is_reporting = True
+        self.now = START
+        self.random = np.random.default_rng(1)
+        self.run(3.0)
+
+    def rate(self, t: float) -> np.ndarray:
+        """Return the rate of the vehicle at a time since the start, rad/s."""
+        return np.array([math.sin(2.1 * t), 0.8 * math.cos(1.7 * t), 0.3 * math.sin(t)])
+
+    def run(self, seconds: float) -> "Watched":
+        for _ in range(round(seconds * NS / STEP)):
+            self.step()
+        return self
+
+    def step(self) -> Sequence[Imu]:
+        self.now += STEP
+        rate = self.rate((self.now - START) / NS)
+        for unit, gyro in enumerate(self.gyros):
+            noisy = rate + self.random.normal(0.0, 0.002, 3)
+            x, y, z = (round(value, 3) for value in map(float, gyro(noisy)))
+            self.evidence.raw.feed(unit, self.now, (x, y, z))
+        if self.is_reporting:
+            self.evidence.hear(self.states, self.now)
+        delivers = [True] * len(self.gyros)
+        return self.evidence.look(delivers, self.out, self.now)
+
+    def blamed(self, seconds: float) -> set[int]:
+        """Return the IMUs, from 0, that are blamed at some time of the next seconds."""
+        found: set[int] = set()
+        for _ in range(round(seconds * NS / STEP)):
+            found |= {k for k, imu in enumerate(self.step()) if imu.blamed}
+        return found
+
+
+def biased(size: float, axis: int = 0) -> Gyro:
+    """Return a gyro with an error on one axis, rad/s."""
+    return lambda rate: rate + size * np.eye(3)[axis]
+
+
+@pytest.mark.parametrize("size", [0.7, -1.0])
+def test_the_odd_one_of_three_is_blamed_without_the_monitor(size: float) -> None:
+    watched = Watched()
+    watched.gyros[1] = biased(size)
+    assert watched.blamed(0.06) == {1}
+    assert watched.blamed(1.0) == {1}
+
+
+# Two that are wrong alike -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("between", [0.0, 0.02, 1.0, 6.0])
+@pytest.mark.parametrize("state", [OK, FAULTY])
+def test_two_gyros_that_stand_still_do_not_outvote_a_sound_one(
+    between: float, state: int
+) -> None:
+    """One after the other, or at once; the monitor sees or does not see what they do."""
+    watched = Watched()
+    watched.gyros[0] = zero
+    watched.run(between)
+    watched.states[:3] = [state] * 3
+    watched.gyros[1] = zero
+    watched.states[3:6] = [state] * 3
+    assert 2 not in watched.blamed(8.0)
+
+
+@pytest.mark.parametrize("state", [SUSPECT, AMBIGUOUS, STALE])
+def test_two_that_the_monitor_doubts_do_not_outvote_one_that_it_does_not(
+    state: int,
+) -> None:
+    """Their values go on changing: a rate that is lost, but noise that is not."""
+    watched = Watched()
+    watched.states[:6] = [state] * 6
+    watched.gyros[:2] = [lambda rate: 0.01 * rate] * 2
+    assert 2 not in watched.blamed(8.0)
+
+
+def test_two_that_were_wrong_before_are_not_trusted_once_they_agree() -> None:
+    watched = Watched()
+    for k in (0, 1):
+        watched.gyros[k] = lambda rate: 0.01 * rate
+        watched.states[3 * k : 3 * k + 3] = [FAULTY] * 3
+        watched.run(5.0 * (1 - k))
+    watched.states = [OK] * 9
+    assert 2 not in watched.blamed(8.0)
+
+
+def test_held_imus_that_both_read_zero_do_not_agree() -> None:
+    """And neither agrees with one in use that reads zero too, beside a sound one."""
+    watched = Watched()
+    watched.gyros[:2] = [zero, lambda rate: 0.01 * rate]
+    watched.states[:6] = [FAULTY] * 6
+    watched.states[6:] = [UNCHECKED] * 3
+    watched.out = [0, 1]
+    watched.run(1.0)
+    assert all(watched.step()[k].agreed is None for k in (0, 1) for _ in range(200))
+    watched.out = [0]
+    watched.run(1.0)
+    assert all(watched.step()[0].agreed is None for _ in range(200))
+    # One that has healed agrees with the last one in use.
+    watched.out = [0, 1]
+    watched.gyros[0] = sound
+    imu = watched.run(3.0).step()[0]
+    assert imu.agreed is not None
+    assert 2 * NS <= watched.now - imu.agreed <= 3 * NS
+
+
+def test_a_gyro_that_is_stuck_does_not_agree_in_hover() -> None:
+    """Its value is within 0.03 rad/s of the others', but does not follow them."""
+    watched = Watched(2)
+    watched.rate = lambda t: np.array([0.02 * math.sin(5.0 * t), 0.0, 0.0])
+    watched.out = [0]
+    watched.gyros[0] = zero
+    watched.run(2.0)
+    assert all(watched.step()[0].agreed is None for _ in range(100))
+    watched.gyros[0] = sound
+    assert watched.run(2.0).step()[0].agreed is not None
+
+
+# What is no steady error ------------------------------------------------------------------
+
+
+def test_an_oscillation_is_no_clear_error() -> None:
+    """1.2 rad/s at 15 Hz on the axis x, and 9 Hz on y: the mean is zero."""
+    watched = Watched()
+    times = iter(np.arange(0.0, 100.0, 0.02))
+
+    def shaken(rate: np.ndarray) -> Sequence[float]:
+        t = next(times)
+        return rate + 1.2 * np.sin(2.0 * math.pi * t * np.array([15.0, 12.0, 0.0]))
+
+    watched.gyros[0] = shaken
+    assert not watched.blamed(8.0)
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.02])
+def test_an_imu_that_measures_later_is_not_blamed_in_hard_manoeuvres(
+    delay: float,
+) -> None:
+    """Up to 60 rad/s^2: 1.2 rad/s within 20 ms."""
+    watched = Watched()
+    watched.rate = lambda t: np.array([6.0 * math.sin(10.0 * t), 0.0, 0.0])
+    late = lambda rate: watched.rate((watched.now - START) / NS - delay)  # noqa: E731
+    watched.gyros[2] = late
+    watched.states[6:] = [SUSPECT] * 3
+    assert not watched.blamed(10.0)
+
+
+@pytest.mark.parametrize(
+    ("turn", "factor", "is_blamed"),
+    [(20.0, 1.03, False), (20.0, 1.15, True), (20.0, 0.0, True), (0.7, 0.0, True)],
+)
+def test_an_error_of_scale_in_a_fast_turn_is_no_clear_error(
+    turn: float, factor: float, is_blamed: bool
+) -> None:
+    watched = Watched()
+    watched.rate = lambda t: np.array([turn, 0.0, 0.0])
+    watched.gyros[2] = lambda rate: factor * rate
+    assert watched.blamed(0.5) == ({2} if is_blamed else set())
+
+
+def test_a_named_gyro_within_the_tolerance_of_scales_is_not_blamed() -> None:
+    """0.12 rad/s in a turn of 4 rad/s are 3 %; at rest they are an error."""
+    watched = Watched()
+    watched.rate = lambda t: np.array([4.0, 0.0, 0.0])
+    watched.gyros[2] = lambda rate: 1.03 * rate
+    watched.states[6] = FAULTY
+    assert not watched.blamed(2.0)
+    watched.gyros[2] = biased(0.12)
+    watched.rate = lambda t: np.array([0.2, 0.0, 0.0])
+    assert watched.blamed(2.0) == {2}
+
+
+# A name and its size ----------------------------------------------------------------------
+
+
+def test_a_name_on_another_axis_is_no_witness() -> None:
+    watched = Watched()
+    watched.states[1] = FAULTY
+    watched.gyros[0] = biased(0.2, axis=0)
+    assert not watched.blamed(3.0)
+    watched.gyros[0] = biased(0.2, axis=1)
+    assert watched.blamed(1.0) == {0}
+
+
+def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference() -> None:
+    """The monitor remembers a fault that is over; then the other gyro fails."""
+    watched = Watched(2)
+    watched.gyros[0] = biased(0.3)
+    watched.states[0] = FAULTY
+    assert watched.blamed(1.0) == {0}
+    watched.gyros[0] = sound
+    watched.run(4.0)
+    watched.gyros[1] = biased(0.3)
+    assert not watched.blamed(5.0)
+    # Named anew, it counts again.
+    watched.gyros[1] = sound
+    watched.states[0] = OK
+    watched.run(1.0)
+    watched.states[0] = FAULTY
+    watched.gyros[0] = biased(0.3)
+    assert watched.blamed(1.0) == {0}
+
+
+def test_of_three_imus_an_old_name_counts_for_the_odd_one() -> None:
+    """A fault that comes and goes while it stays declared."""
+    watched = Watched()
+    watched.states[0] = FAULTY
+    watched.run(4.0)
+    watched.gyros[0] = biased(0.1)
+    assert watched.blamed(1.0) == {0}
+    watched.gyros[:2] = [sound, biased(0.1)]
+    assert not watched.run(1.0).blamed(1.0)
+
+
+def test_a_monitor_that_died_names_nobody() -> None:
+    watched = Watched()
+    watched.states[0] = FAULTY
+    watched.run(1.0)
+    assert watched.step()[0].named is True
+    watched.is_reporting = False
+    assert watched.run(0.8 * FORGOTTEN / NS).step()[0].named is True
+    found = watched.run(0.3 * FORGOTTEN / NS).step()
+    assert [(imu.named, imu.ok) for imu in found] == [(None, False)] * 3
+
+
+@pytest.mark.parametrize(("apart", "compared"), [(7, True), (9, False)])
+def test_samples_form_a_pair_within_four_tenths_of_an_interval(
+    apart: int, compared: bool
+) -> None:
+    raw = RawComparison(2, STEP)
+    for k in range(20):
+        raw.feed(0, START + 20 * k * MS, (0.1, 0.0, 0.0))
+        # The next sample of the first comes 20 ms later, and is not compared with this.
+        raw.feed(1, START + (20 * k + apart) * MS, (0.0, 0.0, 0.0))
+    found = raw.between(0, 1, START + 400 * MS)
+    assert (found is not None) == compared
+    assert not compared or found.mean == pytest.approx((0.1, 0.0, 0.0))

@@ -1,0 +1,62 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Orders of failover in a recording: the same evidence as on a live vehicle."""
+
+import numpy as np
+import pytest
+
+from fdi_ros.config.config import Config
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.failover import FailoverReplay, is_possible
+from fdi_ros.replay.run import Walk
+
+CONFIG = Config.of("ardupilot")
+NAMES = CONFIG.channel_names
+INTERVAL = 20_000_000
+
+
+def recorded(seconds=80.0, seed=1):
+    """Rates of three IMUs in gentle motion, (N, 9) rad/s."""
+    t = np.arange(0.0, seconds, INTERVAL * 1e-9)
+    rates = np.column_stack(
+        [0.5 * np.sin(0.8 * t), 0.4 * np.cos(1.1 * t), 0.3 * np.sin(0.5 * t)]
+    )
+    noise = np.random.default_rng(seed).normal(0.0, 0.002, (len(t), 9))
+    return np.round(np.tile(rates, 3) + noise, 3)
+
+
+def orders(rates):
+    """Orders in a recording, by what is said before " at ", and their times, s."""
+    replay = FailoverReplay(NAMES)
+    stamp = 10**18 + INTERVAL * np.arange(len(rates))
+    Walk(Pipeline(CONFIG), [replay]).take(Block(stamp, rates))
+    _, _, text = replay.text.partition(": ")
+    pairs = [order.split(" at ") for order in text.split("; ")]
+    return [(words, float(time.split()[0])) for words, time in pairs]
+
+
+def test_a_healthy_recording_has_no_order():
+    replay = FailoverReplay(NAMES)
+    Walk(Pipeline(CONFIG), [replay]).take(Block(INTERVAL * np.arange(4000), recorded()))
+    assert replay.text == "failover, if armed: nothing to do"
+
+
+@pytest.mark.parametrize(
+    ("error", "latest"), [((0.0, 0.2, 0.0), 0.3), ((0.7, -0.9, 0.8), 0.1)]
+)
+def test_the_orders_of_failover_in_a_recording(error, latest):
+    """Of a whole unit the raw rates alone are enough before the monitor names any axis."""
+    rates = recorded()
+    rates[2000:2500, 3:6] += error
+    (out, begin), (back, end) = orders(rates)
+    assert out == "IMU 2 (imu_2) out of use"
+    assert back == "IMU 2 (imu_2) in use again"
+    assert 40.0 <= begin <= 40.0 + latest
+    assert 52.0 <= end <= 52.5
+
+
+def test_failover_works_with_two_or_three_imus_of_three_channels():
+    counts = [n for n in range(20) if is_possible(NAMES[:1] * n)]
+    assert counts == [6, 9]
