@@ -284,7 +284,12 @@ def decide(
     lost, since = _lanes(state, memories, view, now)
     announced = dict(state.announced)
     words = []
-    for key, condition in _conditions(memories, view, now, lost):
+    # Without a link nobody would read them.
+    found = _conditions(memories, view, now, lost) if view.linked else []
+    for key, condition in found:
+        if condition is Condition.FINE and memories[key].apart_since is not None:
+            # Off, but not for long, or nobody is the odd one: not the words "no fault".
+            continue
         usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
         last = announced.get(key, Announced(usual, now))
         is_late = condition in REPEATED and now - last.at >= REPEAT

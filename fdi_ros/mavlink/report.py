@@ -190,6 +190,8 @@ STANDING = (
     2 * NS
 )  #: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
 GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
+#: Raw rates of healthy gyros, in whole mrad/s and averaged, differ by less, rad/s.
+ROUNDED = 0.005
 FROZEN = "FROZEN"  #: State of an undeclared channel whose unit repeats old values.
 _STATES = {
     "FAULTY": (CRITICAL, "faulty"),
@@ -310,7 +312,7 @@ class Announcer:
             return False
         unit = next(k for k, one in enumerate(self._units) if names[0] in one)
         error = max(map(self._errors.__getitem__, names))
-        return self._raw_apart(unit) < min(GRAVE, error / 2)
+        return self._raw_apart(unit) < min(GRAVE, max(ROUNDED, error / 2))
 
     def _alike(self) -> list[tuple[str, ...]]:
         """Return the changed channels in groups that share a text: a set, or a whole unit."""

@@ -188,11 +188,13 @@ def test_beside_failover_a_name_waits_while_the_raw_rates_contradict_it() -> Non
     assert ground.hear(report("imu_1.x", "FAULTY"), wait=5.0) == []
     assert ground.hear(report("imu_1.x", "OK")) == []
     assert ground.hear(report("imu_1.x", "FAULTY", error="0.3")) == []
+    assert ground.hear(report("imu_1.x", "FAULTY", error="0.0037")) == []
     for unit in (2, 3):
         told = [(CRITICAL, f"FDI: imu_{unit}.y faulty")]
         assert ground.hear(report(f"imu_{unit}.y", "FAULTY")) == told
     apart[0] = 0.1
-    assert ground.hear() == [(CRITICAL, "FDI: imu_1.x faulty")]
+    large = report("imu_1.x", "FAULTY", error="0.3")
+    assert ground.hear(large) == [(CRITICAL, "FDI: imu_1.x faulty")]
     apart[0] = 0.012
     harmless = report("imu_1.z", "FAULTY", error="-0.012")
     assert ground.hear(harmless) == [(WARNING, "FDI: imu_1.z faulty")]

@@ -249,6 +249,20 @@ def test_a_clear_error_while_the_others_differ_names_nobody(flying: Monitored) -
     assert not flying.autopilots[0].sets
 
 
+def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
+    """IMU 2 is the odd one for long, then nobody is, then it is again."""
+    flying.fault(2, 0.2, [UNCHECKED] * 3, seconds=7.0)
+    assert flying.texts[-1] == "IMU 2 (imu_2) differs from the others"
+    flying.fault(1, 0.6, [UNCHECKED] * 3)
+    flying.states[6:] = [UNCHECKED] * 3
+    flying.run(10.0)
+    assert "no two IMUs agree" in flying.texts
+    flying.fault(1, 0.0, [UNCHECKED] * 3, seconds=4.0)
+    assert not any("no fault" in text for text in flying.texts)
+    flying.heal(2, 2.0)
+    assert "IMU 2 (imu_2) in use, no fault" in flying.texts
+
+
 def test_an_imu_that_healed_while_the_link_was_cut_stays_in_use(
     flying: Monitored,
 ) -> None:

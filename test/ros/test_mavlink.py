@@ -146,8 +146,8 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(
         assert "failover over an unsigned link" in process.said()
 
 
-def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(
-    quiet_domain, tmp_path
+def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_fault(
+    quiet_domain, compiled, tmp_path
 ) -> None:
     autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
@@ -155,19 +155,21 @@ def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(
     file.write_text(
         f'{{"system_id": 1, "out_of_use": [2], "autopilot_booted": {booted}}}'
     )
-    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (
-        ears,
-        _,
-    ):
+    failover = {"failover": "ardupilot", "failover_file": file}
+    with linked_over_udp(autopilot, **failover) as (ears, _):
         assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
     assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
     autopilot.armed = False
-    with linked_over_udp(autopilot, failover="ardupilot", failover_file=file) as (
-        ears,
-        _,
+    with linked_over_udp(autopilot, **failover) as (ears, _):
+        told = (4, "FDI: IMU 2 (imu_2) out of use, monitor silent")
+        assert wait(lambda: told in autopilot.texts), autopilot.texts
+    assert autopilot.parameters["INS_USE2"] == 0.0, "nothing is known of it"
+    with (
+        running("fdi_node", ROOT / "config" / "ardupilot.yaml") as monitor,
+        linked_over_udp(autopilot, **failover) as (ears, _),
     ):
-        assert ears.says("link", "ArduPilot, system 1")
-    assert autopilot.parameters["INS_USE2"] == 1.0
+        assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
+    assert autopilot.parameters["INS_USE2"] == 1.0, "at the stop at the latest"
     assert '"out_of_use": []' in file.read_text()
 
 
