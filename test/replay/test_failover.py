@@ -40,7 +40,9 @@ def orders(rates):
 def test_a_healthy_recording_has_no_order():
     replay = FailoverReplay(NAMES)
     Walk(Pipeline(CONFIG), [replay]).take(Block(INTERVAL * np.arange(4000), recorded()))
-    assert replay.text == "failover, if armed: nothing to do"
+    assert replay.text == (
+        "failover, if armed: no IMU would be taken out (failover_min_size 0.03 rad/s)"
+    )
 
 
 @pytest.mark.parametrize(
