@@ -42,6 +42,7 @@ PARTS = {
     "cost": ("cost", "measure", "FIGURES"),
     "vibration": ("vibration", "measure", "FIGURES"),
     "physics": ("physics", "measure", "FIGURES"),
+    "accelerometers": ("accelerometers", "measure", "FIGURES"),
     "calibration": ("calibration", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""

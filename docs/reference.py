@@ -91,6 +91,7 @@ WHEN = {
     "accelerometers.max_drift": "You know what a healthy bias may do.",
     "accelerometers.max_acceleration": "Their range is another one.",
     "accelerometers.axes": "The accelerometers of an array point elsewhere than its gyros.",
+    "accelerometers.position_std": "Positions are known better, or worse, than that.",
     "accelerometers.positions": "The units are more than a few centimetres apart.",
 }
 """When one would change a parameter."""

@@ -570,6 +570,16 @@ class AccelerometersConfig:
         each=3,
         other_lengths=(0,),
     )
+    position_std: tuple[float, ...] = setting(
+        (),
+        "standard deviation of a position along each axis, one value for all but the first, or one per place; empty:"
+        " 0.02 without positions, else 0",
+        "m",
+        0.0,
+        10.0,
+        per="place",
+        other_lengths=(0, 1),
+    )
 
 
 # Parameters of the nodes that are no settings of the monitor ---------------------------------------------------------

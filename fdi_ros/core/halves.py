@@ -13,9 +13,13 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.records import Core, Sample
+from fdi_ros.compiling.compiled import Vector, compiled
+from fdi_ros.core.records import Core, Sample, Turning
 from fdi_ros.model.samples import Array
+
+TURN_TIME = 0.05
+"""Time constant of the rotation that displaces accelerometers, s: a block and a little more.
+The derivative of single samples is mostly noise."""
 
 
 @compiled
@@ -36,8 +40,45 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
     if half == 1:
         if settings.lever:
             take_off_lever_arms(core, gyros, given.z)
+        follow_turn(core.turning, gyros.last.rate, sample.stamp)
         for i in range(settings.n):
             given.z[i] /= settings.natural
+            core.sample.displaced[i] = displaced_variance(core, i)
+
+
+@compiled
+def follow_turn(turning: Turning, rate: Vector, stamp: int) -> None:
+    """Follow the rotation of the body with the fused rate (3,) of a sample, rad/s."""
+    since = (stamp - turning.stamp) * 1e-9
+    turning.stamp = stamp
+    if not math.isfinite(rate[0]):
+        return
+    for a in range(3):
+        step = rate[a] - turning.rate[a]
+        turning.rate[a] += step * min(since / TURN_TIME, 1.0)
+        turning.acceleration[a] = step / TURN_TIME if since < TURN_TIME else 0.0
+
+
+@compiled
+def displaced_variance(core: Core, i: int) -> float:
+    """Variance of accelerometer i by what is unknown of its position, (m/s^2)^2 over natural^2.
+
+    A displacement r adds ``r . v`` along the axis h, with ``v = h x alpha + omega
+    (omega . h) - omega^2 h``.
+    """
+    settings, turning = core.settings, core.turning
+    variance = settings.position_variance[i]
+    if variance == 0.0:
+        return 0.0
+    omega, alpha, h = turning.rate, turning.acceleration, settings.sensors.axes[i]
+    along = omega[0] * h[0] + omega[1] * h[1] + omega[2] * h[2]
+    speed = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
+    square = 0.0
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        by = h[b] * alpha[c] - h[c] * alpha[b] + omega[a] * along - speed * h[a]
+        square += by * by
+    return float(variance * square / settings.natural**2)
 
 
 @compiled

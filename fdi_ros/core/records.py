@@ -209,6 +209,8 @@ class SampleInput:
     beyond: Mask  # channels out of range, or unusable in this sample by themselves
     acceleration: Vector  # body angular acceleration, rad/s^2
     bias_std: Channels  # standard deviation of each channel's initial bias, rad/s
+    # variance by the unknown positions of accelerometers in the present turn, (rad/s)^2
+    displaced: Channels
     interrupted: Flag  # a hole in the stream precedes this sample
     held: Flag  # a manoeuvre has just driven a channel out of range: evidence is void
     repeated: Flag  # a unit repeats old values while the others move: no evidence
@@ -438,6 +440,15 @@ class Acceleration:
 
 
 @record
+class Turning:
+    """Rotation of the body without the noise of single samples, for lever arms."""
+
+    stamp: Whole  # of the last sample, ns
+    rate: Vector  # fused rate through a low pass of the first order, rad/s
+    acceleration: Vector  # its derivative, rad/s^2
+
+
+@record
 class Parity:
     """Information A and gain G, and working memory for both."""
 
@@ -547,6 +558,9 @@ class PathSettings:
     places: Counts  # index of each accelerometer in a sample
     arms: Axes  # position of each accelerometer from the first unit, m
     lever: Flag  # a position is not zero
+    position_variance: (
+        Channels  # of what is unknown of each position, along an axis, m^2
+    )
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
@@ -639,6 +653,7 @@ class Core:
     correction: Channels  # last estimated error, subtracted from each channel, rad/s
     remaining: Channels  # standard deviation of unknown errors by the residuals, rad/s
     acceleration: Acceleration
+    turning: Turning
     decision: Decision
     excluded: Mask  # taken out by the operator
     # prediction by the others when the present value of each channel first came, rad/s,

@@ -215,6 +215,7 @@ def add_noise(
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
         bent = params.nonlinearity[i] * speed
         inference.covariance[i, i] += noise + kf.peak_extra[i] * part + bent * bent
+        inference.covariance[i, i] += kf.displaced[i]
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part

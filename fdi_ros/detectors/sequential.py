@@ -37,6 +37,7 @@ from fdi_ros.detectors.sums import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
+    follow_displacement,
     judge_block,
     learn,
     predict_innovation_covariance,
@@ -273,6 +274,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
         # No block says yet how the body moves, but the sample does.
         project(params.layout, kf.states, kf.at)
         update_weights(params, kf)
+    follow_displacement(params, kf, sample.displaced)
     update_statistics(params, kf)
     find_outliers(params, kf, sample.z)
     if kf.judged == 0:

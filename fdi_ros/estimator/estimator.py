@@ -238,6 +238,8 @@ class Estimator:
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels  # lately largest, (rad/s)^2
     bent: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
+    displaced: Channels  # variance by unknown positions, lately largest, (rad/s)^2
+    allowed: Channels  # that much of it is in the covariance of samples
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2

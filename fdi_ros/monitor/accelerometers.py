@@ -23,6 +23,8 @@ from fdi_ros.model.samples import Array, Block
 #: specific force and its change for which the level after one more loss is foretold,
 #: m/s^2 and m/s^3
 FORETOLD_FORCE, FORETOLD_CHANGE = 20.0, 200.0
+#: standard deviation of a position along an axis where none is given, m
+UNKNOWN_POSITION = 0.02
 #: not used: accelerometers are never at rest
 NO_AVERAGE: dict[str, Value] = {"bias.startup_bias_duration": 0.0, "bias.fixed": ()}
 
@@ -154,6 +156,17 @@ def lever_arms(config: Config, units: Sequence[int]) -> Array:
     if not len(positions):
         return np.zeros((each * len(units), 3))
     return np.repeat(positions[list(units)], each, axis=0)
+
+
+def position_variance(config: Config, units: Sequence[int]) -> Array:
+    """Variance of what is unknown of the position of each accelerometer along an axis, (m,) m^2.
+
+    Positions are counted from the first place, whose own is known.
+    """
+    own, each = config.accelerometers, 3 if config.has_units else 1
+    std = own.position_std or (0.0 if own.positions else UNKNOWN_POSITION,)
+    of_units = [0.0 if unit == 0 else std[unit % len(std)] for unit in units]
+    return np.repeat(np.square(of_units), each)
 
 
 def felt_units(block: Block) -> tuple[int, ...]:

@@ -38,6 +38,7 @@ from fdi_ros.monitor.accelerometers import (
     felt_units,
     lever_arms,
     places,
+    position_variance,
     possible_names,
     possible_units,
 )
@@ -316,6 +317,8 @@ class Pipeline:
             arms = lever_arms(self.config, units)
             settings["places"][: len(arms)] = places(self.config, units)
             settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
+            variance = position_variance(self.config, units)
+            settings["position_variance"][: len(arms)] = variance
             if self._in_flight:
                 other.prepare()
             self._built[units] = other

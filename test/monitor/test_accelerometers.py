@@ -132,6 +132,41 @@ def test_known_lever_arms_are_taken_off():
     assert corrected < 1.2 * NOISE < 2 * NOISE < residual()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_unknown_lever_arms_are_no_faults_and_are_in_the_covariance(seed):
+    """Units 0.1 m apart in turns of 6 rad/s: 3.6 m/s^2 beside noise of 0.15."""
+    block, force = flight(1500, seed=seed, arms=ARMS, size=6.0, scale=0.005, bias=0.2)
+    given = {"accelerometers__scale_std": 0.005, "accelerometers__turn_on_std": 0.2}
+
+    def output(**changes):
+        return Pipeline(settings(**given, **changes)).process(block).acceleration
+
+    assert [
+        one for one in output(accelerometers__position_std=0.0).events if one.declares
+    ]
+    for changes, most in (({}, 2.5), ({"accelerometers__position_std": 0.05}, 1.0)):
+        allowed = output(**changes)
+        assert not [one for one in allowed.events if one.declares]
+        error = (allowed.rate - force)[200::20]
+        inverse = np.linalg.inv(allowed.covariance[200::20])
+        assert 0.4 < np.einsum("ki,kij,kj->k", error, inverse, error).mean() / 3 < most
+        assert (np.abs(allowed.rate - force) < allowed.level).all()
+
+
+def test_positions_that_are_given_are_known_unless_their_error_is_given():
+    given = {"accelerometers__positions": ARMS.ravel().tolist()}
+    for changes, expected in (
+        ({}, (0.0, 0.02, 0.02)),
+        (given, (0.0, 0.0, 0.0)),
+        ({"accelerometers__position_std": 0.1}, (0.0, 0.1, 0.1)),
+        (given | {"accelerometers__position_std": [0.0, 0.1, 0.3]}, (0.0, 0.1, 0.3)),
+    ):
+        pipeline = Pipeline(settings(accelerometers__enabled="on", **changes))
+        variance = pipeline.accelerometers.core["settings"]["position_variance"]
+        expected = np.repeat(np.square(expected), 3)
+        np.testing.assert_allclose(variance[0, :9], expected, rtol=1e-12)
+
+
 def sent(block, absent=()):
     """The Imu messages of a block, unit and bytes; some units give no accelerations."""
     for k, stamp in enumerate(block.stamp.tolist()):
@@ -148,7 +183,9 @@ def test_message_by_message_equals_the_block():
         ["channel=imu_1.accel_z kind=bias size=4 start=2"],
         Pipeline(settings(accelerometers__enabled="on")).channel_names,
     )
-    ear, offline = Ear(Pipeline(settings())), Pipeline(settings())
+    # With positions unknown, the rate counts, too, which has seen one sample more.
+    known = settings(accelerometers__position_std=0.0)
+    ear, offline = Ear(Pipeline(known)), Pipeline(known)
     for unit, data in sent(block):
         ear.take(unit, data)
     read = np.array([ImuSource.parse(data, 6)[1] for data in ear.fused])
