@@ -3,6 +3,7 @@
 
 """The Python interface: what a script may pass, and what it gets back."""
 
+import numpy as np
 import pytest
 from conftest import ROOT
 
@@ -34,3 +35,35 @@ def test_shipped_parameter_files_are_found_by_their_names(name, tmp_path, monkey
     assert fdi_ros.Config.from_file("px4").hardware_id == "mine"
     with pytest.raises(ConfigError, match="cannot read config px5"):
         fdi_ros.Config.from_file("px5")
+
+
+@pytest.mark.parametrize(
+    ("interval", "count", "is_refused"),
+    [
+        (1, 100, True),  # numbers of samples
+        (10, 51, True),  # milliseconds
+        (10_000, 100, True),  # microseconds
+        (10_000_000, 100, False),
+        (50_000, 100, False),  # a burst
+        (1, 50, False),  # too few to tell
+    ],
+)
+def test_stamps_in_another_unit_than_nanoseconds_are_refused(
+    interval, count, is_refused
+):
+    pipeline = fdi_ros.Pipeline("two_imus")
+    rates = np.random.default_rng(1).normal(0.0, 0.002, (count, 6))
+    block = fdi_ros.Block(10**9 + interval * np.arange(count), rates)
+    if not is_refused:
+        assert len(pipeline.process(block)) == count
+        return
+    with pytest.raises(ConfigError, match="expected nanoseconds, about"):
+        pipeline.process(block)
+    assert pipeline.status().samples == 0
+
+
+def test_a_block_has_the_arrays_that_the_page_on_python_names():
+    block = next(fdi_ros.read(ROOT / "bags" / "cone_flight", "two_imus"))
+    assert (block.stamp.dtype, block.z.dtype) == (np.int64, np.float64)
+    assert block.z.shape == (len(block.stamp), 6)
+    assert 0.009 < np.median(np.diff(block.stamp)) * 1e-9 < 0.011

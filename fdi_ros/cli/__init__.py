@@ -1,6 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: one module declares all verbs, the others have what they do, by kind."""
+"""The command line: `command_line` declares the verbs, the other modules run them."""
 
-STOPPED = 130  # exit code, as a shell has it of what the keyboard has interrupted
+STOPPED = 130
+"""Exit code after a signal, as a shell reports it after an interrupt."""

@@ -1,9 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The process of ``fdi`` from its first moment to its last; ``python -m fdi_ros.cli`` where no script is installed.
+"""The process of ``fdi``. Without an installed script, ``python -m fdi_ros.cli`` starts the same.
 
-Little is imported here: before `fdi` runs a signal has Python's own handler, which prints a traceback.
+This module imports little: until `fdi` runs, Python's own handler answers a signal with a
+traceback.
 """
 
 from __future__ import annotations
@@ -17,21 +18,23 @@ from types import FrameType
 from fdi_ros.cli import STOPPED
 from fdi_ros.signals import heeded
 
-PATIENCE = 2.0  # s in which further signals do not disturb the end: what is half written is removed
+PATIENCE = 2.0
+"""Time after the first signal in which others are ignored, s: fdi removes unfinished files."""
 
 
 class Stop:
-    """Handler of signals: the first is as from the keyboard, and one that comes much later ends the process at once.
+    """Handler of signals: the first one interrupts the verb, a much later one ends the process.
 
-    So does the first while nothing is open yet.
+    Before a verb runs, the first signal ends the process, too.
     """
 
     def __init__(self) -> None:
         self.running = False
-        self.asked: float | None = None  # when
+        self.asked: float | None = None
+        """Time of the first signal, s on the monotonic clock. None: no signal yet."""
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take a signal."""
+        """Handle a signal."""
         now = time.monotonic()
         if not self.running or (self.asked is not None and now - self.asked > PATIENCE):
             os._exit(STOPPED)
@@ -41,14 +44,15 @@ class Stop:
 
 
 def fdi() -> int:
-    """Run the command line; return its exit code."""
+    """Run the command line and return its exit code."""
     stop = Stop()
     stopping = heeded()
     for number in stopping:
         signal.signal(number, stop)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
-            # Closed (>&-): whatever is opened next would get its number, and what is printed.
+            # The stream is closed (>&-). Otherwise the next file to be opened gets its
+            # number, and with it all printed text.
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
             setattr(sys, name, open(descriptor, "w", encoding="utf-8", closefd=False))  # noqa: SIM115, until the end
     from fdi_ros.cli.command_line import main
@@ -60,7 +64,7 @@ def fdi() -> int:
         return STOPPED
     finally:
         for number in stopping:
-            # While Python ends, it gives signals their first effect back; what is ignored stays so.
+            # At exit Python restores the original handlers, but keeps ignored signals ignored.
             signal.signal(number, signal.SIG_IGN)
 
 

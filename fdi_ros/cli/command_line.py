@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: its verbs, what each takes, and what an end of one means; what they do stands in other modules.
+"""Declares the verbs of the command line with their arguments, runs one, and returns its exit code.
 
-Neither NumPy nor Numba is imported before a verb runs: usage errors come at once, and help without the compiler.
+Neither NumPy nor Numba is imported before a verb runs, so that usage errors and help come at once.
 """
 
 from __future__ import annotations
@@ -30,42 +30,45 @@ from fdi_ros.errors import FdiError
 from fdi_ros.system import BAGS, POOL, PROGRESS, require, resolve, shipped_files
 from fdi_ros.system.text import LINE, did_you_mean, shown
 
-# Verbs ----------------------------------------------------------------------------------------------------------------
+# Verbs
 
-Options = Mapping[
-    str, Any
-]  # what argparse is told of an argument, or of it beside what `SHARED` says
+Options = Mapping[str, Any]
+"""Keyword arguments of argparse for one argument. Those in `SHARED` need not be repeated."""
 
 
 class Verb(NamedTuple):
     """One verb."""
 
     meaning: str
-    examples: Sequence[str]  # the first is the one to begin with
-    arguments: Mapping[
-        str, Options
-    ]  # by name, several names with spaces between; what is not said is as in `SHARED`
-    run: str  # module of this folder and function, which returns the exit code
-    libraries: Sequence[str] = ()  # that the verb needs and a live node does not
+    """What the verb does, for the help."""
+    examples: Sequence[str]
+    """Examples for the help, the simplest first."""
+    arguments: Mapping[str, Options]
+    """Arguments by name. Spaces separate several names of one argument."""
+    run: str
+    """Module of this folder and function, which returns the exit code."""
+    libraries: Sequence[str] = ()
+    """Libraries that the verb needs, but a live node does not."""
 
 
 def takes(words: str, **options: Any) -> Options:
-    """Return what argparse is told of an argument, help first."""
+    """Return the options of an argument, its help first."""
     return {"help": words, **options}
 
 
 def takes_path(words: str = "", **options: Any) -> Options:
-    """Return what it is told of a path."""
+    """Return the options of a path."""
     return {"type": Path, "metavar": "FILE", "help": words, **options}
 
 
 def shipped(kind: str) -> str:
-    """List the shipped files of a kind, for a help."""
+    """Return the names of the shipped files of a kind, for the help."""
     return ", ".join(path.name for path in shipped_files() if path.parent.name == kind)
 
 
 _CONFIG = "ROS 2 parameter file{}, a shipped one by its name alone; may be repeated, later ones win"
-DETECTOR_NAMES = ", ".join(reversed(DETECTORS))  # for a help, the one that flies first
+DETECTOR_NAMES = ", ".join(reversed(DETECTORS))
+"""Names of the detectors for the help, the default first."""
 SHARED: Mapping[str, Options] = {
     "bag": takes_path(
         "rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file",
@@ -111,14 +114,11 @@ SHARED: Mapping[str, Options] = {
         metavar="ADDRESS",
     ),
 }
-"""Arguments of several verbs."""
+"""Arguments that several verbs share."""
 PART: Mapping[str, Options] = {"--start": {}, "--end": {}}
 WORKERS: Mapping[str, Options] = {"--workers": {}, "--scheduler": {}}
-RESULTS: Mapping[str, Options] = {
-    "--json": {},
-    "--force": {},
-    "--quiet": {},
-}  # what every verb takes that has results
+RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}
+"""Arguments of every verb with results."""
 _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
     **PART,
@@ -134,7 +134,7 @@ _SETTINGS: Mapping[str, Options] = {
         metavar="RECORDING",
     ),
 }
-"""What settings are made of, and where they are written."""
+"""Arguments of the verbs that make settings."""
 VERBS = {
     "setup": Verb(
         "make a config from a recording: topics, mounts, delays, biases, noise; with a page of the results",
@@ -422,11 +422,13 @@ VERBS = {
         "settings:run_compile",
     ),
 }
-FIRST = ("inspect", "setup", "replay", "watch")  # what one needs first
+FIRST = ("inspect", "setup", "replay", "watch")
+"""Verbs that a new user needs first."""
 
-# A run ----------------------------------------------------------------------------------------------------------------
+# A run
 
-DEFECT = 70  # EX_SOFTWARE of sysexits.h
+DEFECT = 70
+"""Exit code for a defect of fdi: EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
     "Exit codes: 0 done, and the verdict is good; 1 a replay does not meet its --check; 2 wrong arguments or input"
     " (one line on standard error); 3 a verdict that needs action; 4 a verdict that leaves a question open;"
@@ -437,16 +439,23 @@ EXIT_CODES = (
 def main(
     argv: Sequence[str] | None = None, stopped: Callable[[], bool] = lambda: False
 ) -> int:
-    """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70.
+    """Run a verb and return its exit code.
 
-    ``stopped``: whether a signal has come; what it broke off may have failed in any way.
+    A known error is one line and exit code 2, a defect a traceback and exit code 70.
+
+    Parameters
+    ----------
+    argv
+        Arguments of the command. None: those of the process.
+    stopped
+        Returns whether a signal has arrived. The interrupted work may then fail in any way.
     """
     try:
         code = _run(argv)
         sys.stdout.flush()
         return code
     except SystemExit:
-        # Of argparse: help, version, or a usage error.
+        # argparse exits after help, version and usage errors.
         try:
             sys.stdout.flush()
         except BrokenPipeError:
@@ -455,7 +464,7 @@ def main(
     except KeyboardInterrupt:
         return STOPPED
     except BrokenPipeError:
-        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
+        # The reader of the output has gone (fdi ... | head): no error, and no output at exit.
         _let_go_of_output()
         return 0
     except Exception as error:
@@ -472,9 +481,9 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            # What a terminal cannot show is escaped.
+            # Escape characters that the terminal cannot show.
             stream.reconfigure(errors="backslashreplace")
-    # That something has to be compiled is no error: with --quiet it is not logged.
+    # With --quiet only errors are logged, and compiling is none.
     logging.getLogger("fdi_ros").setLevel(
         logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET
     )
@@ -484,7 +493,7 @@ def _run(argv: Sequence[str] | None) -> int:
         f"fdi_ros.cli.{verb.run}"
     )
     if "quiet" not in given:
-        # What has no results, `fdi watch`, does not wait for the compiler.
+        # `fdi watch` has no results and does not wait for the compiler.
         return run(given)
     from fdi_ros.compiling.notice import announced
 
@@ -493,7 +502,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def run_watch(arguments: argparse.Namespace) -> int:
-    """Show a running monitor until interrupted; here it does not wait for what the other verbs import."""
+    """Show a running monitor until interrupted, without the imports of the other verbs."""
     from fdi_ros.ros.process import NO_ROS
 
     try:
@@ -504,7 +513,7 @@ def run_watch(arguments: argparse.Namespace) -> int:
 
 
 def _failure(error: Exception) -> int:
-    """Say what has ended a verb, in one line or as a defect; return the exit code."""
+    """Print the error that ended a verb, in one line or as a defect and return the exit code."""
     if isinstance(error, FdiError):
         words = str(error)
     elif isinstance(error, MemoryError):
@@ -516,8 +525,8 @@ def _failure(error: Exception) -> int:
         with contextlib.suppress(OSError):
             traceback.print_exception(error)
             print(
-                f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the"
-                " lines above and the command, to the maintainers named in its package.xml",
+                f"fdi: this is a defect of fdi {__version__}, not of your input: please report the command and the"
+                " lines above to the maintainers named in its package.xml",
                 file=sys.stderr,
             )
         return DEFECT
@@ -526,28 +535,28 @@ def _failure(error: Exception) -> int:
     except OSError:
         _let_go_of_output()
     with contextlib.suppress(OSError):
-        # An error quotes what it refuses, which may come from anywhere.
+        # An error quotes its input, which may be hostile.
         print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
     return 2
 
 
 def _let_go_of_output() -> None:
-    """Have what is left of standard output go nowhere: it would be tried once more at exit."""
+    """Discard the rest of standard output, which Python would try to write again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-# Parser ---------------------------------------------------------------------------------------------------------------
+# Parser
 
 
 class _Parser(argparse.ArgumentParser):
-    """Quotes what it refuses as it may be shown; parsers of verbs are of its kind."""
+    """Parser whose errors are safe to show in a terminal. The parsers of verbs derive from it."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong, and end."""
+        """Print an error and exit."""
         super().error(shown(message, LINE))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a verb or a choice that is unknown, with the closest one."""
+        """Refuse an unknown verb or choice, and suggest the closest one."""
         choices = tuple(action.choices or ())
         if choices and value not in choices:
             name = str(action.metavar or action.option_strings[0])
@@ -556,7 +565,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _refuse(parser: argparse.ArgumentParser, verb: str, words: Sequence[str]) -> None:
-    """Refuse words that a verb does not take, with the closest option for the first."""
+    """Refuse unknown arguments of a verb, and suggest the closest option for the first one."""
     if not words:
         return
     unknown = next((word for word in words if word.startswith("-")), "")
@@ -573,7 +582,7 @@ def _refuse(parser: argparse.ArgumentParser, verb: str, words: Sequence[str]) ->
 
 
 class _PrintCompletion(argparse.Action):
-    """Prints a completion script: made once, it costs nothing at each key, and the shell needs no Python for it."""
+    """Prints a completion script, which the shell can run without Python."""
 
     def __call__(
         self,
@@ -582,7 +591,7 @@ class _PrintCompletion(argparse.Action):
         values: Any,
         option_string: Any = None,
     ) -> None:
-        """Print it and end."""
+        """Print the script and exit."""
         try:
             require("--print-completion", ("shtab",))
         except FdiError as error:
@@ -599,22 +608,21 @@ class _PrintCompletion(argparse.Action):
 
 
 def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
-    """Mark every argument that is a path or a detector, of the verbs too; the parser serves nothing else then."""
+    """Mark all paths and detectors among the arguments of a parser and its verbs, for shtab."""
     for action in parser._actions:
         if action.type in (Path, resolve) or action.dest == "paths":
-            vars(action)["complete"] = files  # shtab's own attribute
+            vars(action)["complete"] = files  # attribute of shtab
         if action.metavar == "NAME" and action.dest in ("detector", "compare"):
             action.choices = DETECTORS
         if isinstance(action, argparse._SubParsersAction):
-            action.help = (
-                None  # what is hidden from the help would be from the completion
-            )
+            # shtab would hide from the completion whatever the help hides.
+            action.help = None
             for verb in action.choices.values():
                 _complete(verb, files)
 
 
 class _FaultKinds:
-    """Looked up when the help is printed: it needs NumPy."""
+    """Kinds of faults, looked up only when the help is printed, because this needs NumPy."""
 
     def __str__(self) -> str:
         from fdi_ros.faults.kinds import FAULT_KINDS
@@ -666,7 +674,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _overview() -> str:
-    """Say what there is: first what one needs first, with an example each."""
+    """Return the list of verbs. Those that a new user needs first have an example."""
     width = max(40, min(shutil.get_terminal_size().columns, 110))
     wide = max(map(len, VERBS)) + 2
 

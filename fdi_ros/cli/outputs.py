@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a verb says and writes: progress, words, files that replace nothing but a former result of their kind."""
+"""Output of the verbs: progress, text, and files, which replace only an earlier result of their kind."""
 
 from __future__ import annotations
 
@@ -36,22 +36,36 @@ from fdi_ros.system.files import (
 )
 from fdi_ros.system.text import LINE, shown, visible
 
-# Progress -------------------------------------------------------------------------------------------------------------
+# Progress
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TIMED_FORMAT = "{desc}, {elapsed}"
-SAID_EVERY = 10.0  # how often the share done is said where there is no terminal, s
-_TICK = 1.0  # how often the time is drawn anew, s
+SAID_EVERY = 10.0
+"""Period of the progress lines without a terminal, s."""
+_TICK = 1.0
+"""Period at which the bar in a terminal is refreshed, s."""
 
 
 @contextmanager
 def progress(
     stream: TextIO, quiet: bool, what: str = "", timed: bool = False
 ) -> Iterator[Callable[[float], None]]:
-    """Show how much is done: a bar on the last line of a terminal, wiped at the end; elsewhere a line now and then.
+    """Show progress: a bar in a terminal, which is removed at the end. Otherwise a line every 10 s.
 
-    Gives what is to be called with the share done, 0 to 1. The line begins with ``what``. ``timed``: no share is known,
-    so it says what is done, and for how long already. ``quiet``: nothing is shown.
+    Parameters
+    ----------
+    stream
+        Stream for the bar or the lines.
+    quiet
+        Show nothing.
+    what
+        Begin of each line.
+    timed
+        The share done is unknown: show only the elapsed time.
+
+    Yields
+    ------
+    A function to be called with the share done, 0 to 1.
     """
     if quiet:
         yield lambda share: None
@@ -64,17 +78,17 @@ def progress(
         compiling_seconds(),
         threading.Event(),
     )
-    # None: tqdm asks the stream whether it is a terminal.
+    # disable=None: tqdm shows a bar only in a terminal.
     bar = tqdm(
         total=1.0, desc=what, file=stream, disable=None, bar_format=shown, leave=False
     )
     done = 0.0
 
     def tick() -> None:
-        """Draw the time anew, or say now and then how much is done, whatever keeps the rest waiting."""
+        """Refresh the bar or print a line, even while the work itself reports nothing."""
         while not ended.wait(SAID_EVERY if bar.disable else _TICK):
             if is_compiling():
-                continue  # That has lines of its own.
+                continue  # The compiler has progress lines of its own.
             if not bar.disable:
                 bar.refresh()
                 continue
@@ -91,7 +105,7 @@ def progress(
         nonlocal compiled, done
         before, compiled = compiled, compiling_seconds()
         if not bar.disable:
-            # Time spent compiling is none of the work.
+            # The time left must not include the time of compiling.
             bar.start_t += compiled - before
         bar.update(share - bar.n)
         done = share
@@ -106,37 +120,48 @@ def progress(
         bar.close()
 
 
-# Files and words ------------------------------------------------------------------------------------------------------
+# Files and words
 
-_HEAD = (
-    1 << 16
-)  # bytes at the begin of a file in which the mark of a result is looked for
+_HEAD = 1 << 16
+"""Size of the begin of a file that is searched for the mark of a result, bytes."""
 
 
 class Kind(Enum):
-    """What is written, and the pattern by which a former result of the kind is recognised; nothing else matches it."""
+    """Kind of a result, with the pattern that recognises an earlier result of that kind and nothing else."""
 
     JSON = rb'\s*\{\s*"generator":\s*"fdi_ros"'
     CSV = rb"stamp,rate_x,rate_y,rate_z,std_x,|monitor,channel,kind,size,fault,at_s,"
     PAGE = rb'\s*(?i:<!doctype html>)[^\0]*?<meta name="generator" content="fdi_ros">'
     PARAMETERS = rb"(?:(?:[ \t]*#[^\n]*|---[^\n]*|[ \t]*)\n)*?[ \t]*#[^\n]*\bmade by fdi (?:inspect|setup|calibrate)\b"
-    FOLDER = rb""  # an output bag: recognised by its metadata
+    FOLDER = rb""  # an output bag, recognised by its metadata
 
 
 _KINDS = {
     "json": Kind.JSON,
     "csv": Kind.CSV,
     "report": Kind.PAGE,
-}  # what is written where options of these names say
+}
+"""Kind of the result that an option writes."""
 
 
 class Outputs:
-    """What a verb was asked for: files, refused before any work is done and confirmed when it is, and words.
+    """Files and text that a verb writes. Targets are checked before any work is done.
 
-    ``names``: of the options that say where to write, in the order in which that is confirmed; ``targets``: what they
-    say. ``sources``: what is read, never overwritten wherever its files lie; None: not given. ``output``: what is
-    written where ``--output`` says; None: whoever writes it looks at what is there. `BagError` if one may not be
-    written, or two are one.
+    Parameters
+    ----------
+    arguments
+        Arguments of the verb.
+    names
+        Options with paths to write, in the order of their confirmation.
+    sources
+        Paths that the verb reads. Their files are never overwritten. None: not given.
+    output
+        Kind of the result of ``--output``. None: the writer itself checks the target.
+
+    Raises
+    ------
+    BagError
+        If a target must not be written, or two options have the same target.
     """
 
     def __init__(
@@ -159,7 +184,7 @@ class Outputs:
         folders = [path for path, kind in wanted if kind is Kind.FOLDER]
         taken: set[Path] = set()
         for target, kind in wanted:
-            # A device keeps none of what goes there apart; a file and standard output do.
+            # Two outputs may share a device, but neither a file nor standard output.
             if real_path(target) in taken and (
                 target == STANDARD_OUTPUT or not is_stream(target)
             ):
@@ -181,9 +206,10 @@ class Outputs:
             )
 
     def say(self, text: str, severity: Severity | None = None) -> None:
-        """Print for people, unless they asked for quiet: to standard output, unless data goes there.
+        """Print text, unless ``--quiet`` is given.
 
-        ``severity``: of the first line, where that is a verdict; a terminal shows it by its colour.
+        Text goes to standard output, or to standard error if data goes to standard output.
+        ``severity`` colours the first line in a terminal.
         """
         if not self._arguments.quiet:
             stream = (
@@ -212,17 +238,31 @@ class Outputs:
         severity: Severity | None = None,
         **others: Callable[[Path], object],
     ) -> int:
-        """Write page, figures and other files where they were asked for, all or none; say the text, and all targets.
+        """Write all files or none, then print the text and the targets.
 
-        `severity` is that of the first line of the text, where that is a verdict; `others` write the files of other
-        options, by name. Returns the exit code.
+        Parameters
+        ----------
+        text
+            Text for the terminal.
+        figures
+            Content of the JSON file. None: there is none.
+        html
+            Returns the page. None: there is none.
+        severity
+            Severity of the verdict in the first line of the text. None: no verdict.
+        others
+            Functions that write the files of other options, by the names of these.
+
+        Returns
+        -------
+        The exit code.
         """
         if html is not None:
             others["report"] = lambda path: path.write_text(
                 html(), encoding="utf-8", errors="replace"
             )
         with ExitStack() as stack:
-            # They take their places at the end: where one cannot be written, there is none.
+            # The files appear only at the end, so that a failure leaves none of them.
             for name, write in others.items():
                 if name in self.targets:
                     write(stack.enter_context(whole(self.targets[name])))
@@ -240,19 +280,19 @@ class Outputs:
 
 
 def config_words(arguments: argparse.Namespace) -> str:
-    """Name the parameter files that were read."""
+    """Return the paths of the parameter files."""
     return ", ".join(map(str, arguments.config))
 
 
 def versions() -> str:
-    """Name the versions that figures may depend on."""
+    """Return the versions on which figures may depend."""
     return f"fdi_ros {__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
 
 
 def about(
     arguments: argparse.Namespace, config: str, more: Mapping[str, str]
 ) -> dict[str, str]:
-    """Say for a page what was run: of which part of which recording, with which config, and more."""
+    """Return the head of a page: recording, part, config, versions, and more rows."""
     end = "the end" if math.isinf(arguments.end) else f"{arguments.end:g} s"
     first = {
         "recording": str(arguments.bag),
@@ -263,7 +303,7 @@ def about(
 
 
 def check_part(arguments: argparse.Namespace) -> None:
-    """Refuse a part of a recording that is none: `ConfigError` if the end is not after the start."""
+    """Check the part of a recording: `ConfigError` unless 0 <= start < end."""
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(
             f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end"
@@ -273,9 +313,9 @@ def check_part(arguments: argparse.Namespace) -> None:
 def check_target(
     path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()
 ) -> None:
-    """Refuse to write where something is that should stay (`BagError`), before any work is done.
+    """Raise `BagError` if a target exists and must stay.
 
-    A former result of this kind may be overwritten with ``force``; what is read (``sources``) never is.
+    With ``force`` an earlier result of this kind may be overwritten, but none of the ``sources``.
     """
     if is_stream(path):
         if kind is Kind.FOLDER:
@@ -303,18 +343,18 @@ def check_target(
 
 
 def _parts(source: Path) -> list[Path]:
-    """Where all that belongs to a source lies: metadata.yaml and links may lead out of the folder of a recording."""
+    """Return the real paths of all files of a source. Links and metadata.yaml may lead elsewhere."""
     found = [real_path(source)]
     if source.is_dir():
         found.append(real_path(source / "metadata.yaml"))
-        # What is no recording is refused when it is read.
+        # Reading the source will report if it is no recording.
         with suppress(BagError):
             found += map(real_path, find_files(source, Damage()))
     return found
 
 
 def _what_stays(path: Path, kind: Kind) -> str:
-    """Say what lies at a path that is no former result of a kind; empty: there is one, or nothing."""
+    """Describe a path that is no earlier result of a kind. Empty: it may be overwritten."""
     if kind is Kind.FOLDER:
         if not path.is_dir():
             return "no folder"

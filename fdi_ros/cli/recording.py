@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a recording to settings: ``fdi inspect``, ``fdi setup``, ``fdi calibrate``; and to a bag: ``fdi convert``."""
+"""Verbs that make settings (``fdi inspect``, ``setup``, ``calibrate``) or a bag (``convert``) of a recording."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def run_inspect(arguments: Namespace) -> int:
-    """Print what it is fit for and a table of the topics; write a config to start from."""
+    """Print the fitness of a recording and its topics and write a config to start from."""
     outputs, unit = (
         Outputs(arguments, ("json", "output"), [arguments.bag]),
         unit_of(arguments.degrees),
@@ -71,20 +71,23 @@ def run_inspect(arguments: Namespace) -> int:
 def _starting_config(
     reports: Sequence[TopicReport], bag: Path
 ) -> tuple[str | None, str]:
-    """Return a config to start from, or none, and why the node would refuse it."""
+    """Return a config to start from, and why the node would refuse it.
+
+    The config is None if the recording is unfit or the node would refuse it.
+    """
     if needs(reports):
         return None, ""
     start = starting_config(candidates(reports), bag)
     try:
         Config.from_parameters(start.parameters)
     except ConfigError as error:
-        # A recording may say anything: what the node would refuse is not offered.
+        # A recording may contain any values. A config that the node refuses is no use.
         return None, f"other values: {shown(error, LINE)}"
     return start.text, ""
 
 
 def run_setup(arguments: Namespace) -> int:
-    """Find out what the recording shows, write config and page, say both."""
+    """Set up from a recording: write config and page, print the result."""
     from fdi_ros.setup.run import set_up
 
     check_part(arguments)
@@ -106,7 +109,7 @@ def run_setup(arguments: Namespace) -> int:
 
 
 def run_calibrate(arguments: Namespace) -> int:
-    """Calibrate, say what was found, write the files."""
+    """Calibrate, write the files, print the result."""
     from fdi_ros.setup.calibrate import REPLACED
     from fdi_ros.setup.run import recalibrate
 
@@ -138,7 +141,7 @@ def run_calibrate(arguments: Namespace) -> int:
 def _calibrated(
     arguments: Namespace, found: SetupResult
 ) -> tuple[dict[str, object], str]:
-    """Return the settings that a calibration changes, and what its parameter file says of where they come from."""
+    """Return the settings that a calibration changes, and the comment on their origin."""
     bag, configs = (
         shown(arguments.bag.name),
         ", ".join(shown(file.name) for file in arguments.config),
@@ -146,7 +149,7 @@ def _calibrated(
     if found.kept:
         return (
             {},
-            f"made by fdi calibrate: all is as in {configs}; what {bag} gives is no better",
+            f"made by fdi calibrate: as in {configs}, because the result from {bag} is no better",
         )
     result = found.calibration
     assert result is not None
@@ -165,7 +168,7 @@ def _finish(
     config: str,
     more: str = "",
 ) -> int:
-    """Write config, page and figures, and say what was found."""
+    """Write config, page and figures, and print the result."""
     from fdi_ros.setup.report import (
         setup_figures,
         setup_findings,
@@ -175,7 +178,7 @@ def _finish(
 
     def write(path: Path) -> None:
         path.write_text(config, encoding="utf-8")
-        # What the node would refuse is not written.
+        # Raises if the node would refuse the config: then no file is written.
         Pipeline(Config.from_file(path))
 
     said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
@@ -190,7 +193,7 @@ def _finish(
 
 
 def run_convert(arguments: Namespace) -> int:
-    """Convert to an MCAP bag of the gyro topics, and say how much was written."""
+    """Convert the gyro topics to an MCAP bag, and print the number of messages."""
     outputs = Outputs(
         arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER
     )

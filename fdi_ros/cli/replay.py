@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Through the monitor: ``fdi replay``, a recording; ``fdi sweep``, many faults; ``fdi fleet``, many recordings."""
+"""Verbs that run the monitor: ``fdi replay``, ``fdi sweep`` and ``fdi fleet``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fdi_ros.cli.outputs import (
     Kind,
@@ -29,11 +29,12 @@ from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.inspection.fitness import not_configured, refuse_unfit
-from fdi_ros.inspection.starting_config import assumed_config
+from fdi_ros.inspection.starting_config import AssumedConfig, assumed_config
+from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.accelerometers import possible_names
 from fdi_ros.monitor.building import build_geometry
-from fdi_ros.replay.conditions import failures, parse_check
+from fdi_ros.replay.conditions import Condition, failures, parse_check
 from fdi_ros.replay.failover import FailoverReplay, is_possible
 from fdi_ros.replay.outputs import CsvFile, OutputBag
 from fdi_ros.replay.page import Report
@@ -46,14 +47,53 @@ from fdi_ros.system.files import whole, write_json, write_text
 from fdi_ros.system.text import shown, storable
 
 if TYPE_CHECKING:
+    from fdi_ros.fleet.tables import Tables
     from fdi_ros.replay.sweep import Plan, Subject
 
 
+class _Task(NamedTuple):
+    """What a replay is asked for, checked before the recording is replayed."""
+
+    config: Config
+    """The settings."""
+    assumed: AssumedConfig | None
+    """Their origin if no config was given."""
+    faults: list[Fault]
+    """Faults to inject."""
+    required: list[Condition]
+    """Conditions of ``--check``."""
+    geometry: Geometry
+    """Axes of the gyros."""
+
+
 def run_replay(arguments: Namespace) -> int:
-    """Replay, print a table, write what was asked for."""
-    # Arguments that are wrong by themselves are refused before the recording is read.
+    """Replay a recording, print the result, write the files. Return the exit code."""
+    task = _replay_task(arguments)
+    sources = [arguments.bag, *arguments.config, arguments.scenario]
+    options = ("json", "csv", "report", "output")
+    outputs = Outputs(arguments, options, sources, output=Kind.FOLDER)
+    refuse_unfit(arguments.bag, task.config)
+    failover: FailoverReplay | None = None
+    names = task.geometry.channel_names
+    if arguments.bag.suffix.lower() in AUTOPILOT_LOGS and is_possible(names):
+        failover = FailoverReplay(names)
+    summary, unmet = _replay_to_files(arguments, task, [failover] if failover else [])
+    text = summary_text(summary, unit_of(arguments.degrees))
+    if failover is not None:
+        text += f"{failover.text}\n"
+    text += _config_notes(arguments, task)
+    code = outputs.finish(text, severity=summary.verdict.severity)
+    if arguments.check is not None:
+        return _report_check(arguments, outputs, summary, unmet)
+    # With injected faults the verdict is on the monitor, not on the gyros.
+    return 0 if task.faults else code
+
+
+def _replay_task(arguments: Namespace) -> _Task:
+    """Read arguments and settings. Arguments that are wrong by themselves are refused first."""
     faults = [parse_fault(text) for text in arguments.fault]
-    faults += [] if arguments.scenario is None else load_scenario(arguments.scenario)
+    if arguments.scenario is not None:
+        faults += load_scenario(arguments.scenario)
     check_part(arguments)
     if arguments.detector:
         detector_class(arguments.detector)
@@ -62,80 +102,61 @@ def run_replay(arguments: Namespace) -> int:
     if arguments.detector:
         config = config.replaced({"detector.name": arguments.detector})
     geometry = build_geometry(config)
-    required = (
-        []
-        if arguments.check is None
-        else parse_check(
-            arguments.check, len(faults), possible_names(config, geometry.channel_names)
-        )
-    )
-    sources = [arguments.bag, *arguments.config, arguments.scenario]
-    outputs = Outputs(
-        arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER
-    )
-    refuse_unfit(arguments.bag, config)
-    unit = unit_of(arguments.degrees)
-    report = (
-        Report(geometry, config.sample_rate, unit)
-        if arguments.report is not None
-        else None
-    )
-    is_log = arguments.bag.suffix.lower() in AUTOPILOT_LOGS
-    failover = (
-        FailoverReplay(geometry.channel_names)
-        if is_log and is_possible(geometry.channel_names)
-        else None
-    )
-    with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
-        sinks = [
-            *_sinks(arguments, config, stack),
-            *([report] if report else []),
-            *([failover] if failover else []),
-        ]
-        part = (arguments.start, arguments.end)
-        summary = replay(
-            arguments.bag, config, faults, *part, sinks=sinks, progress=show
-        )
-        if assumed:
-            summary = with_unused(summary, assumed.unused)
-        figures = as_json(summary)
-        unmet = failures(required, summary)
-        if arguments.check is not None:
-            figures["check"] = {
-                "required": [one.text for one in required],
-                "unmet": unmet,
-            }
-        if report:
-            page = report.html(
-                summary,
-                _about_replay(
-                    arguments, config, faults, assumed.words if assumed else ""
-                ),
-            )
-            stack.enter_context(whole(arguments.report)).write_text(
-                page, encoding="utf-8"
-            )
-        write_json(arguments.json, figures)
-    words = summary_text(summary, unit)
-    if failover is not None:
-        words += f"{failover.text}\n"
-    if assumed:
-        words += f"note: no --config: assumed {assumed.words}\n"
-    else:
-        unused = not_configured(arguments.bag, config)
-        words += "".join(f"note: {line}\n" for line in unused)
-    code = outputs.finish(words, severity=summary.verdict.severity)
+    required: list[Condition] = []
     if arguments.check is not None:
-        return _say_check(arguments, outputs, summary, unmet)
-    # Who injects faults tries the monitor: what it then finds is no news of the gyros.
-    return 0 if faults else code
+        channels = possible_names(config, geometry.channel_names)
+        required = parse_check(arguments.check, len(faults), channels)
+    return _Task(config, assumed, faults, required, geometry)
 
 
-def _say_check(
+def _replay_to_files(
+    arguments: Namespace, task: _Task, more: Sequence[Sink]
+) -> tuple[Summary, list[str]]:
+    """Replay and write all files or none. Return the result, and the unmet conditions."""
+    with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
+        sinks = [*_sinks(arguments, task.config, stack), *more]
+        report: Report | None = None
+        if arguments.report is not None:
+            unit = unit_of(arguments.degrees)
+            report = Report(task.geometry, task.config.sample_rate, unit)
+            sinks.append(report)
+        summary = replay(
+            arguments.bag,
+            task.config,
+            task.faults,
+            arguments.start,
+            arguments.end,
+            sinks=sinks,
+            progress=show,
+        )
+        if task.assumed:
+            summary = with_unused(summary, task.assumed.unused)
+        figures = as_json(summary)
+        unmet = failures(task.required, summary)
+        if arguments.check is not None:
+            conditions = [one.text for one in task.required]
+            figures["check"] = {"required": conditions, "unmet": unmet}
+        if report:
+            page = report.html(summary, _about_replay(arguments, task))
+            target = stack.enter_context(whole(arguments.report))
+            target.write_text(page, encoding="utf-8")
+        write_json(arguments.json, figures)
+    return summary, unmet
+
+
+def _config_notes(arguments: Namespace, task: _Task) -> str:
+    """Return notes on an assumed config, or on topics that the given one does not name."""
+    if task.assumed:
+        return f"note: no --config: assumed {task.assumed.words}\n"
+    unused = not_configured(arguments.bag, task.config)
+    return "".join(f"note: {line}\n" for line in unused)
+
+
+def _report_check(
     arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]
 ) -> int:
-    """Say what came of the check; return the exit code."""
-    # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
+    """Print the result of ``--check`` and return the exit code."""
+    # A wrong sample rate makes the check worthless, so --quiet must not hide the warning.
     for line in (
         sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ()
     ):
@@ -148,7 +169,7 @@ def _say_check(
 
 
 def _sinks(arguments: Namespace, config: Config, stack: ExitStack) -> list[Sink]:
-    """Open the outputs that grow with the stream."""
+    """Open the files that grow during the replay."""
     sinks: list[Sink] = []
     if arguments.csv is not None:
         path = stack.enter_context(whole(arguments.csv))
@@ -162,37 +183,37 @@ def _sinks(arguments: Namespace, config: Config, stack: ExitStack) -> list[Sink]
 
 
 def _written(value: object) -> str:
-    """Write a setting as in a file, to the figures that matter."""
+    """Return a setting as a parameter file has it, with six digits."""
     if isinstance(value, (tuple, list)):
         return f"[{', '.join(map(_written, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about_replay(
-    arguments: Namespace, config: Config, faults: Sequence[Fault], assumed: str
-) -> dict[str, str]:
-    """Say what was run, for the report."""
-    changed = "; ".join(
-        f"{name}: {_written(value)}" for name, value in config.changed.items()
-    )
+def _about_replay(arguments: Namespace, task: _Task) -> dict[str, str]:
+    """Return the head of the report: what was replayed, and with which settings."""
+    changed = [
+        f"{name}: {_written(value)}" for name, value in task.config.changed.items()
+    ]
     more = {
-        "detector": config.detector.name,
-        "faults": "; ".join(map(str, faults)) or "none",
-        "seeds": ", ".join(str(fault.seed) for fault in faults) or "none needed",
-        "settings other than the default": changed,
+        "detector": task.config.detector.name,
+        "faults": "; ".join(map(str, task.faults)) or "none",
+        "seeds": ", ".join(str(fault.seed) for fault in task.faults) or "none needed",
+        "settings other than the default": "; ".join(changed),
     }
-    return about(
-        arguments, config_words(arguments) or f"none; assumed: {assumed}", more
-    )
+    config = config_words(arguments)
+    if task.assumed and not config:
+        config = f"none; assumed: {task.assumed.words}"
+    return about(arguments, config, more)
 
 
-# Faults of many sizes -------------------------------------------------------------------------------------------------
+# Many faults
 
 MOST_TIMES = 1000
+"""Largest number of start times of a sweep."""
 
 
 def run_sweep(arguments: Namespace) -> int:
-    """Sweep, print the tables, write what was asked for."""
+    """Sweep, print the tables, write the files. Return the exit code."""
     from fdi_ros.replay.sweep import sweep
     from fdi_ros.replay.sweep_report import (
         sweep_figures,
@@ -256,7 +277,7 @@ def _plan(arguments: Namespace) -> Plan:
 
 
 def _configs(arguments: Namespace) -> dict[str, Config]:
-    """Return the configs to be tried by name: the one given, and those to compare it with."""
+    """Return the configs to try, by name: the given one, and those to compare with."""
     config = Config.from_file(arguments.config)
     config = (
         config.replaced({"detector.name": arguments.detector})
@@ -279,18 +300,18 @@ def _configs(arguments: Namespace) -> dict[str, Config]:
         file = resolve(other)
         if not file.exists():
             raise ConfigError(
-                f"--compare {other}: no such file, and no detector; there are: {', '.join(DETECTORS)}"
+                f"--compare {other}: neither a file nor a detector, expected one of: {', '.join(DETECTORS)}"
             )
         found[other] = Config.from_file(file)
         if build_geometry(found[other]).channel_names != names:
             raise ConfigError(
-                f"--compare {other}: its channels are not those of --config: {', '.join(names)}"
+                f"--compare {other}: its channels differ from those of --config: {', '.join(names)}"
             )
     return found
 
 
 def _subjects(arguments: Namespace, configs: dict[str, Config]) -> list[Subject]:
-    """Read the recording as each config aligns it; what aligns alike is read once."""
+    """Read the recording with the alignment of each config, once for equal alignments."""
     from fdi_ros.bag.samples import read_block
     from fdi_ros.replay.sweep import Subject
 
@@ -316,74 +337,88 @@ def _alignment(config: Config) -> object:
     )
 
 
-# Many recordings ------------------------------------------------------------------------------------------------------
+# Many recordings
 
 PAGE = "fleet.html"
 
 
 def run_fleet(arguments: Namespace) -> int:
-    """Judge them, write tables and page, print what needs a person."""
-    from fdi_ros.fleet.judge import find_recordings, judge_all
-    from fdi_ros.fleet.tables import Fleet, Tables
+    """Replay many recordings, write tables and a page, print the result. Return the exit code."""
+    from fdi_ros.fleet.judge import find_recordings
+    from fdi_ros.fleet.tables import Fleet
     from fdi_ros.system.jobs import worker_count
 
     workers = worker_count(arguments.workers)
-    names = ", ".join(shown(file.name) for file in arguments.config)
-    parameters = (
-        with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
-    )
     paths, unread = find_recordings(arguments.paths)
-    outputs = Outputs(
-        arguments, ("output", "json"), [*paths, *arguments.config], output=None
-    )
+    sources = [*paths, *arguments.config]
+    outputs = Outputs(arguments, ("output", "json"), sources, output=None)
     folder = arguments.output.absolute()
     if folder.exists():
         check_target(folder / PAGE, Kind.PAGE, force=True)
-    tables = Tables(
-        folder,
-        {"config": parameters, "calibrate": arguments.calibrate},
-        arguments.force,
-    )
+    tables = _judged(arguments, paths, workers)
+    fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
+    write_text(folder / PAGE, fleet.html(_about_fleet(arguments, len(paths))))
+    notes = [f"Not searched: {shown(line)}." for line in unread]
+    if others := len(tables.flights) - len(paths):
+        notes.insert(0, f"The tables also hold {others} flights of earlier runs.")
+    text = fleet.text() + "".join(f"{line}\n" for line in notes)
+    figures = fleet.figures() | {"not_searched": unread}
+    code = outputs.finish(text, figures, severity=fleet.verdict.severity)
+    if not fleet.judged:
+        raise BagError(
+            f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE}"
+            " has the reasons"
+        )
+    return code
+
+
+def _judged(arguments: Namespace, paths: Sequence[Path], workers: int) -> Tables:
+    """Replay recordings that are not in the tables yet. An interrupted run can be continued."""
+    from fdi_ros.fleet.judge import judge_all
+    from fdi_ros.fleet.tables import Tables
+
+    parameters = ""
+    if arguments.config:
+        names = ", ".join(shown(file.name) for file in arguments.config)
+        parameters = with_parameters(arguments.config, {}, f"as in {names}", {})
+    folder = arguments.output.absolute()
+    settings = {"config": parameters, "calibrate": arguments.calibrate}
+    tables = Tables(folder, settings, arguments.force)
     reports = folder / "reports" if arguments.reports else None
     if reports:
         reports.mkdir(exist_ok=True)
     compile_for_workers(arguments)
+    calibrates = arguments.calibrate == "each"
     try:
         with progress(sys.stderr, arguments.quiet, "flights") as show:
-            given = parameters, arguments.calibrate == "each", tables
-            judge_all(paths, *given, workers, arguments.scheduler, show, reports)
+            judge_all(
+                paths,
+                parameters,
+                calibrates,
+                tables,
+                workers,
+                arguments.scheduler,
+                show,
+                reports,
+            )
     except KeyboardInterrupt:
-        print(
-            "fdi: stopped; what was judged is kept, the same command goes on from there",
-            file=sys.stderr,
+        words = (
+            "fdi: stopped; finished flights are kept, and the same command continues"
         )
+        print(words, file=sys.stderr)
         raise
     except (FdiError, OSError):
         tables.give_up()
         raise
-    fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
-    head = {
-        "recordings": f"{len(paths)}, from {', '.join(map(str, arguments.paths))}",
-        "config": config_words(arguments)
-        or "what fdi inspect writes for each recording",
+    return tables
+
+
+def _about_fleet(arguments: Namespace, count: int) -> dict[str, str]:
+    """Return the head of the page."""
+    config = config_words(arguments)
+    return {
+        "recordings": f"{count}, from {', '.join(map(str, arguments.paths))}",
+        "config": config or "the one that fdi inspect writes for each recording",
         "calibrated": arguments.calibrate,
         "versions": versions(),
     }
-    write_text(folder / PAGE, fleet.html(head))
-    others = len(tables.flights) - len(paths)
-    more = (
-        [f"The tables have {others} more, of other runs: not counted here."]
-        if others
-        else []
-    )
-    more += [f"Not searched: {shown(line)}." for line in unread]
-    text, figures = (
-        fleet.text() + "".join(f"{line}\n" for line in more),
-        fleet.figures() | {"not_searched": unread},
-    )
-    code = outputs.finish(text, figures, severity=fleet.verdict.severity)
-    if not fleet.judged:
-        raise BagError(
-            f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why"
-        )
-    return code

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Without a recording: ``fdi geometry``, ``fdi montecarlo``, ``fdi shipped`` (files), ``fdi compile``."""
+"""Verbs without a recording: ``fdi geometry``, ``montecarlo``, ``shipped``, ``compile``."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ from fdi_ros.system import BAGS, shipped_files, there
 from fdi_ros.system.files import plain
 from fdi_ros.system.text import did_you_mean
 
-MADE = "diagnostics.yaml"  # the file that can be made for nodes
-_NODE_NAME = re.compile(
-    r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII
-)  # full name of a node
+MADE = "diagnostics.yaml"
+"""Shipped file of which `made_for` makes copies for certain nodes."""
+_NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+"""Full name of a node."""
 _ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
-"""In the file, a regular expression of statuses of any monitor."""
+"""Regular expression in that file which matches the statuses of any monitor."""
 
 
 def run_geometry(arguments: Namespace) -> int:
@@ -71,7 +71,7 @@ def run_geometry(arguments: Namespace) -> int:
 
 
 def run_montecarlo(arguments: Namespace) -> int:
-    """Run the study; print its headline table."""
+    """Run a study and print its headline table."""
     from fdi_ros.experiments.montecarlo import load_study, run_study
     from fdi_ros.experiments.report import headline, report
 
@@ -90,9 +90,9 @@ def run_montecarlo(arguments: Namespace) -> int:
 
 
 def run_shipped(arguments: Namespace) -> int:
-    """Print the path of every shipped file, or of those of one name; with nodes, the file made for them.
+    """Print the paths of the shipped files, or the text of one that is made for certain nodes.
 
-    `ConfigError` if no shipped file has that name, or it is not made for nodes.
+    `ConfigError` if no shipped file has the given name, or the file cannot be made for nodes.
     """
     if arguments.node and arguments.name != MADE:
         raise ConfigError(
@@ -117,10 +117,14 @@ def run_shipped(arguments: Namespace) -> int:
 
 
 def made_for(nodes: Sequence[str], text: str) -> str:
-    """Return the parameters of diagnostic_aggregator for monitors of certain names.
+    """Return the parameters of diagnostic_aggregator for certain monitors.
 
-    ``nodes``: full name of each. ``text``: the shipped file, for any number of monitors of the default name in any
-    namespaces. `ConfigError` if one is no name of a node, or given twice.
+    Parameters
+    ----------
+    nodes
+        Full names of the monitors. `ConfigError` if one is invalid or given twice.
+    text
+        The shipped file, which covers all monitors with the default name.
     """
     for name in nodes:
         if not _NODE_NAME.fullmatch(name):
@@ -141,18 +145,18 @@ def made_for(nodes: Sequence[str], text: str) -> str:
         " ".join([f"shipped {MADE}", *(f"--node {name}" for name in nodes)]),
         1,
     )
-    # The first is that of the monitors, each of which has one such status; without names nobody knows how many.
+    # The first timeout belongs to the monitors: each has one status, and now their number is known.
     timeout = "          timeout: 3.0\n"
     return text.replace(timeout, f"{timeout}          num_items: {len(names)}\n", 1)
 
 
-# Compiling ahead ------------------------------------------------------------------------------------------------------
+# Compiling ahead
 
 
 def run_compile(arguments: Namespace) -> int:
-    """Compile, and say how long it took and where the results are kept."""
+    """Compile and print the time and the folder of the results."""
     if INTERPRETED:
-        raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")
+        raise FdiError("NUMBA_DISABLE_JIT is set: there is nothing to compile")
     names = arguments.detector or list(DETECTORS)
     for name in names:
         detector_class(name)
@@ -175,23 +179,23 @@ def run_compile(arguments: Namespace) -> int:
 
 
 def compile_for_workers(arguments: Namespace) -> None:
-    """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
+    """Compile before local worker processes start, so that each finds the results."""
     if arguments.scheduler is None and missing():
         compile_now()
 
 
 def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
-    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
+    """Compile the code of the verbs, the node and some detectors, on up to two cores.
 
-    Return how many functions had to be compiled.
+    Return the number of functions that were compiled.
     """
-    # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
+    # The longest part comes first. Blocks and messages share code, so they are one part.
     parts: list[tuple[Any, ...]] = [
         (warm_path,),
         *((warm_detector, name) for name in reversed(names)),
         (warm_verbs,),
     ]
-    # Spawned: forking a process that has threads can hang.
+    # Forking a process with threads can hang.
     spawned = multiprocessing.get_context("spawn")
     functions = sorted(missing())
     compiled = spawned.Array("b", max(1, len(functions)), lock=False)
@@ -210,7 +214,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
 
 
 def _count_into(functions: Sequence[str], compiled: Any) -> None:
-    """Set the flag of each function that this worker process compiles."""
+    """Set a flag for each function that this worker process compiles."""
     places = {name: k for k, name in enumerate(functions)}
 
     def count(name: str) -> None:
@@ -221,7 +225,7 @@ def _count_into(functions: Sequence[str], compiled: Any) -> None:
 
 
 def _quietly(part: tuple[Any, ...]) -> int:
-    """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
+    """Compile one part with a quiet log and return the number of functions that were compiled."""
     LOG.setLevel(logging.ERROR)
     before = compilations()
     part[0](*part[1:])
@@ -229,7 +233,7 @@ def _quietly(part: tuple[Any, ...]) -> int:
 
 
 def warm_verbs() -> None:
-    """Compile what the offline verbs need besides, whatever the detector."""
+    """Compile the code of the verbs that belongs to no detector."""
     if all(map(there, BAGS)):
         from fdi_ros.bag.dataflash import find_records
         from fdi_ros.bag.mcap_file import walk

@@ -484,7 +484,7 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
         words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
     ending = {
         ChannelState.SUSPECT: "suspected, left out for now",
-        ChannelState.FAULTY: "declared faulty and left out",
+        ChannelState.FAULTY: "isolated and left out",
         ChannelState.UNCHECKED: "left out" if channel.is_left_out else "still used",
     }
     return f"{words}, {lasting}; {ending.get(channel.state, 'left out')}"

@@ -58,6 +58,10 @@ from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.system.text import html_table
 
 EVENTS = 1024  # events that the sample path writes down at once
+LEAST_STAMPS = 51
+"""Samples of a block from which on the unit of their stamps is checked."""
+TOO_CLOSE = 500.0
+"""Ratio of the configured to the mean interval of stamps in another unit: 1000 for microseconds."""
 
 
 class Pipeline:
@@ -247,7 +251,8 @@ class Pipeline:
         Raises
         ------
         ConfigError
-            If the block has another number of channels, or stamps that do not increase.
+            If the block has another number of channels, stamps that do not increase, or
+            stamps in another unit than nanoseconds.
         """
         samples = self._checked(block)
         nothing = self._output(2 * (allocate(OutputRow, 0),), [])
@@ -427,6 +432,16 @@ class Pipeline:
             )
         return Output(rows[0], n, events, names, acceleration)
 
+    def _check_unit_of(self, first: int, end: int, count: int) -> None:
+        """Refuse stamps of many samples that are too close together to be in nanoseconds."""
+        rate = self.config.sample_rate
+        if count < LEAST_STAMPS or (end - first) * rate > 1e9 / TOO_CLOSE * (count - 1):
+            return
+        raise ConfigError(
+            f"{count} stamps lie within {end - first} ns, expected nanoseconds, about"
+            f" {1e9 / rate:.4g} ns apart at sample_rate {rate:g} Hz"
+        )
+
     def _checked(self, block: Block) -> NDArray[Any]:
         """Return the samples of a block as the sample path takes them, (N,) `Sample`."""
         block = self.arranged(block)
@@ -442,6 +457,7 @@ class Pipeline:
                 raise ConfigError(
                     f"stamps go from {first} to {end} ns, expected within {MAX_STAMP} ns of 0"
                 )
+            self._check_unit_of(first, end, count)
             if first <= last:
                 raise ConfigError(
                     f"stamp {first} ns does not come after the last one, {last} ns"

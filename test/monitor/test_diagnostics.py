@@ -117,7 +117,7 @@ def test_an_isolated_fault_by_how_much_and_since_when() -> None:
         " rad/s, for "
     )
     assert float(error) == pytest.approx(0.21, abs=0.01)
-    assert seconds.endswith(" s; declared faulty and left out")
+    assert seconds.endswith(" s; isolated and left out")
     assert float(seconds.split()[0]) == pytest.approx(4.0, abs=0.15)
     assert abs(float(values["residual (rad/s)"])) == pytest.approx(0.21, abs=0.02)
     assert lines["monitor"].level == Level.WARN

@@ -342,7 +342,7 @@ def test_a_rate_of_channels_under_doubt_says_so_in_covariance_and_level_or_is_wi
     assert np.isnan(output.covariance[~output.valid]).all()
     assert pipeline.status().withheld
     assert told(pipeline)["monitor"].message.startswith(
-        "no fused rate: withheld, as channels under doubt"
+        "no fused rate: withheld, because suspect channels"
     )
     pipeline.reconfigure(open_.config)
     assert pipeline.process(block(z[-1:], len(z))).valid.all()

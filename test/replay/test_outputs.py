@@ -131,7 +131,7 @@ def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
         s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status
     }
     assert status["fdi_node: imu_1.y"].level == 2
-    assert "declared faulty and left out" in status["fdi_node: imu_1.y"].message
+    assert "isolated and left out" in status["fdi_node: imu_1.y"].message
     assert detected == pytest.approx(20.03, abs=0.02)
     last = {
         s.name: s
